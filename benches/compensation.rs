@@ -9,10 +9,10 @@ use std::sync::LazyLock;
 use divan::{Bencher, black_box};
 use rand::RngExt;
 use regrind::compensation::{
-    Contact, Correction, CorrectionLimits, GainRule, LearningState, MapOptions, ParameterOptions, Seen, Smoothing,
+    SurfacePoint, Correction, CorrectionLimits, GainRule, LearningState, MapOptions, ParameterOptions, PassObservation, Smoothing,
     error_map, parameters, point_spacing_mm,
 };
-use regrind::geometry::{Point, Sample, Vector};
+use regrind::geometry::{Point, DeviationSample, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 
@@ -22,9 +22,9 @@ const SCAN: (usize, usize) = (226, 126);
 /// Node spacings of the maps, in mm.
 const SPACINGS_MM: [f64; 2] = [1.0, 0.5];
 
-static CONTACTS: LazyLock<Vec<Contact>> = LazyLock::new(measured);
-static READINGS: LazyLock<Vec<Sample>> = LazyLock::new(|| {
-    let reading = |c: &Contact| Sample { place_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
+static CONTACTS: LazyLock<Vec<SurfacePoint>> = LazyLock::new(measured);
+static READINGS: LazyLock<Vec<DeviationSample>> = LazyLock::new(|| {
+    let reading = |c: &SurfacePoint| DeviationSample { place_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
     CONTACTS.iter().map(reading).collect()
 });
 
@@ -32,7 +32,7 @@ fn main() {
     divan::main();
 }
 
-fn measured() -> Vec<Contact> {
+fn measured() -> Vec<SurfacePoint> {
     let shape = FreeForm::default();
     let form = FormError::new(5, 30.0, 6.657e-3, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
     let mut rng = regrind_sim::rng(1);
@@ -47,7 +47,7 @@ fn measured() -> Vec<Contact> {
             let normal = Vector::from(shape.normal(x, y));
             let wheel = -0.02 * (1.0 / normal.z - 1.0);
             let deviation_mm = form.height(x, y) + noise + spike + wheel;
-            Contact { point: Point::from(shape.point(x, y)), normal, deviation_mm }
+            SurfacePoint { point: Point::from(shape.point(x, y)), normal, deviation_mm }
         })
         .collect()
 }
@@ -108,7 +108,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
     let error = error_map(&READINGS, &options).expect("a map");
     let now = Correction::zero(error.grid, 0.06);
     let begin = LearningState::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
-    let seen = Seen { correction: &now, error: &error, response: None, explained: None };
+    let seen = PassObservation { correction: &now, error: &error, response: None, explained: None };
     let known = begin.updated(&seen);
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
@@ -126,5 +126,5 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
 fn separation_of_parameters(bencher: Bencher) {
     let contacts = &*CONTACTS;
     let options = ParameterOptions::new(12.5);
-    bencher.bench(|| parameters(black_box(contacts), None, &options));
+    bencher.bench(|| estimate_parameters(black_box(contacts), None, &options));
 }

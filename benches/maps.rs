@@ -10,7 +10,7 @@ use divan::{Bencher, black_box};
 use regrind::compensation::ErrorMap;
 use regrind::form::{FormOptions, figures};
 use regrind::formats::{parse_x3p, write_error_map_x3p};
-use regrind::geometry::{Aperture, Grid, Sample};
+use regrind::geometry::{Aperture, Grid, DeviationSample};
 use regrind::report::HeatMap;
 
 fn main() {
@@ -18,7 +18,7 @@ fn main() {
 }
 
 /// Returns samples of a rough surface over the free form's aperture.
-fn samples(points: usize) -> Vec<Sample> {
+fn samples(points: usize) -> Vec<DeviationSample> {
     let columns = (points as f64 * 102.0 / 62.0).sqrt().round() as usize;
     let rows = points.div_ceil(columns);
     let place = |k: usize| {
@@ -28,7 +28,7 @@ fn samples(points: usize) -> Vec<Sample> {
         ]
     };
     let rough = |[x, y]: [f64; 2]| 1e-3 * (0.2 * x).sin() * (0.3 * y).cos() + 1e-4 * (5.0 * x + 7.0 * y).sin();
-    (0..columns * rows).map(place).map(|at_mm| Sample { place_mm: at_mm, deviation_mm: rough(at_mm) }).collect()
+    (0..columns * rows).map(place).map(|at_mm| DeviationSample { place_mm: at_mm, deviation_mm: rough(at_mm) }).collect()
 }
 
 fn error_map(nodes: usize) -> ErrorMap {
@@ -54,7 +54,7 @@ fn all_figures(bencher: Bencher, points: usize) {
     let samples = samples(points);
     let aperture = Some(Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 });
     let options = FormOptions { aperture, ..FormOptions::default() };
-    bencher.bench_local(|| figures(black_box(&samples), &options).unwrap());
+    bencher.bench_local(|| compute_figures(black_box(&samples), &options).unwrap());
 }
 
 #[divan::bench(args = [6_400, 1_000_000], sample_count = 10)]

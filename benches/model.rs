@@ -7,9 +7,9 @@
 use divan::Bencher;
 use nalgebra::DMatrix;
 use regrind::geometry::{Point, Pose};
-use regrind::model::{DensePosterior, Field, Form, Hyperparameters, IncrementalPosterior, ModelInputs, Observed};
+use regrind::model::{DensePosterior, Field, Form, Hyperparameters, IncrementalPosterior, ModelInputs, Observations};
 use regrind::registration::{Options, Registration, Start, register};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{add_noise, centre};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -22,7 +22,7 @@ const HYPER: Hyperparameters =
     Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
 /// Returns points of a part of 102 x 62 mm with form, noise, and the six motions of a part as effects.
-fn measured(count: u32) -> Observed {
+fn measured(count: u32) -> Observations {
     let places: Vec<[f64; 2]> = (0..count)
         .map(|k| f64::from(k) + 0.5)
         .map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0])
@@ -31,7 +31,7 @@ fn measured(count: u32) -> Observed {
     let scatter = |k: usize| 5e-4 * ((k as f64 * 12.9898).sin() * 43_758.545_3).fract();
     let deviations_mm = places.iter().enumerate().map(|(k, &place)| shape(place) + scatter(k)).collect();
     let effects = motions(&places);
-    Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
+    Observations { fixed_effects: effects, ..Observations::without_effects(places, deviations_mm) }
 }
 
 /// Returns the displacement at each place by each of the six motions of a part that is curved in both directions.
@@ -65,7 +65,7 @@ fn a_batch_after_400_points(bencher: Bencher) {
 #[divan::bench]
 fn a_batch_after_400_points_in_place(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(100, 60));
-    let only = |from: usize, until: usize| Observed {
+    let only = |from: usize, until: usize| Observations {
         places: all.places[from..until].to_vec(),
         deviations_mm: all.deviations_mm[from..until].to_vec(),
         fixed_effects: all.fixed_effects.rows(from, until - from).into_owned(),
@@ -73,7 +73,7 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
         path: Vec::new(),
     };
     let effects = motions(&map);
-    let mut before = IncrementalPosterior::over(&map, &effects, &DMatrix::zeros(map.len(), 0), HYPER).unwrap();
+    let mut before = IncrementalPosterior::at_places(&map, &effects, &DMatrix::zeros(map.len(), 0), HYPER).unwrap();
     before.update(&only(0, 400)).unwrap();
     let batch = only(400, 420);
     bencher.with_inputs(|| before.clone()).bench_values(|mut model| {
@@ -101,7 +101,7 @@ fn registered(columns: usize, rows: usize) -> Registration {
     const RADIUS_MM: f64 = 1.5;
     let shape = FreeForm::default();
     let points = |of: Vec<[f64; 3]>| of.into_iter().map(Point::from).collect::<Vec<_>>();
-    let nominal = Nominal::from_points(points(shape.grid(66.0, 46.0, 265, 185)), Projection::Auto).unwrap();
+    let nominal = Nominal::from_points(points(shape.grid(66.0, 46.0, 265, 185)), PlaneProjection::Auto).unwrap();
     let mut rng = regrind_sim::rng(1);
     let form = FormError::with_rms(&mut rng, 20.0, 1e-3);
     let at = |k: usize, n: usize, size_mm: f64| size_mm * (k as f64 / (n - 1) as f64 - 0.5);
@@ -125,6 +125,6 @@ fn the_parameters_of_1800_points(bencher: Bencher) {
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points_along_a_path(bencher: Bencher) {
     let all = measured(1800);
-    let all = Observed { path: (0..1800).map(f64::from).collect(), ..all };
+    let all = Observations { path: (0..1800).map(f64::from).collect(), ..all };
     bencher.bench(|| Hyperparameters::estimate(&all, None).unwrap());
 }

@@ -12,7 +12,7 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use regrind::geometry::{Point, Pose};
 use regrind::registration::{Options, Registration, Start, register};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, centre};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -68,11 +68,11 @@ fn measured((columns, rows): (usize, usize), place: &Placement) -> Vec<Point> {
 }
 
 fn gridded(points: Vec<Point>) -> Nominal {
-    Nominal::from_points(points, Projection::Auto).expect("the free form is a surface")
+    Nominal::from_points(points, PlaneProjection::Auto).expect("the free form is a surface")
 }
 
 fn scattered(points: Vec<Point>) -> Nominal {
-    Nominal::from_triangulated_points(points, Projection::Auto).expect("the free form is a surface")
+    Nominal::from_triangulated_points(points, PlaneProjection::Auto).expect("the free form is a surface")
 }
 
 fn found(nominal: &Nominal, measured: &[Point], start: Start) -> Registration {

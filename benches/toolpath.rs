@@ -7,11 +7,11 @@ use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use regrind::compensation::path::{Field, Move, PathMode, PathOptions, Summary, ToolPath, Wanted, Wheel};
-use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, Seen, error_map};
+use regrind::compensation::path::{HeightField, Move, PathMode, PathOptions, PathSummary, ToolPath, TargetSurface, Wheel};
+use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, PassObservation, error_map};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::{Exactness, ProgramHeader, write_program};
-use regrind::geometry::{Aperture, Grid, Sample};
+use regrind::geometry::{Aperture, Grid, DeviationSample};
 
 fn main() {
     divan::main();
@@ -38,7 +38,7 @@ fn error_mm([x, y]: [f64; 2]) -> f64 {
     5e-3 * (0.3 * x).sin() * (0.25 * y).cos()
 }
 
-fn nominal() -> Field {
+fn nominal() -> HeightField {
     let on = Grid { columns: 263, rows: 163, first_mm: [-52.4, -32.4], spacing_mm: [0.4, 0.4] };
     let form = |x: f64, y: f64| {
         let (s, c) = (0.042 * x + 0.016 * y + 0.4).sin_cos();
@@ -47,11 +47,11 @@ fn nominal() -> Field {
     };
     let place = |k: usize| ((k % 263) as f64 * 0.4 - 52.4, (k / 263) as f64 * 0.4 - 32.4);
     let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = (0..263 * 163).map(place).map(|(x, y)| form(x, y)).unzip();
-    Field::hermite(on, &heights, &slopes)
+    HeightField::hermite(on, &heights, &slopes)
 }
 
-fn path_of(nominal: Field, correction: &Correction, points: u64) -> ToolPath {
-    let wanted = Wanted::new(nominal, correction, 12.5).expect("finite");
+fn path_of(nominal: HeightField, correction: &Correction, points: u64) -> ToolPath {
+    let wanted = TargetSurface::new(nominal, correction, 12.5).expect("finite");
     // A track of 104 mm has about 450 points at 0.1 um.
     let track_mm = 60.0 * 450.0 / points as f64;
     let options = PathOptions::new(Wheel::Sphere { radius_mm: 12.5 }, track_mm, 1000.0);
@@ -92,7 +92,7 @@ fn program(bencher: Bencher, points: u64) {
     bencher.counter(ItemsCount::new(points)).bench(|| write(&path, &summary, &file));
 }
 
-fn write(path: &ToolPath, summary: &Summary, file: &Path) {
+fn write(path: &ToolPath, summary: &PathSummary, file: &Path) {
     let header = ProgramHeader {
         part: "bench".into(),
         cycle: 2,
@@ -126,9 +126,9 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
 fn from_deviations_to_a_program(bencher: Bencher) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("part.ngc");
-    let readings: Vec<Sample> = (0..226 * 126)
+    let readings: Vec<DeviationSample> = (0..226 * 126)
         .map(|k| [(k % 226) as f64 * 100.0 / 225.0 - 50.0, (k / 226) as f64 * 60.0 / 125.0 - 30.0])
-        .map(|at_mm| Sample { place_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
+        .map(|at_mm| DeviationSample { place_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
         .collect();
     let options = MapOptions::new(5.0, 1.0);
     let limits = CorrectionLimits {
@@ -143,7 +143,7 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
         let now = Correction::zero(error.grid, 0.06);
-        let known = begin.updated(&Seen { correction: &now, error: &error, response: None, explained: None });
+        let known = begin.updated(&PassObservation { correction: &now, error: &error, response: None, explained: None });
         let step = now.next_pass(&error, &known, None, &limits).expect("a correction");
         let path = path_of(nominal(), &step.correction, 1_000_000);
         write(&path, &path.summary().expect("a path"), &file);

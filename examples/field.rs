@@ -8,7 +8,7 @@
 //! effects, and the computing time in milliseconds.
 
 use nalgebra::DMatrix;
-use regrind::model::{DensePosterior, Field, Hyperparameters, Observed};
+use regrind::model::{DensePosterior, Field, Hyperparameters, Observations};
 use serde_json::{Value, json};
 
 fn main() {
@@ -26,7 +26,7 @@ fn main() {
     let (seen, asked) = (places("places"), places("asked"));
     let effects = DMatrix::from_fn(seen.len(), columns, |r, c| rows[r][c]);
     let observed =
-        Observed { fixed_effects: effects, ..Observed::without_effects(seen, numbers(&told["deviations_mm"])) };
+        Observations { fixed_effects: effects, ..Observations::without_effects(seen, numbers(&told["deviations_mm"])) };
     let field = Field::new(number("sigma_mm"), number("range_mm"));
     let hyperparameters = Hyperparameters { field, noise_sigma_mm: number("scatter_mm"), noise_autocorrelation: 0.0 };
     let began = std::time::Instant::now();

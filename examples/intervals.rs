@@ -17,7 +17,7 @@ use rayon::prelude::*;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{Form, Interval, ModelInputs};
 use regrind::registration::{Deviation, Options, PointStatus, Start, register};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -145,7 +145,7 @@ fn median(of: impl Iterator<Item = f64>) -> f64 {
 fn nominal() -> Nominal {
     let shape = FreeForm::default();
     let grid = shape.grid(2.0 * HALF_MM[0] + 6.0, 2.0 * HALF_MM[1] + 6.0, 265, 185);
-    Nominal::from_points(grid.into_iter().map(Point::from).collect(), Projection::Auto).expect("a surface")
+    Nominal::from_points(grid.into_iter().map(Point::from).collect(), PlaneProjection::Auto).expect("a surface")
 }
 
 /// Returns the true figures of a part and the intervals that were estimated for them.

@@ -25,7 +25,7 @@ use regrind::registration::{
     Deviation, Method, Options, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
 };
 use regrind::report::{Axis, ColourMap, HeatMap, Plot, Scale, Series};
-use regrind::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side};
+use regrind::surface::{DistanceModel, Nominal, OffsetSurface, FacetIndex, PlaneProjection, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -69,7 +69,7 @@ fn heading(title: &str) {
 /// Samples the free form on a grid that covers it.
 fn nominal((columns, rows): (usize, usize)) -> Outcome<Nominal> {
     let points = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
-    Ok(Nominal::from_points(points.into_iter().map(Point::from).collect(), Projection::Auto)?)
+    Ok(Nominal::from_points(points.into_iter().map(Point::from).collect(), PlaneProjection::Auto)?)
 }
 
 /// Returns the nodes of a grid over a rectangle centred on the origin, row by row, x fastest.
@@ -154,17 +154,17 @@ fn validity_of_the_distance(figures: &Path) -> Outcome {
     HeatMap::of_lengths("Surface error put on (fig. 6a)", "error", &exact)?.save_svg(&figures.join("fig6a.svg"))?;
 
     let cases = [
-        (Distance::Triangle, 0.0, "flat", "residual, flat triangles on the nominal surface, PV / nm", "5"),
+        (DistanceModel::Triangle, 0.0, "flat", "residual, flat triangles on the nominal surface, PV / nm", "5"),
         (
-            Distance::Triangle,
+            DistanceModel::Triangle,
             PROBE_RADIUS_MM,
             "flat-offset",
             "residual, flat triangles on the offset surface, PV / nm",
             "-",
         ),
-        (Distance::Curved, 0.0, "curved", "residual, curved triangles on the nominal surface, PV / nm", "-"),
+        (DistanceModel::Curved, 0.0, "curved", "residual, curved triangles on the nominal surface, PV / nm", "-"),
         (
-            Distance::Curved,
+            DistanceModel::Curved,
             PROBE_RADIUS_MM,
             "curved-offset",
             "residual, curved triangles on the offset surface, PV / nm",
@@ -176,7 +176,7 @@ fn validity_of_the_distance(figures: &Path) -> Outcome {
         let residual = |&[x, y, e]: &[f64; 3]| {
             let (s, n) = (shape.point(x, y), shape.normal(x, y));
             let point = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + (radius_mm + e) * n[k]));
-            [x, y, surface.project(&point, Place::UNKNOWN).distance_mm - e]
+            [x, y, surface.project(&point, FacetIndex::UNKNOWN).distance_mm - e]
         };
         let residuals: Vec<[f64; 3]> = exact.par_iter().map(residual).collect();
         row(what, paper, format!("{:.4}", 1e6 * pv(residuals.iter().map(|s| s[2]))));
@@ -201,7 +201,7 @@ const MISALIGNMENTS: [Misalignment; 8] = [
 ];
 
 /// Returns the options of the method as the paper describes it: start from the identity, known side, every point used.
-fn as_in_the_paper(distance: Distance) -> Options {
+fn as_in_the_paper(distance: DistanceModel) -> Options {
     Options {
         start: Start::Pose(Pose::identity()),
         side: ProbeSide::Above,
@@ -223,16 +223,16 @@ fn robustness(nominal: &Nominal, figures: &Path) -> Outcome {
     for (name, shift_mm, degrees) in MISALIGNMENTS {
         let placement = Placement::new(shift_mm, degrees);
         let measured: Vec<Point> = exact.iter().map(|&p| Point::from(placement.apply(p))).collect();
-        let options = as_in_the_paper(Distance::Curved);
+        let options = as_in_the_paper(DistanceModel::Curved);
         let found = register(nominal, &measured, &options)?;
-        let flat = register(nominal, &measured, &as_in_the_paper(Distance::Triangle));
+        let flat = register(nominal, &measured, &as_in_the_paper(DistanceModel::Triangle));
         row(&format!("{name}: PV / nm (iterations, objective rises)"), "< 1e-6", in_short(&found));
         row(
             &format!("{name}: the same with flat triangles"),
             "< 1e-6",
             flat.map_or_else(|e| e.to_string(), |f| in_short(&f)),
         );
-        let start = (0.0, objective_mm2(nominal, &measured, Distance::Curved)?);
+        let start = (0.0, objective_mm2(nominal, &measured, DistanceModel::Curved)?);
         let taken = found.trace.iter().filter(|i| i.taken).zip(1..).map(|(i, k)| (f64::from(k), i.objective_mm2));
         series.push(Series {
             name: name.into(),
@@ -256,9 +256,9 @@ fn in_short(found: &Registration) -> String {
 }
 
 /// Returns the objective before any step, in mm²: eq. (7) at the identity.
-fn objective_mm2(nominal: &Nominal, measured: &[Point], distance: Distance) -> Outcome<f64> {
+fn objective_mm2(nominal: &Nominal, measured: &[Point], distance: DistanceModel) -> Outcome<f64> {
     let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?.with_distance_model(distance);
-    Ok(measured.iter().map(|p| surface.project(p, Place::UNKNOWN).distance_mm.powi(2)).sum())
+    Ok(measured.iter().map(|p| surface.project(p, FacetIndex::UNKNOWN).distance_mm.powi(2)).sum())
 }
 
 /// Simulated measurement of a ground part on the machine: the planted truth, and the points that the probe reports.
@@ -358,12 +358,12 @@ fn save(map: &HeatMap, figures: &Path, name: &str) -> Outcome {
 }
 
 fn registered(nominal: &Nominal, measured: &Measurement, when: &str, paper: [&str; 2]) -> Outcome<Registration> {
-    let found = register(nominal, &measured.centres, &as_in_the_paper(Distance::Curved))?;
+    let found = register(nominal, &measured.centres, &as_in_the_paper(DistanceModel::Curved))?;
     let (twist, left) = best_fit(measured).ok_or("the part has a symmetry")?;
     let expected = measured.cmm_from_model * Pose::exp(&twist);
     let off = (expected.inverse() * found.cmm_from_model).log();
     let map_off = found.deviations.iter().zip(&left).map(|(d, e)| d.deviation_mm - e);
-    let before = objective_mm2(nominal, &measured.centres, Distance::Curved)?;
+    let before = objective_mm2(nominal, &measured.centres, DistanceModel::Curved)?;
     let um = |mm: f64| format!("{:.3}", 1e3 * mm);
     row(&format!("{when}: surface error, PV / um"), paper[0], um(found.quality.pv_mm));
     row(&format!("{when}: surface error, RMS / um"), paper[1], um(found.quality.rms_mm));
@@ -414,7 +414,7 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?;
     let inverse = pose.inverse();
     let map_off = measured.centres.iter().zip(&after.deviations);
-    let map_off = map_off.map(|(y, d)| surface.project(&inverse.transform_point(y), Place::UNKNOWN).distance_mm - d.deviation_mm);
+    let map_off = map_off.map(|(y, d)| surface.project(&inverse.transform_point(y), FacetIndex::UNKNOWN).distance_mm - d.deviation_mm);
     row("map against the right one, PV / um", "-", format!("{:.3}", 1e3 * pv(map_off)));
     Ok(())
 }
@@ -445,7 +445,7 @@ impl nabo::Point<f64> for Entry {
 fn equivalence(nominal: &Nominal, (measured, after): &(Measurement, Registration), figures: &Path) -> Outcome {
     heading("eq. (18): contact points, registered to the nominal surface");
     let contacts: Vec<Point> = after.deviations.iter().map(|d| d.point).collect();
-    let options = Options { method: Method::Contact, ..as_in_the_paper(Distance::Curved) };
+    let options = Options { method: Method::Contact, ..as_in_the_paper(DistanceModel::Curved) };
     let found = register(nominal, &contacts, &options)?;
     let largest = (found.cmm_from_model.rotation - nalgebra::Matrix3::identity()).amax();
     row(
@@ -493,7 +493,7 @@ fn subtracting_the_radius(
     figures: &Path,
 ) -> Outcome {
     heading("fig. 12b: centres on the nominal surface, the radius subtracted");
-    for (distance, name) in [(Distance::Triangle, "flat triangles"), (Distance::Curved, "curved triangles")] {
+    for (distance, name) in [(DistanceModel::Triangle, "flat triangles"), (DistanceModel::Curved, "curved triangles")] {
         let options = Options { method: Method::SubtractRadius, rms_limit_mm: Some(10.0), ..as_in_the_paper(distance) };
         let found: Result<_, RegistrationError> = register(nominal, &measured.centres, &options);
         let found = match found {
@@ -509,7 +509,7 @@ fn subtracting_the_radius(
             "-",
             format!("{:.3}", 1e3 * maps_apart(&found, after)),
         );
-        if distance == Distance::Triangle {
+        if distance == DistanceModel::Triangle {
             save(&HeatMap::of_deviations("The radius subtracted (fig. 12b)", &found.deviations)?, figures, "fig12b")?;
         }
     }

@@ -21,7 +21,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind::config::PlantConfig;
 use regrind::journal::{Kind, Reader, Record, restore, restore_file, sha256_hex};
-use regrind_plant::{DatabaseSettings, Link, Shipper, enrol_cell};
+use regrind_plant::{DatabaseSettings, Link, Replicator, enrol_cell};
 
 const PASSWORD: &str = "for-measuring";
 
@@ -111,7 +111,7 @@ async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usiz
         let password = home.path().join(format!("{cell}.password"));
         regrind::formats::write_private(&password, PASSWORD.as_bytes()).unwrap();
         let settings = DatabaseSettings { user: role, password_file: Some(password), ..database.clone() };
-        shippers.push((Shipper::new(folder, None), settings));
+        shippers.push((Replicator::new(folder, None), settings));
     }
     println!("{cells} cells, {runs} runs each, {records} records, and {} files of each run", files_of(like));
     let began = Instant::now();
@@ -144,8 +144,8 @@ async fn fill(
     let link = Link::open(database).await.unwrap();
     let began = Instant::now();
     let text = "INSERT INTO cell (name, role) SELECT 'cell-' || n, 'cell_' || n FROM generate_series(1, $1) n ON CONFLICT DO NOTHING";
-    link.ask(text, &[&(cells as i32)]).await.unwrap();
-    let first = link.ask("SELECT coalesce(max(id), 0) FROM run", &[]).await.unwrap()[0].get::<_, i32>(0);
+    link.query(text, &[&(cells as i32)]).await.unwrap();
+    let first = link.query("SELECT coalesce(max(id), 0) FROM run", &[]).await.unwrap()[0].get::<_, i32>(0);
     // About 500 parts of a thousand cells in an hour. A fifth of the recipes is made much more often than the others.
     let text = "WITH made AS (
             INSERT INTO run (cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um,
@@ -163,9 +163,9 @@ async fn fill(
             FROM made CROSS JOIN LATERAL generate_series(1, cycles) k";
     for from in (1..=runs).step_by(10_000) {
         let [from, to] = [from, (from + 9_999).min(runs)].map(|n| first + n as i32);
-        link.ask(text, &[&from, &to, &(cells as i32), &(first + runs as i32)]).await.unwrap();
+        link.query(text, &[&from, &to, &(cells as i32), &(first + runs as i32)]).await.unwrap();
     }
-    let made = link.ask("SELECT id, name FROM run WHERE id > $1 ORDER BY id", &[&first]).await.unwrap();
+    let made = link.query("SELECT id, name FROM run WHERE id > $1 ORDER BY id", &[&first]).await.unwrap();
     let ids: Vec<i32> = made.iter().map(|row| row.get(0)).collect();
     let mut random = StdRng::seed_from_u64(1);
     let mut records = 0;
@@ -177,7 +177,7 @@ async fn fill(
         let texts: Vec<String> = again.iter().map(Record::text).collect();
         let text = "INSERT INTO record (run, seq, hash, text)
             SELECT $1, n, hash, text FROM unnest($2::bytea[], $3::text[]) WITH ORDINALITY AS u (hash, text, n)";
-        link.ask(text, &[&row.get::<_, i32>(0), &hashes, &texts]).await.unwrap();
+        link.query(text, &[&row.get::<_, i32>(0), &hashes, &texts]).await.unwrap();
         records += again.len();
     }
     let each = records / chained.len().max(1);
@@ -185,16 +185,16 @@ async fn fill(
         SELECT id, seq, sha256(hash || int4send(id)), text FROM unnest($1::int[]) id CROSS JOIN record WHERE run = $2";
     let others = &ids[chained.len()..][..repeated.min(others.len())];
     for some in others.chunks(100) {
-        link.ask(text, &[&some, &ids[0]]).await.unwrap();
+        link.query(text, &[&some, &ids[0]]).await.unwrap();
         records += each * some.len();
     }
     let with_all = chained.len() + others.len();
-    link.ask("ANALYZE", &[]).await.unwrap();
+    link.query("ANALYZE", &[]).await.unwrap();
     let bytes = |table: &str| {
         let text = format!("SELECT pg_total_relation_size('{table}'), pg_relation_size('{table}')");
         let link = &link;
         async move {
-            let row = &link.ask(&text, &[]).await.unwrap()[0];
+            let row = &link.query(&text, &[]).await.unwrap()[0];
             [row.get::<_, i64>(0), row.get(1)].map(|bytes| bytes as f64)
         }
     };

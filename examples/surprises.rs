@@ -10,12 +10,12 @@
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
-use regrind::cell::{PvOf, Tolerance};
-use regrind::drive::Adaptive;
+use regrind::cell::{PvPoints, Tolerance};
+use regrind::drive::AdaptiveOptions;
 use regrind::geometry::{Point, Pose, Vector};
 use regrind::model::{FIRST_BATCH, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, decide, farthest_points};
 use regrind::registration::{Options, Start, register};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::Rng;
 use regrind_sim::form::FormError;
 use regrind_sim::probe::add_noise;
@@ -93,7 +93,7 @@ fn main() {
     let shape = FreeForm::default();
     let grid = shape.grid(2.0 * HALF_MM[0] + 6.0, 2.0 * HALF_MM[1] + 6.0, 409, 249);
     let nominal =
-        Nominal::from_points(grid.into_iter().map(Point::from).collect(), Projection::Auto).expect("a surface");
+        Nominal::from_points(grid.into_iter().map(Point::from).collect(), PlaneProjection::Auto).expect("a surface");
     println!(
         "| planted | covers targets | touches | touched | found | found where touched | in tolerance with it | accepted wrongly |"
     );
@@ -148,12 +148,12 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         pv_mm: 7e-3 * limits,
         rms_mm: 1e-3 * limits,
         with_uncertainty: true,
-        probability: Tolerance::USUAL,
-        pv_of: PvOf::MostPoints,
+        probability: Tolerance::DEFAULT_PROBABILITY,
+        pv_of: PvPoints::MostPoints,
     };
-    let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles: 5 };
+    let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles: 5 };
     let given =
-        ModelInputs { decision_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
+        ModelInputs { decision_risk: adaptive.decision_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
     // As in a run: ten for the gates, then enough for a first stopping decision.
@@ -168,7 +168,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
         let found = register(nominal, &cloud, &options).expect("a registration");
         let so_far = PartialMeasurement { targets: &targets, tried: &tried, touched: &touched };
-        let decision = decide(&found, &given, &so_far, &adaptive.purpose(true), seed).expect("a model");
+        let decision = decide(&found, &given, &so_far, &adaptive.stopping_criteria(true), seed).expect("a model");
         if decision.next.is_empty() {
             let all: Vec<usize> = (0..targets.len()).filter(|&k| covers(k)).collect();
             let hit = touched.iter().filter(|&&k| covers(k)).count();

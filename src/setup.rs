@@ -11,22 +11,22 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
+use crate::cell::{CellPlan, Deadlines, Device, HoldOrStop, GateLimits, Tolerance};
 use crate::compensation::path::{
-    Contact as PathContact, Field, Lean, Limits, PathError, PathOptions, Rotary, Scallops, TrackSpacing, TurnAxis,
-    Wanted, Wheel as PathWheel,
+    Contact as PathContact, HeightField, TiltMode, MachineLimits, PathError, PathOptions, RotaryAxis, Scallops, TrackSpacing, RotationAxis,
+    TargetSurface, Wheel as PathWheel,
 };
-use crate::compensation::{Contact, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
-use crate::config::{CellConfig, Link, RotaryLetter};
+use crate::compensation::{SurfacePoint, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
+use crate::config::{CellConfig, LinkConfig, RotaryLetter};
 use crate::device::{AnyCmm, AnyGrinder, DriverContext, DriverError, LineAddress, ModbusSettings, Pass, hex};
-use crate::drive::{Adaptive, Probing, Programs, Sphere, TakenBack, Task, correction_grid};
+use crate::drive::{AdaptiveOptions, Probing, Programs, ReferenceSphere, ParameterCompensation, Task, correction_grid};
 use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
-use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
-use crate::recipe::{Leaning, Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, TableWords, Tilt, Um, Wheel};
+use crate::measuring::{ThermalExpansion, Layout, PatternError, Target, targets};
+use crate::recipe::{TiltKind, SelectionMode, NominalSource, MeasuringPattern, Recipe, SpindleAxis, RegistrationStart, TableSettings, Tilt, Micrometres, WheelDimensions};
 use crate::registration::{Coordinate, MapLimits};
-use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
+use crate::surface::{DefinedSurface, DefinitionError, Nominal, PlaneProjection, Side, SurfaceError};
 
 /// Reason why a recipe and a cell cannot make a run.
 #[derive(Debug, Error)]
@@ -87,21 +87,21 @@ pub enum SetupError {
 }
 
 /// Timeout of a job of a machine that a person serves without a wire.
-const WAIT_FOR_PEOPLE: Duration = Duration::from_secs(7 * 86_400);
+const MANUAL_JOB_TIMEOUT: Duration = Duration::from_secs(7 * 86_400);
 /// Timeout for a person to hold or to stop a machine and to confirm it.
-const WAIT_FOR_STILL: Duration = Duration::from_secs(600);
+const MANUAL_STOP_TIMEOUT: Duration = Duration::from_secs(600);
 /// Timeout of the stand-in for a machine without a wire, for example a folder on another computer. It includes the
 /// reading of a large file.
-const ANSWERS_WITHIN: Duration = Duration::from_secs(90);
+const MANUAL_ANSWER_TIMEOUT: Duration = Duration::from_secs(90);
 /// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
-const LARGEST_TARGET: usize = 56;
+const MAX_TARGET_BYTES: usize = 56;
 /// Factor between the timeout of a transfer and its duration without faults.
-const TRANSFER_ROOM: f64 = 3.0;
+const TRANSFER_TIMEOUT_FACTOR: f64 = 3.0;
 /// Minimum time between two polls during a slow transfer.
-const SLOW_POLL: Duration = Duration::from_millis(250);
+const MIN_MANUAL_POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum share of the tolerances, of RMS and of PV, that scallops take if they determine the track distance. A larger
 /// share causes a warning. A fifth of an RMS adds 2 % in quadrature; a fifth of a PV adds a fifth.
-pub const SCALLOP_SHARE: f64 = 0.2;
+pub const MAX_SCALLOP_SHARE: f64 = 0.2;
 
 /// Builds the task, from which a run computes, and the plan, by which its cell decides.
 ///
@@ -109,19 +109,19 @@ pub const SCALLOP_SHARE: f64 = 0.2;
 /// Returns an error if the nominal surface or the pattern is not available, or if the recipe exceeds the limits of the
 /// cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
-    let (nominal, nominal_file, part_identity) = nominal(recipe)?;
+    let (nominal, nominal_file, part_identity) = read_nominal(recipe)?;
     let side = recipe.measure.side.side().unwrap_or_default();
-    let targets = lay(recipe, &nominal, side)?;
+    let targets = lay_targets(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;
-    let sphere = sphere(recipe, cell)?;
+    let sphere = reference_sphere(recipe, cell)?;
     if let Some(sphere) = &sphere {
         check_sphere(recipe, cell, &nominal, sphere)?;
     }
-    let ground = ground(recipe, &nominal);
-    let (track_mm, scallops) = tracks(recipe, cell, &nominal, &ground)?;
-    let parameters = taken_back(recipe, cell, &ground, &nominal)?;
-    let datum = datum(recipe, &nominal);
-    let kind = kind(recipe, &part_identity, track_mm, targets.len());
+    let ground = surface_and_outline(recipe, &nominal);
+    let (track_mm, scallops) = track_distance(recipe, cell, &nominal, &ground)?;
+    let parameters = parameter_compensation(recipe, cell, &ground, &nominal)?;
+    let datum = locked_sigmas(recipe, &nominal);
+    let kind = learning_kind(recipe, &part_identity, track_mm, targets.len());
     let programs = ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm)));
     if let Ok(programs) = &programs {
         let said = |source| SetupError::Dialect { recipe: recipe.path().into(), cell: cell.path().into(), source };
@@ -133,7 +133,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         programs,
         scallops,
         nominal: Arc::new(nominal),
-        nominal_file,
+        nominal_path: nominal_file,
         part_identity,
         probing: Probing {
             probe_radius_mm: recipe.measure.probe_radius_mm,
@@ -142,22 +142,22 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
             speed_mm_s: recipe.measure.speed_mm_s,
             safe_height_mm: recipe.measure.safe_height_mm,
         },
-        sphere,
+        reference_sphere: sphere,
         fixture_cmm_from_model: cell.cmm.fixture_cmm_from_model,
-        registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
-        start_at_fixture: recipe.registration.start == StartAt::Fixture,
-        coordinates: cell.cmm.link.wire.coordinates(),
-        parameters,
-        datum,
-        place: MapLimits { max_lateral_mm: recipe.compensation.max_displacement_mm, ..MapLimits::default() },
-        map: map_options(recipe),
-        gain: recipe.compensation.gain(),
-        repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
+        registration_options: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
+        start_at_fixture: recipe.registration.start == RegistrationStart::Fixture,
+        expected_coordinates: cell.cmm.link.wire.coordinates(),
+        parameter_compensation: parameters,
+        locked_sigmas: datum,
+        map_limits: MapLimits { max_lateral_mm: recipe.compensation.max_displacement_mm, ..MapLimits::default() },
+        map_options: map_options(recipe),
+        gain_rule: recipe.compensation.gain(),
+        repeatability_mm: recipe.compensation.repeatability_um.map(Micrometres::mm),
         learned: None,
-        setting: setting(recipe, cell, &kind),
+        setting: learning_setting(recipe, cell, &kind),
         kind,
         targets,
-        limits: CorrectionLimits {
+        correction_limits: CorrectionLimits {
             max_depth_mm: cell.grinder.limits.max_depth_mm,
             min_depth_mm: recipe.compensation.min_depth_um.mm(),
             depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
@@ -165,32 +165,32 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
             allowance_mm: recipe.grinding.allowance_um.mm(),
             removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
         },
-        tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
-        least_found: recipe.measure.min_coverage,
-        temperature_c: recipe.measure.temperature_c,
+        plot_tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
+        min_found_share: recipe.measure.min_coverage,
+        temperature_range_c: recipe.measure.temperature_c,
         expansion: expansion(recipe, cell),
-        machine: cell.cmm.uncertainty,
+        machine_uncertainty: cell.cmm.uncertainty,
         tolerance: tolerance(recipe),
         adaptive: adaptive(recipe),
-        simulation: cell.is_marked(),
+        simulation: cell.is_marked_simulation(),
         rehearsal: cell.rehearsal,
     };
-    let mut plan = plan(recipe, cell);
-    plan.gates.least_found = least_found(recipe);
-    let [map, targets] = [8 * task.first_correction().grid.len(), LARGEST_TARGET * task.targets.len()];
+    let mut plan = cell_plan(recipe, cell);
+    plan.gates.least_found = min_found_share(recipe);
+    let [map, targets] = [8 * task.first_correction().grid.len(), MAX_TARGET_BYTES * task.targets.len()];
     for (link, bytes) in [(&cell.grinder.link, map), (&cell.cmm.link, targets)] {
-        plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_within(link, bytes));
+        plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_timeout(link, bytes));
     }
     Ok((task, plan))
 }
 
 /// Returns the machine parameters that are compensated, with the contact points under the nodes of a correction.
-fn taken_back(
+fn parameter_compensation(
     recipe: &Recipe,
     cell: &CellConfig,
-    ground: &Result<Ground, PathError>,
+    ground: &Result<SurfaceAndOutline, PathError>,
     nominal: &Nominal,
-) -> Result<Option<TakenBack>, SetupError> {
+) -> Result<Option<ParameterCompensation>, SetupError> {
     let Some(parameters) = &recipe.compensation.parameters else { return Ok(None) };
     let (field, _) = ground
         .as_ref()
@@ -200,12 +200,12 @@ fn taken_back(
     // A program moves the centre of the wheel along the normals. A grinder with its own path is guided in height.
     let is_program = cell.grinder.link.wire.reads_run_folder();
     let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
-    Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under_nodes(field, &grid) }))
+    Ok(Some(ParameterCompensation { tolerances: parameters.tolerances(), wheel_term, node_points: SurfacePoint::under_nodes(field, &grid) }))
 }
 
 /// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad. The rotation moves the
 /// edge of the part by the same amount. The recipe states the expanded uncertainty (k = 2).
-fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
+fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
     let shift_mm = 0.5 * recipe.registration.lock_uncertainty_um?.mm();
@@ -213,37 +213,37 @@ fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
 }
 
 /// Returns the settings of a measurement with chosen touches.
-fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
-    let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == Mode::Adaptive)?;
-    Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, max_cycles: u32::from(recipe.cycle.max_cycles) })
+fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
+    let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == SelectionMode::Adaptive)?;
+    Some(AdaptiveOptions { tolerance: tolerance(recipe), accepted_risk, max_cycles: u32::from(recipe.cycle.max_cycles) })
 }
 
 /// Returns the minimum share of a plan's targets that must be found.
-fn least_found(recipe: &Recipe) -> f64 {
+fn min_found_share(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
-    let share = if recipe.measure.mode == Mode::Adaptive { Adaptive::ONE_MAY_MISS } else { 1.0 };
+    let share = if recipe.measure.mode == SelectionMode::Adaptive { AdaptiveOptions::FIRST_BATCH_MIN_SHARE } else { 1.0 };
     share * recipe.measure.min_coverage
 }
 
 /// Returns the acceptance limits.
 fn tolerance(recipe: &Recipe) -> Tolerance {
-    let limit = |um: Option<Um>| um.map_or(f64::INFINITY, Um::mm);
+    let limit = |um: Option<Micrometres>| um.map_or(f64::INFINITY, Micrometres::mm);
     Tolerance {
         pv_mm: limit(recipe.acceptance.pv_um),
         rms_mm: limit(recipe.acceptance.rms_um),
         with_uncertainty: recipe.acceptance.expanded_uncertainty,
-        probability: recipe.probability(),
+        probability: recipe.required_probability(),
         pv_of: recipe.acceptance.pv_of,
     }
 }
 
 /// Returns the timeout for the transfer of `bytes` over the line of a machine, with a margin for retries.
-fn transfer_within(link: &Link, bytes: usize) -> Duration {
+fn transfer_timeout(link: &LinkConfig, bytes: usize) -> Duration {
     let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
     let pages = bytes.div_ceil(224) as f64;
     let page_s = (249.0 + 8.0) * 11.0 / f64::from(baud.max(1)) + 0.05;
-    Duration::from_secs_f64(TRANSFER_ROOM * pages * page_s)
+    Duration::from_secs_f64(TRANSFER_TIMEOUT_FACTOR * pages * page_s)
 }
 
 fn map_options(recipe: &Recipe) -> MapOptions {
@@ -260,7 +260,7 @@ fn map_options(recipe: &Recipe) -> MapOptions {
 
 /// Returns the text of all settings that two runs must share so that one can learn from the other: the cell, the part,
 /// and the settings of grinding, measuring and compensation.
-fn setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
+fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     let mut said = format!("cell {:?}, {kind}", cell.name);
     // Another simulated world counts as another grinder.
     if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
@@ -271,7 +271,7 @@ fn setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
 
 /// Returns the same text without the cell: the settings that runs of two cells must share so that one can start from
 /// the results of the other.
-fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
+fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
     let mut said = format!(
@@ -300,21 +300,21 @@ fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> Stri
 
 /// Reads or samples the nominal surface. Returns it with its path and with the SHA-256 of its source, which identifies
 /// the part.
-fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
+fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
-            let nominal = sampled(recipe.path(), surface)?;
-            let identity = identity_of(&nominal);
+            let nominal = sample_surface(recipe.path(), nominal_from_file)?;
+            let identity = surface_identity(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
         NominalSource::File { path, table, projection, aperture } => {
-            let table = nominal_table(table).map_err(|(key, what)| SetupError::Table {
+            let table = nominal_table_format(table).map_err(|(key, what)| SetupError::Table {
                 path: recipe.path().to_owned(),
                 key,
                 what,
             })?;
             let (file, identity) = formats::read_nominal_with_identity(path, &table)?;
-            let nominal = surface(path, file, *projection)?;
+            let nominal = nominal_from_file(path, file, *projection)?;
             let nominal = match aperture {
                 Some(outline) => nominal.with_outline(outline.clone()),
                 None => nominal,
@@ -328,19 +328,19 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
 ///
 /// # Errors
 /// Returns the key with an invalid value, and the reason.
-pub fn nominal_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
-    table(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
+pub fn nominal_table_format(words: &TableSettings) -> Result<formats::Table, (&'static str, String)> {
+    table_format(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
 }
 
 /// Parses the format of a recipe's table of points to measure.
 ///
 /// # Errors
 /// Returns the key with an invalid value, and the reason.
-pub fn plan_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
-    table(words, ["measure.file_columns", "measure.file_unit", "measure.file_height_unit"])
+pub fn plan_table_format(words: &TableSettings) -> Result<formats::Table, (&'static str, String)> {
+    table_format(words, ["measure.file_columns", "measure.file_unit", "measure.file_height_unit"])
 }
 
-fn table(words: &TableWords, keys: [&'static str; 3]) -> Result<formats::Table, (&'static str, String)> {
+fn table_format(words: &TableSettings, keys: [&'static str; 3]) -> Result<formats::Table, (&'static str, String)> {
     let unit = |word: &Option<String>, key| word.as_deref().map(str::parse).transpose().map_err(|what| (key, what));
     Ok(formats::Table {
         columns: words.columns.as_deref().map(str::parse).transpose().map_err(|what| (keys[0], what))?,
@@ -353,7 +353,7 @@ fn table(words: &TableWords, keys: [&'static str; 3]) -> Result<formats::Table, 
 ///
 /// # Errors
 /// Returns an error with the path of the file if its content does not make a surface.
-pub fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result<Nominal, SetupError> {
+pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjection) -> Result<Nominal, SetupError> {
     let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
     match file {
         NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(of_surface),
@@ -363,24 +363,24 @@ pub fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result
             Ok(nominal)
         }
         NominalFile::Definition(text) => match DefinedSurface::from_toml(&text) {
-            Ok(surface) => sampled(path, &surface),
+            Ok(surface) => sample_surface(path, &nominal_from_file),
             Err(source) => Err(SetupError::Definition { path: path.to_owned(), source }),
         },
     }
 }
 
 /// Samples a defined surface at its spacing, within its outline.
-fn sampled(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
-    let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm));
+fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
+    let grid = nominal_from_file.spacing_mm().and_then(|spacing_mm| nominal_from_file.sample(spacing_mm));
     let grid = grid.map_err(|source| SetupError::Definition { path: path.to_owned(), source })?;
     Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
-        .map(|nominal| nominal.with_outline(surface.aperture().clone()))
+        .map(|nominal| nominal.with_outline(nominal_from_file.aperture().clone()))
         .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
 /// Returns the identity of a formula, computed from its nodes. The same surface has the same identity in every
 /// notation.
-fn identity_of(nominal: &Nominal) -> [u8; 32] {
+fn surface_identity(nominal: &Nominal) -> [u8; 32] {
     let mut hash = Sha256::new();
     for point in nominal.points() {
         for c in point.iter() {
@@ -390,28 +390,28 @@ fn identity_of(nominal: &Nominal) -> [u8; 32] {
     hash.finalize().into()
 }
 
-fn lay(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, SetupError> {
+fn lay_targets(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, SetupError> {
     let layout = match &recipe.pattern {
-        Pattern::Laid(layout) => layout,
-        Pattern::File { path, table } => {
-            let table = plan_table(table).map_err(|(key, what)| SetupError::Table {
+        MeasuringPattern::Generated(layout) => layout,
+        MeasuringPattern::File { path, table } => {
+            let table = plan_table_format(table).map_err(|(key, what)| SetupError::Table {
                 path: recipe.path().to_owned(),
                 key,
                 what,
             })?;
             &Layout::Points(formats::read_plan(path, &table)?)
         }
-        Pattern::Free { .. } => return Ok(Vec::new()),
+        MeasuringPattern::Free { .. } => return Ok(Vec::new()),
     };
     targets(nominal, side, layout, recipe.measure.edge_margin_mm)
         .map_err(|source| SetupError::Pattern { path: recipe.path().to_owned(), source })
 }
 
-fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupError> {
+fn reference_sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<ReferenceSphere>, SetupError> {
     match (recipe.measure.qualify, &cell.cmm.reference_sphere) {
         (false, _) => Ok(None),
         (true, Some(sphere)) => {
-            Ok(Some(Sphere { centre: sphere.centre, radius_mm: sphere.radius_mm, points: usize::from(sphere.points) }))
+            Ok(Some(ReferenceSphere { centre: sphere.centre, radius_mm: sphere.radius_mm, points: usize::from(sphere.points) }))
         }
         (true, None) => Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() }),
     }
@@ -419,7 +419,7 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
 
 /// Checks that the probe does not search for the reference sphere inside the part. The part fills the box under its
 /// surface, in the pose of the fixture.
-fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &Sphere) -> Result<(), SetupError> {
+fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &ReferenceSphere) -> Result<(), SetupError> {
     let centre = cell.cmm.fixture_cmm_from_model.inverse().transform_point(&sphere.centre);
     let mut nearest = Point::from([f64::INFINITY; 3]);
     let mut farthest = -nearest;
@@ -465,7 +465,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
         ("measure.temperature_c", recipe.measure.temperature_c.is_some()),
     ];
     // Checked here, because the first measurement comes after the first grinding.
-    if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *is_there)
+    if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *check_machine)
         && !cell.cmm.link.wire.reports_temperature()
     {
         return Err(SetupError::NoTemperature { recipe: recipe.path().into(), cell: cell.path().into(), key });
@@ -477,7 +477,7 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let Some(travel) = &cell.cmm.travel else { return Ok(()) };
     let reach = recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
     let pose = &cell.cmm.fixture_cmm_from_model;
-    let outside = |p: &Point| (0..3).any(|k| !(travel.least_mm[k]..=travel.most_mm[k]).contains(&p[k]));
+    let outside = |p: &Point| (0..3).any(|k| !(travel.min_mm[k]..=travel.max_mm[k]).contains(&p[k]));
     let found = targets.iter().map(|t| pose.transform_point(&(t.point + reach * t.normal))).enumerate().find(|(_, p)| outside(p));
     match found {
         None => Ok(()),
@@ -486,7 +486,7 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
             cell: cell.path().into(),
             number: k + 1,
             at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z).into(),
-            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm).into(),
+            allowed: format!("{:?} to {:?}", travel.min_mm, travel.max_mm).into(),
         }),
     }
 }
@@ -512,25 +512,25 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32], track_spaci
 }
 
 /// Surface under the paths, and outline of the part.
-type Ground = (Field, Aperture);
+type SurfaceAndOutline = (HeightField, Aperture);
 
-fn ground(recipe: &Recipe, nominal: &Nominal) -> Result<Ground, PathError> {
-    let (field, outline) = Programs::ground(nominal)?;
+fn surface_and_outline(recipe: &Recipe, nominal: &Nominal) -> Result<SurfaceAndOutline, PathError> {
+    let (field, outline) = Programs::surface_and_outline(nominal)?;
     // The surface as seen from the side of the wheel.
-    Ok((if from_below(recipe) { field.mirrored() } else { field }, outline))
+    Ok((if is_from_below(recipe) { field.mirrored() } else { field }, outline))
 }
 
 /// Returns true if the part is machined from the side of -z. It is then also measured from that side.
-fn from_below(recipe: &Recipe) -> bool {
+fn is_from_below(recipe: &Recipe) -> bool {
     recipe.measure.side.side() == Some(Side::Opposite)
 }
 
 /// Returns the track distance, from the recipe or from the allowed scallops, and the scallops between the tracks.
-fn tracks(
+fn track_distance(
     recipe: &Recipe,
     cell: &CellConfig,
     nominal: &Nominal,
-    ground: &Result<Ground, PathError>,
+    ground: &Result<SurfaceAndOutline, PathError>,
 ) -> Result<(f64, Option<Scallops>), SetupError> {
     let grinding = &recipe.grinding;
     let (field, outline) = match (ground, grinding.track_mm) {
@@ -544,26 +544,26 @@ fn tracks(
     let size_mm = [high[0] - low[0], high[1] - low[1]];
     let none = Correction::zero(Grid { columns: 2, rows: 2, first_mm: low, spacing_mm: size_mm }, 0.0);
     let unknown = |source| SetupError::Tracks { recipe: recipe.path().to_owned(), source };
-    let wanted = Wanted::new(field.clone(), &none, 1.0).map_err(unknown)?;
+    let wanted = TargetSurface::new(field.clone(), &none, 1.0).map_err(unknown)?;
     let options =
-        tilted(recipe, cell, PathOptions::new(path_wheel(&grinding.wheel, nominal), 1.0, grinding.feed_mm_min));
+        with_tilt(recipe, cell, PathOptions::new(path_wheel(&grinding.wheel, nominal), 1.0, grinding.feed_mm_min));
     let wheel_at = |contact: &PathContact| options.wheel_at(contact);
-    let unit = Scallops::between(&wanted, outline, wheel_at, grinding.pattern, 1.0);
+    let unit = Scallops::compute(&wanted, outline, wheel_at, grinding.pattern, 1.0);
     // Tracks must overlap, and there must be more than one.
     let widest_mm = grinding.wheel.radius_mm().min(0.5 * size_mm[0].min(size_mm[1]));
     let track_mm = match (grinding.track_mm, grinding.scallop_nm) {
         (Some(track_mm), None) => track_mm,
-        (most_mm, Some(nm)) => unit.track_for_mm(1e-6 * nm, f64::INFINITY).min(most_mm.unwrap_or(widest_mm)),
+        (most_mm, Some(nm)) => unit.max_track_mm(1e-6 * nm, f64::INFINITY).min(most_mm.unwrap_or(widest_mm)),
         (None, None) => track_for_tolerance_mm(recipe, &unit).min(widest_mm),
     };
-    Ok((track_mm, Some(unit.at_mm(track_mm))))
+    Ok((track_mm, Some(unit.with_track_mm(track_mm))))
 }
 
 /// Returns the maximum track distance, in mm, at which the scallops stay within their share of the tolerances of a
 /// recipe. The result is rounded down to two digits.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
-    let share = |limit: Option<Um>| limit.map_or(f64::INFINITY, |um| SCALLOP_SHARE * um.mm());
-    let most_mm = scallops.track_for_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
+    let share = |limit: Option<Micrometres>| limit.map_or(f64::INFINITY, |um| MAX_SCALLOP_SHARE * um.mm());
+    let most_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
     if !most_mm.is_finite() {
         return most_mm;
     }
@@ -577,21 +577,21 @@ fn programs(
     cell: &CellConfig,
     nominal: &Nominal,
     part_identity: [u8; 32],
-    (ground, track_mm): (Ground, f64),
+    (ground, track_mm): (SurfaceAndOutline, f64),
 ) -> Programs {
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
     let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), track_mm, grinding.feed_mm_min);
-    let plain = tilted(recipe, cell, plain);
+    let plain = with_tilt(recipe, cell, plain);
     // The wheel reaches its feed before it touches the part.
-    let machine = Limits {
-        travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
+    let machine = MachineLimits {
+        travel_mm: limits.travel.map(|travel| [travel.min_mm, travel.max_mm]),
         speed_mm_s: limits.max_speed_mm_s,
         acceleration_mm_s2: limits.max_acceleration_mm_s2,
         jerk_mm_s3: limits.max_jerk_mm_s3,
     };
     let run_up_mm = 1.1 * machine.run_up_mm(grinding.feed_mm_min);
     let options = PathOptions {
-        from_below: from_below(recipe),
+        from_below: is_from_below(recipe),
         pattern: grinding.pattern,
         one_way: grinding.one_way,
         spacing: match grinding.scallop_nm {
@@ -609,7 +609,7 @@ fn programs(
     Programs {
         part: recipe.part.name.clone(),
         part_identity,
-        ground,
+        surface_and_outline: ground,
         options,
         limits: machine,
         mode: grinding.path_mode,
@@ -624,14 +624,14 @@ fn programs(
 }
 
 /// Returns the same path options with the rotary axis of the cell's grinder and the tilt of the wheel from the recipe.
-fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
+fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
     let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
     let rotary = cell.grinder.rotary.map(|head| {
         let (letter, about) = match head.letter {
-            RotaryLetter::A => ('A', TurnAxis::X),
-            RotaryLetter::B => ('B', TurnAxis::Y),
+            RotaryLetter::A => ('A', RotationAxis::X),
+            RotaryLetter::B => ('B', RotationAxis::Y),
         };
-        Rotary {
+        RotaryAxis {
             letter,
             axis: about,
             reversed: head.reversed,
@@ -642,19 +642,19 @@ fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions
         }
     });
     let lean = recipe.grinding.tilt.map(|Tilt { lean, angle_deg }| match (lean, angle_deg.to_radians()) {
-        (Leaning::Constant, angle_rad) => Lean::Constant { angle_rad },
-        (Leaning::Following, lead_rad) => Lean::Following { lead_rad },
+        (TiltKind::Constant, angle_rad) => TiltMode::Constant { angle_rad },
+        (TiltKind::Following, lead_rad) => TiltMode::Following { lead_rad },
     });
     PathOptions { rotary, tilt: lean, ..plain }
 }
 
 /// Returns the wheel of a recipe in the form that paths use. A cup is tilted by more than the slope of the part, unless
 /// the recipe sets the angle.
-fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
-    const BEYOND_THE_SLOPE_RAD: f64 = 0.0873;
+fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
+    const CUP_TILT_MARGIN_RAD: f64 = 0.0873;
     match *wheel {
-        Wheel::Sphere { radius_mm } => PathWheel::Sphere { radius_mm },
-        Wheel::Torus { radius_mm, minor_radius_mm, spindle } => PathWheel::Torus {
+        WheelDimensions::Sphere { radius_mm } => PathWheel::Sphere { radius_mm },
+        WheelDimensions::Torus { radius_mm, minor_radius_mm, spindle } => PathWheel::Torus {
             ring_mm: radius_mm - minor_radius_mm,
             tube_mm: minor_radius_mm,
             spindle: match spindle {
@@ -662,19 +662,19 @@ fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
                 SpindleAxis::Y => Vector::y(),
             },
         },
-        Wheel::Cup { radius_mm, minor_radius_mm, tilt_deg } => {
-            let sloped = || nominal.max_slope_rad() + BEYOND_THE_SLOPE_RAD;
+        WheelDimensions::Cup { radius_mm, minor_radius_mm, tilt_deg } => {
+            let sloped = || nominal.max_slope_rad() + CUP_TILT_MARGIN_RAD;
             PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt_deg.map_or_else(sloped, f64::to_radians))
         }
     }
 }
 
 /// Returns the thermal expansion of part and scales, if the recipe states that of the part.
-fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<Expansion> {
+fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<ThermalExpansion> {
     const MILLIONTH: f64 = 1e-6;
     let of_part = recipe.part.expansion_um_m_k?;
     let uncertainty = recipe.part.expansion_uncertainty_um_m_k.unwrap_or(0.1 * of_part.abs());
-    Some(Expansion {
+    Some(ThermalExpansion {
         part_per_k: MILLIONTH * of_part,
         part_sigma_per_k: MILLIONTH * uncertainty,
         scales_per_k: MILLIONTH * cell.cmm.scale_expansion_um_m_k,
@@ -682,15 +682,15 @@ fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<Expansion> {
     })
 }
 
-fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
+fn cell_plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     // A job by a person can take days. During a hold the cell keeps waiting.
     let mut deadlines = Deadlines::default();
     let by_person = [&cell.cmm.link, &cell.grinder.link].map(|link| link.wire.is_by_person());
     for k in (0..2).filter(|k| by_person[*k]) {
         (deadlines.progress[k], deadlines.hold[k], deadlines.stop[k]) =
-            (WAIT_FOR_PEOPLE, WAIT_FOR_STILL, WAIT_FOR_STILL);
+            (MANUAL_JOB_TIMEOUT, MANUAL_STOP_TIMEOUT, MANUAL_STOP_TIMEOUT);
         deadlines.progress_notice[k] = None;
-        (deadlines.answer, deadlines.connect) = (ANSWERS_WITHIN, ANSWERS_WITHIN);
+        (deadlines.answer, deadlines.connect) = (MANUAL_ANSWER_TIMEOUT, MANUAL_ANSWER_TIMEOUT);
     }
     CellPlan {
         begin_with: recipe.cycle.begin_with,
@@ -700,8 +700,8 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         stall_mm: recipe.cycle.stall_um.mm(),
         on_stall: recipe.cycle.on_stall,
         on_divergence: recipe.cycle.on_divergence,
-        on_refusal: Disposal::Stop,
-        gates: Gates {
+        on_refusal: HoldOrStop::Stop,
+        gates: GateLimits {
             least_found: recipe.measure.min_coverage,
             min_coverage: recipe.registration.min_coverage,
             most_shift_mm: recipe.registration.max_shift_mm,
@@ -721,7 +721,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
 ///
 /// # Errors
 /// Returns an error if a wire cannot be opened, a folder does not exist, or reference points cannot be read.
-pub fn machines(
+pub fn create_drivers(
     recipe: &Recipe,
     cell: &CellConfig,
     part: &str,
@@ -734,39 +734,39 @@ pub fn machines(
         cell_folder: cell.path().parent().unwrap_or(Path::new("")),
         run_folder: folder,
         min_free_points: match &recipe.pattern {
-            Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
+            MeasuringPattern::Free { min_points: least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },
-        min_coverage: least_found(recipe),
+        min_coverage: min_found_share(recipe),
         rehearsal: cell.rehearsal,
-        volume_mm: volume_mm(cell),
-        ..making(link, cell.simulated, [owner, epoch])
+        volume_mm: probe_travel_mm(cell),
+        ..driver_context(link, cell.simulated, [owner, epoch])
     };
     let cmm = cell.cmm.link.wire.create_cmm(&making(&cell.cmm.link)).map_err(failed)?;
-    let beside = DriverContext { shared_link: cmm.link(), ..making(&cell.grinder.link) };
+    let beside = DriverContext { shared_link: create_cmm.link(), ..making(&cell.grinder.link) };
     let grinder = cell.grinder.link.wire.create_grinder(&beside).map_err(failed)?;
-    Ok((cmm, grinder))
+    Ok((create_cmm, create_grinder))
 }
 
 /// Returns the settings of a machine on Modbus; `None` for any other.
 ///
 /// `simulated` states whether the cell's machines are simulated. A machine that reports the opposite is refused.
-pub fn modbus(link: &Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
+pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (line, unit) = link.wire.modbus_line()?;
-    Some(ModbusSettings::from_context(line, unit, &making(link, simulated, [owner, epoch])))
+    Some(ModbusSettings::from_context(line, unit, &driver_context(link, simulated, [owner, epoch])))
 }
 
 /// Checks that the resources of a machine exist, such as its exchange folders. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
+pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
     let link = match device {
         Device::Cmm => &cell.cmm.link,
         Device::Grinder => &cell.grinder.link,
     };
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
-    let making = DriverContext { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) };
+    let making = DriverContext { cell_folder, volume_mm: probe_travel_mm(cell), ..driver_context(link, cell.simulated, [1, 1]) };
     match device {
         Device::Cmm => link.wire.create_cmm(&making).map(drop),
         Device::Grinder => link.wire.create_grinder(&making).map(drop),
@@ -777,13 +777,13 @@ pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
+pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.cmm.link;
     link.wire.create_cmm(&DriverContext {
         cell_folder,
-        volume_mm: volume_mm(cell),
-        ..making(link, cell.simulated, [1, 1])
+        volume_mm: probe_travel_mm(cell),
+        ..driver_context(link, cell.simulated, [1, 1])
     })
 }
 
@@ -791,19 +791,19 @@ pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
+pub fn create_grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.grinder.link;
-    link.wire.create_grinder(&DriverContext { cell_folder, ..making(link, cell.simulated, [1, 1]) })
+    link.wire.create_grinder(&DriverContext { cell_folder, ..driver_context(link, cell.simulated, [1, 1]) })
 }
 
 /// Returns the box of allowed positions of the probe's centre, as minimum and maximum in mm.
-fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
-    cell.cmm.travel.as_ref().map(|travel| [travel.least_mm, travel.most_mm])
+fn probe_travel_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
+    cell.cmm.travel.as_ref().map(|travel| [travel.min_mm, travel.max_mm])
 }
 
 /// Returns the context for the driver of a machine, besides its wire, without a part.
-fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
+fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
     DriverContext {
         part: "",
         cell_folder: Path::new(""),
@@ -824,6 +824,6 @@ fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverConte
 }
 
 /// Returns the time between two polls of a machine.
-pub fn poll(link: &Link) -> Duration {
-    if link.wire.is_by_person() { link.timing.poll.max(SLOW_POLL) } else { link.timing.poll }
+pub fn poll_interval(link: &LinkConfig) -> Duration {
+    if link.wire.is_by_person() { link.timing.poll.max(MIN_MANUAL_POLL_INTERVAL) } else { link.timing.poll }
 }

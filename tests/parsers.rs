@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use peak_alloc::PeakAlloc;
 use proptest::prelude::*;
 use proptest::sample::Index;
-use regrind::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, Seen};
+use regrind::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, PassObservation};
 use regrind::formats::Learned;
 use regrind::geometry::Grid;
 use regrind::journal::{Entry, Header, Journal, Kind};
@@ -201,7 +201,7 @@ fn samples_are_made() {
         fs::write(folder.join(parser).join(name), bytes).unwrap();
     };
     let lines = |values: Vec<serde_json::Value>| values.iter().map(|value| format!("{value}\n")).collect::<String>();
-    let events = regrind::cell::samples(1).iter().map(|event| serde_json::to_value(event).unwrap()).collect();
+    let events = regrind::cell::sample_events(1).iter().map(|event| serde_json::to_value(event).unwrap()).collect();
     save("event", "events.jsonl", lines(events).as_bytes());
     for (name, content) in small_run() {
         fs::create_dir_all(folder.join("../journal")).unwrap();
@@ -303,6 +303,6 @@ fn what_was_learned() -> Learned {
     let correction = Correction::zero(grid, 0.05);
     let error = ErrorMap::exact(grid, (0..grid.len()).map(|k| 1e-3 * k as f64).collect(), vec![true; grid.len()]);
     let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-    let known = begin.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+    let known = begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
     Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use regrind::formats::{read_measured, read_points};
 use regrind::geometry::Pose;
 use regrind::registration::{Options, Start, register};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::{Nominal, PlaneProjection};
 
 fn main() -> Result<(), Box<dyn Error>> {
     // Cargo adds `--bench` to what was asked for.
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for _ in 0..repeats.parse::<usize>()?.max(1) {
         let points = points.clone();
         let begun = Instant::now();
-        let nominal = Nominal::from_points(points, Projection::Auto)?;
+        let nominal = Nominal::from_points(points, PlaneProjection::Auto)?;
         let prepared = begun.elapsed();
         let registration = register(&nominal, &measured, &options)?;
         times.push((begun.elapsed(), prepared));

@@ -394,14 +394,14 @@ catalogue! {
 
 impl AlarmId {
     /// Returns the general alarm of the catalogue, without the values of a case.
-    pub fn in_general(self) -> Alarm {
-        Alarm::of(self, "")
+    pub fn generic_alarm(self) -> Alarm {
+        Alarm::new(self, "")
     }
 }
 
 impl Alarm {
     /// Builds an alarm from its entry in the catalogue and the values of a case.
-    pub(super) fn of(id: AlarmId, case: impl AsRef<str>) -> Self {
+    pub(super) fn new(id: AlarmId, case: impl AsRef<str>) -> Self {
         let (head, consequence, clears, remedy) = id.entry();
         let what = match case.as_ref() {
             "" => format!("{head}."),

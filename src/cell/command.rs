@@ -121,7 +121,7 @@ pub enum Ending {
 }
 
 /// Formats a label as it is recorded.
-pub(super) fn spelled((name, device): (&'static str, Option<Device>)) -> String {
+pub(super) fn format_label((name, device): (&'static str, Option<Device>)) -> String {
     device.map_or(name.to_owned(), |device| format!("{name} {device}"))
 }
 
@@ -154,7 +154,7 @@ impl Command {
 
     /// Returns the name of the command as it is recorded, with its machine.
     pub fn name(&self) -> String {
-        spelled(self.label())
+        format_label(self.label())
     }
 
     /// Returns the parts of [`Self::name`]: the kind of command and the machine.

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-use super::figure::Interval;
+use super::interval::RecordedInterval;
 use super::state::Device;
 
 /// Person, and the place at which the order was given.
@@ -53,7 +53,7 @@ pub enum Event {
     /// `ClearMachine`.
     Connected { device: Device, boot_id: u32, simulated: bool, found: Occupation },
     /// The machine cannot be used. Answers `Connect`.
-    NotConnected { device: Device, why: Mismatch },
+    NotConnected { device: Device, why: ConnectionRefusal },
     /// The machine cannot be reached, or its application does not run.
     LinkLost { device: Device, why: String },
     /// The link is open again; the signature and the synchronisation are verified.
@@ -115,7 +115,7 @@ pub enum Event {
     /// The machine stands still, but no signal shows whether it is clear of the part. Answers `VerifyClear`.
     ClearUnknown { device: Device },
     /// The machine refused the request.
-    Refused { device: Device, what: Asked, why: String },
+    Refused { device: Device, what: MachineRequest, why: String },
     /// The machine is in FAULTED. (A machine that held because the link was silent is `MachineHeld`.)
     Fault {
         device: Device,
@@ -132,7 +132,7 @@ pub enum Event {
 
     // Results of computations.
     /// The points of this cycle are read and stored: `found` of the `targets` planned. Answers `Collect`.
-    Collected { cycle: u32, targets: u32, found: u32, gate: Gate },
+    Collected { cycle: u32, targets: u32, found: u32, gate: GateResult },
     /// The radius of the probe was compared with the reference sphere. `radius_error_mm` is the radius found minus the
     /// radius in the recipe. Answers `Qualify`.
     Qualified {
@@ -180,7 +180,7 @@ pub enum Occupation {
 /// Reason why a machine cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Mismatch {
+pub enum ConnectionRefusal {
     /// No device answers at the address.
     Unreachable(String),
     /// A device answers, but it is not this machine.
@@ -209,7 +209,7 @@ pub enum Condition {
 /// Request to a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Asked {
+pub enum MachineRequest {
     /// To take a payload.
     Load,
     /// To prepare.
@@ -267,7 +267,7 @@ pub enum Reconciliation {
 /// Verdict of the gate on a measurement.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Gate {
+pub enum GateResult {
     /// The measurement can be used.
     Passed,
     /// The measurement cannot be used.
@@ -311,7 +311,7 @@ pub struct Figures {
     /// Figures of the part itself, which are judged: without the noise of the probe. `None` in records of earlier
     /// versions, which judged the figures of the points.
     #[serde(default)]
-    pub form: Option<FormFigures>,
+    pub form: Option<RecordedFormFigures>,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
     #[serde(with = "super::number")]
     pub pv_expanded_mm: f64,
@@ -328,7 +328,7 @@ pub struct Figures {
     /// Figures with the outliers included, and the places of the outliers. `None` if there are no outliers, and in
     /// records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub left_out: Option<Box<LeftOut>>,
+    pub left_out: Option<Box<OutlierFigures>>,
     /// Distance of the part from its expected place.
     #[serde(with = "super::number")]
     pub shift_mm: f64,
@@ -340,7 +340,7 @@ pub struct Figures {
     /// Other warnings for a person.
     pub warnings: Vec<String>,
     /// Response of the part to the previous map. `None` before the second pass.
-    pub response: Option<Response>,
+    pub response: Option<PartResponse>,
     /// Expected result of another pass. `None` if it cannot be predicted.
     #[serde(default)]
     pub forecast: Option<Forecast>,
@@ -353,12 +353,12 @@ pub struct Figures {
     pub unstated: Option<[u32; 2]>,
     /// Points to touch before any decision. `None` if enough is known, and if all targets are touched at once.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub touch_on: Option<Box<TouchOn>>,
+    pub touch_on: Option<Box<FurtherTouches>>,
 }
 
 /// Figures with the outliers included.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LeftOut {
+pub struct OutlierFigures {
     /// Peak to valley of the deviations.
     #[serde(with = "super::number")]
     pub pv_mm: f64,
@@ -374,7 +374,7 @@ pub struct LeftOut {
 
 /// Further points to touch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TouchOn {
+pub struct FurtherTouches {
     /// Number of the next targets.
     pub targets: u32,
     /// Reason, in words.
@@ -383,14 +383,14 @@ pub struct TouchOn {
 
 /// Figures of the form of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FormFigures {
+pub struct RecordedFormFigures {
     /// Peak to valley.
-    pub pv: Interval,
+    pub pv: RecordedInterval,
     /// Peak to valley of the aperture: of the touched points and the places between them, without the outermost 0.1 %
     /// at each end.
-    pub pv_robust: Interval,
+    pub pv_robust: RecordedInterval,
     /// Root mean square.
-    pub rms: Interval,
+    pub rms: RecordedInterval,
     /// Standard deviation of the noise of a single point.
     #[serde(with = "super::number")]
     pub scatter_mm: f64,
@@ -414,7 +414,7 @@ pub struct Forecast {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
-pub enum Response {
+pub enum PartResponse {
     /// As expected.
     Expected,
     /// Unknown: the map was too small, or its effect too noisy.
@@ -457,7 +457,7 @@ pub struct CompensationSummary {
     pub warnings: Vec<String>,
     /// Parameters of the machine that the recipe compensates in addition to the map, as far as they are estimated.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub parameters: Vec<ParameterTold>,
+    pub parameters: Vec<RecordedParameter>,
     /// Root mean square of the residual error for the map, if parameters are compensated in addition.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub map_rms_mm: Option<f64>,
@@ -468,7 +468,7 @@ pub struct CompensationSummary {
 
 /// Estimate of a parameter of the machine from a measurement, and its compensation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ParameterTold {
+pub struct RecordedParameter {
     /// Name of the parameter.
     pub name: String,
     /// Unit of all its values.
@@ -485,7 +485,7 @@ pub struct ParameterTold {
     pub removes_rms_um: f64,
 }
 
-impl ParameterTold {
+impl RecordedParameter {
     /// Formats the estimate for people.
     pub fn in_words(&self) -> String {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
@@ -546,7 +546,7 @@ impl fmt::Display for Condition {
     }
 }
 
-impl fmt::Display for Asked {
+impl fmt::Display for MachineRequest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Load => "to take its payload",

@@ -1,22 +1,22 @@
 //! Judgement of the figures of a cycle: the verdict and its reason, in words.
 
 use super::command::Verdict;
-use super::event::{Figures, Response};
-use super::figure::Interval;
-use super::plan::{CellPlan, PvOf, Tolerance};
+use super::event::{Figures, PartResponse};
+use super::interval::RecordedInterval;
+use super::plan::{CellPlan, PvPoints, Tolerance};
 
 /// Factor by which a figure must exceed the one of the cycle before to make the cycle worse.
-const WORSE: f64 = 1.05;
+const DIVERGENCE_FACTOR: f64 = 1.05;
 
 /// Verdict and its reason.
-pub(super) struct Judged {
+pub(super) struct ReasonedVerdict {
     pub(super) verdict: Verdict,
     pub(super) reason: String,
 }
 
 impl Figures {
     /// Returns true if all figures are finite numbers, and none that cannot be negative is negative.
-    pub(super) fn are_sound(&self) -> bool {
+    pub(super) fn are_valid(&self) -> bool {
         let all = [
             self.pv_mm,
             self.rms_mm,
@@ -32,19 +32,19 @@ impl Figures {
             self.left_out.as_ref().map_or(0.0, |of| of.rms_mm),
         ];
         let form = self.form.iter().flat_map(|form| [form.pv, form.pv_robust, form.rms]);
-        all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_sound())
+        all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
     /// Returns the intervals of the peak to valley and of the root mean square, as far as they are known. The flag is
     /// true if the first is the PV 99.8 %; otherwise it is the PV of all points.
-    fn known(&self, pv_of: PvOf) -> ([Interval; 2], bool) {
+    fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
-            Some(form) if pv_of == PvOf::MostPoints => ([form.pv_robust, form.rms], true),
+            Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
             Some(form) => ([form.pv, form.rms], false),
             None => {
-                let robust = self.pv_robust_mm.filter(|_| pv_of == PvOf::MostPoints);
-                let pv = Interval::about(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
-                ([pv, Interval::about(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
+                let robust = self.pv_robust_mm.filter(|_| pv_of == PvPoints::MostPoints);
+                let pv = RecordedInterval::from_expanded(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
+                ([pv, RecordedInterval::from_expanded(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
             }
         }
     }
@@ -63,7 +63,7 @@ pub enum Conformity {
 }
 
 impl Conformity {
-    fn of([low, high]: [f64; 2], limit: f64) -> Self {
+    fn from_interval([low, high]: [f64; 2], limit: f64) -> Self {
         if high <= limit {
             Self::Within
         } else if low <= limit {
@@ -76,152 +76,152 @@ impl Conformity {
 
 /// Figure that is judged, with its limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Compared {
+pub struct ComparedFigure {
     /// Name of the figure.
     pub name: &'static str,
     /// Median of the figure.
-    pub found_mm: f64,
+    pub median_mm: f64,
     /// Expanded measuring uncertainty (k = 2), whether the tolerance counts it or not: half of the width of
     /// `between_mm`.
     pub expanded_mm: f64,
     /// Lower and upper end of the 95 % interval, whether the tolerance counts them or not.
-    pub between_mm: [f64; 2],
+    pub interval_mm: [f64; 2],
     /// Largest accepted value; infinite if the figure is not limited.
     pub limit_mm: f64,
     /// Probability that the figure is within its limit, 0.001 to 0.999, whether the tolerance counts it or not. `None`
     /// if the figure is not limited.
-    pub within: Option<f64>,
+    pub probability_within: Option<f64>,
     /// Values that are compared with the limit: the lower and upper quantile for the probability of the tolerance, or
     /// twice the median.
-    pub held_mm: [f64; 2],
+    pub compared_mm: [f64; 2],
     /// Conformity, with the uncertainty if the tolerance counts it.
     pub conformity: Conformity,
 }
 
-impl Compared {
+impl ComparedFigure {
     /// Describes the probability that the figure is within its limit, for people. Returns `None` if it is not limited.
-    pub fn within_in_words(&self) -> Option<String> {
-        let [least, most] = [Interval::PROBABILITIES[0], Interval::PROBABILITIES[Interval::COUNT - 1]];
-        self.within.map(|within| match within {
-            _ if within <= least => format!("P(in tolerance) < {}", percent(least)),
-            _ if within >= most => format!("P(in tolerance) > {}", percent(most)),
-            _ => format!("P(in tolerance) = {}", percent(within)),
+    pub fn probability_in_words(&self) -> Option<String> {
+        let [least, most] = [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
+        self.probability_within.map(|within| match within {
+            _ if within <= least => format!("P(in tolerance) < {}", format_percent(least)),
+            _ if within >= most => format!("P(in tolerance) > {}", format_percent(most)),
+            _ => format!("P(in tolerance) = {}", format_percent(within)),
         })
     }
 }
 
 /// Formats a probability for people. Rounds down, so that it is never overstated.
-fn percent(probability: f64) -> String {
+fn format_percent(probability: f64) -> String {
     format!("{:.1} %", 0.1 * (1e3 * probability + 1e-6).floor())
 }
 
 impl Tolerance {
     /// Compares the two figures that are judged with their limits: the peak to valley that the tolerance selects, and
     /// the RMS.
-    pub fn compare(&self, figures: &Figures) -> [Compared; 2] {
-        let ([pv, rms], is_robust) = figures.known(self.pv_of);
-        let compared = |name, of: Interval, limit_mm: f64| {
+    pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
+        let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_of);
+        let compared = |name, of: RecordedInterval, limit_mm: f64| {
             let between_mm = [of.low_mm, of.high_mm];
             let held_mm = match self.with_uncertainty {
                 true => [1.0 - self.probability, self.probability].map(|share| of.quantile_mm(share)),
                 false => [of.median_mm; 2],
             };
             let within = limit_mm.is_finite().then(|| of.probability_within(limit_mm));
-            let (conformity, expanded_mm) = (Conformity::of(held_mm, limit_mm), of.expanded_mm());
-            Compared { name, found_mm: of.median_mm, expanded_mm, between_mm, limit_mm, within, held_mm, conformity }
+            let (conformity, expanded_mm) = (Conformity::from_interval(held_mm, limit_mm), of.expanded_mm());
+            ComparedFigure { name, median_mm: of.median_mm, expanded_mm, interval_mm: between_mm, limit_mm, probability_within: within, compared_mm: held_mm, conformity }
         };
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
 
     /// Returns true if the part is within its limits without the outliers, and beyond one with them.
-    pub fn left_out_decides(&self, figures: &Figures) -> bool {
+    pub fn outliers_decide(&self, figures: &Figures) -> bool {
         let [pv, rms] = self.compare(figures).map(|compared| compared.conformity);
-        pv.max(rms) == Conformity::Within && self.beyond_with_left_out(figures).is_some()
+        pv.max(rms) == Conformity::Within && self.exceeded_with_outliers(figures).is_some()
     }
 
     /// Describes the outliers if the part would exceed a limit with them. Returns `None` otherwise. A touched point
     /// counts until it is touched again.
     ///
     /// The outliers increase the figures of the part by as much as they increase the figures of the points.
-    fn beyond_with_left_out(&self, now: &Figures) -> Option<String> {
+    fn exceeded_with_outliers(&self, now: &Figures) -> Option<String> {
         let left_out = now.left_out.as_ref()?;
         let [pv, rms] = self.compare(now);
         let more = |with_mm: f64, without_mm: f64| (with_mm - without_mm).max(0.0);
-        let pv_mm = pv.found_mm + more(left_out.pv_mm, now.pv_mm);
-        let rms_mm = (rms.found_mm.powi(2) + more(left_out.rms_mm.powi(2), now.rms_mm.powi(2))).sqrt();
+        let pv_mm = pv.median_mm + more(left_out.pv_mm, now.pv_mm);
+        let rms_mm = (rms.median_mm.powi(2) + more(left_out.rms_mm.powi(2), now.rms_mm.powi(2))).sqrt();
         let beyond = [("PV", pv_mm, pv.limit_mm), ("RMS", rms_mm, rms.limit_mm)];
         let beyond: Vec<String> = beyond
             .into_iter()
             .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
-            .map(|(name, with_mm, limit_mm)| format!("{name} {}, limit {}", um(with_mm), um(limit_mm)))
+            .map(|(name, with_mm, limit_mm)| format!("{name} {}, limit {}", format_um(with_mm), format_um(limit_mm)))
             .collect();
         (!beyond.is_empty()).then(|| format!("{}; with the outliers: {}", left_out.places, beyond.join("; ")))
     }
 }
 
 /// Judges the figures of a cycle after `passes` passes. The rules come in the order of what cannot be undone.
-pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> Judged {
-    let tell = |verdict, reason| Judged { verdict, reason };
-    let figures = told(plan, now);
+pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> ReasonedVerdict {
+    let tell = |verdict, reason| ReasonedVerdict { verdict, reason };
+    let figures = figures_in_words(plan, now);
     let conformity = conformity(plan, now);
     if conformity == Conformity::Within {
-        if let Some(beyond) = plan.tolerance.beyond_with_left_out(now) {
+        if let Some(beyond) = plan.tolerance.exceeded_with_outliers(now) {
             return tell(Verdict::LeftOut, format!("{beyond}; without the outliers: {figures}"));
         }
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
     }
     let spent = now.removed_mm.filter(|removed| removed + plan.least_depth_mm > plan.removal_budget_mm);
     if let Some(removed) = spent {
-        let (removed, budget) = (um(removed), um(plan.removal_budget_mm));
+        let (removed, budget) = (format_um(removed), format_um(plan.removal_budget_mm));
         return tell(
             Verdict::BudgetSpent,
             format!("removed {removed}, limit {budget}: no further pass is possible; {figures}"),
         );
     }
     if passes >= plan.max_cycles {
-        let response = now.response.and_then(wrong).map_or(String::new(), |message| format!("; {message}"));
+        let response = now.response.and_then(wrong_response).map_or(String::new(), |message| format!("; {message}"));
         return tell(
             Verdict::MaxCycles,
             format!("{passes} of {} passes are ground; {figures}{response}", plan.max_cycles),
         );
     }
-    if let Some(message) = now.response.and_then(wrong) {
+    if let Some(message) = now.response.and_then(wrong_response) {
         return tell(Verdict::WrongResponse, format!("{message}; {figures}"));
     }
     if let Some(before) = before {
-        let [[pv, rms], [pv_before, rms_before]] = [now, before].map(|of| judged(plan, of));
-        let was = format!("previous cycle: PV {}, RMS {}", um(pv_before), um(rms_before));
-        if pv > WORSE * pv_before || rms > WORSE * rms_before {
+        let [[pv, rms], [pv_before, rms_before]] = [now, before].map(|of| judged_medians_mm(plan, of));
+        let was = format!("previous cycle: PV {}, RMS {}", format_um(pv_before), format_um(rms_before));
+        if pv > DIVERGENCE_FACTOR * pv_before || rms > DIVERGENCE_FACTOR * rms_before {
             return tell(Verdict::Diverging, format!("worse than the previous cycle: {figures}; {was}"));
         }
         if has_stalled(plan, before, now) {
             let least = match plan.stall_mm {
                 0.0 => format!("the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share),
                 least => {
-                    format!("the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, um(least))
+                    format!("the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, format_um(least))
                 }
             };
             return tell(Verdict::Stalled, format!("improvement below {least}: {figures}; {was}"));
         }
     }
-    go_on(plan, before, now, conformity)
+    judge_next_pass(plan, before, now, conformity)
 }
 
 /// Returns the verdict on another pass: continue if the expected gain is worth its material.
-fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> Judged {
-    let (tell, figures) = (|verdict, reason| Judged { verdict, reason }, told(plan, now));
+fn judge_next_pass(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> ReasonedVerdict {
+    let (tell, figures) = (|verdict, reason| ReasonedVerdict { verdict, reason }, figures_in_words(plan, now));
     let undecided = conformity == Conformity::Undecided;
     let so_far = if undecided { "not proven in or out of tolerance" } else { "not yet in tolerance" };
     // Before the first correction nothing is known about the effect of a correction.
     let forecast = now.forecast.filter(|_| before.is_some());
     let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
-    let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
-    let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", lower bound {}", um(floor)));
+    let (expected, sigma) = (format_um(forecast.rms_mm), format_um(forecast.sigma_mm));
+    let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", lower bound {}", format_um(floor)));
     let expected = format!("expected after another pass: RMS {expected} ± {sigma}{floor}");
     let [_, rms] = plan.tolerance.compare(now);
     // If the found rms exceeds the floor by no more than its uncertainty, another pass cannot improve it.
-    let at_floor = forecast.floor_mm.is_some_and(|floor| rms.found_mm <= floor + rms.expanded_mm);
-    if !at_floor && rms.found_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * rms.found_mm) {
+    let at_floor = forecast.floor_mm.is_some_and(|floor| rms.median_mm <= floor + rms.expanded_mm);
+    if !at_floor && rms.median_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * rms.median_mm) {
         return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
@@ -235,50 +235,50 @@ fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
 }
 
 /// Returns the medians of the two figures that are judged: peak to valley and RMS.
-fn judged(plan: &CellPlan, figures: &Figures) -> [f64; 2] {
-    plan.tolerance.compare(figures).map(|compared| compared.found_mm)
+fn judged_medians_mm(plan: &CellPlan, figures: &Figures) -> [f64; 2] {
+    plan.tolerance.compare(figures).map(|compared| compared.median_mm)
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
     let still = |was: f64, is: f64, least: f64| was - is < least.max(plan.stall_share * was);
     let [pv, rms] = plan.tolerance.compare(now);
-    let [pv_before, rms_before] = judged(plan, before);
-    still(pv_before, pv.found_mm, pv.expanded_mm) && still(rms_before, rms.found_mm, rms.expanded_mm.max(plan.stall_mm))
+    let [pv_before, rms_before] = judged_medians_mm(plan, before);
+    still(pv_before, pv.median_mm, pv.expanded_mm) && still(rms_before, rms.median_mm, rms.expanded_mm.max(plan.stall_mm))
 }
 
 /// Returns how far the figures are from acceptance: the larger ratio of a figure to its limit. Returns the RMS if there
 /// is no limit.
-pub(super) fn distance(plan: &CellPlan, figures: &Figures) -> f64 {
+pub(super) fn distance_to_acceptance(plan: &CellPlan, figures: &Figures) -> f64 {
     let compared = plan.tolerance.compare(figures);
     let shares = compared.iter().filter(|of| of.limit_mm.is_finite() && of.limit_mm > 0.0);
-    shares.map(|of| of.found_mm / of.limit_mm).reduce(f64::max).unwrap_or(compared[1].found_mm)
+    shares.map(|of| of.median_mm / of.limit_mm).reduce(f64::max).unwrap_or(compared[1].median_mm)
 }
 
 /// Describes a cycle that was better than the last one.
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
-    let [pv, rms] = judged(plan, figures);
-    format!("; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}", um(pv), um(rms))
+    let [pv, rms] = judged_medians_mm(plan, figures);
+    format!("; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}", format_um(pv), format_um(rms))
 }
 
 /// Describes a wrong response. Returns `None` if the response is not wrong.
-fn wrong(response: Response) -> Option<&'static str> {
+fn wrong_response(response: PartResponse) -> Option<&'static str> {
     match response {
-        Response::Expected | Response::Unclear => None,
-        Response::SignFlipped => Some("the part responded with the opposite sign: the sign of the map is wrong"),
-        Response::Mirrored => {
+        PartResponse::Expected | PartResponse::Unclear => None,
+        PartResponse::SignFlipped => Some("the part responded with the opposite sign: the sign of the map is wrong"),
+        PartResponse::Mirrored => {
             Some("the part responded as to a mirrored or rotated map: the direction of an axis is wrong")
         }
-        Response::NoEffect => Some("the part did not respond to the map"),
-        Response::Doubled => Some("the part responded twice as much as expected: the map was applied twice"),
+        PartResponse::NoEffect => Some("the part did not respond to the map"),
+        PartResponse::Doubled => Some("the part responded twice as much as expected: the map was applied twice"),
     }
 }
 
-fn told(plan: &CellPlan, now: &Figures) -> String {
-    let of = |compared: Compared| {
-        let within = compared.within_in_words().map_or(String::new(), |words| format!(", {words}"));
-        let Compared { name, found_mm, expanded_mm, limit_mm, .. } = compared;
-        let limit = if limit_mm.is_finite() { format!(", limit {}", um(limit_mm)) } else { String::new() };
-        format!("{name}: {} ± {}{limit}{within}", um(found_mm), um(expanded_mm))
+fn figures_in_words(plan: &CellPlan, now: &Figures) -> String {
+    let of = |compared: ComparedFigure| {
+        let within = compared.probability_in_words().map_or(String::new(), |words| format!(", {words}"));
+        let ComparedFigure { name, median_mm: found_mm, expanded_mm, limit_mm, .. } = compared;
+        let limit = if limit_mm.is_finite() { format!(", limit {}", format_um(limit_mm)) } else { String::new() };
+        format!("{name}: {} ± {}{limit}{within}", format_um(found_mm), format_um(expanded_mm))
     };
     let [pv, rms] = plan.tolerance.compare(now).map(of);
     let Tolerance { with_uncertainty, probability, .. } = plan.tolerance;
@@ -289,7 +289,7 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
             }
             _ => String::new(),
         };
-        format!("{} required{unstated}", percent(probability))
+        format!("{} required{unstated}", format_percent(probability))
     } else {
         "uncertainty not counted".into()
     };
@@ -297,6 +297,6 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
 }
 
 /// Formats a length in micrometres, for people.
-pub(super) fn um(mm: f64) -> String {
+pub(super) fn format_um(mm: f64) -> String {
     format!("{:.2} µm", 1e3 * mm)
 }

@@ -19,14 +19,14 @@
 //! The cell starts a machine at most once for a cycle. Only the machine's own proof that START was not taken allows
 //! another START. A measurement that failed its gate is repeated under the next cycle number. A pass is never repeated.
 
-mod act;
+mod transitions;
 mod alarm;
 mod command;
 mod event;
-mod figure;
+mod interval;
 mod judge;
-mod machine;
-mod memory;
+mod state_machine;
+mod cell;
 mod number;
 mod plan;
 mod state;
@@ -35,13 +35,13 @@ mod table;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
-    GateFailure, JobResult, LeftOut, Mismatch, Occupation, ParameterTold, Reconciliation, RecordFailure, Response,
-    TouchOn,
+    Actor, MachineRequest, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, RecordedFormFigures, GateResult,
+    GateFailure, JobResult, OutlierFigures, ConnectionRefusal, Occupation, RecordedParameter, Reconciliation, RecordFailure, PartResponse,
+    FurtherTouches,
 };
-pub use figure::Interval;
-pub use judge::{Compared, Conformity};
-pub use memory::Cell;
-pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
+pub use interval::RecordedInterval;
+pub use judge::{ComparedFigure, Conformity};
+pub use cell::Cell;
+pub use plan::{FirstStep, CellPlan, Deadlines, HoldOrStop, GateLimits, PvPoints, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};
-pub use table::{Answer, Row, TABLE_VERSION, samples, table};
+pub use table::{Answer, Row, TABLE_VERSION, sample_events, transition_table};

@@ -7,19 +7,19 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 /// Number as it is recorded.
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
-enum Recorded {
+enum RecordedNumber {
     Number(f64),
     Word(String),
     /// NaN in records of earlier versions.
     Nothing(()),
 }
 
-impl Recorded {
-    fn of(value: f64) -> Self {
+impl RecordedNumber {
+    fn new(value: f64) -> Self {
         if value.is_finite() { Self::Number(value) } else { Self::Word(value.to_string()) }
     }
 
-    fn value<E: Error>(self) -> Result<f64, E> {
+    fn into_value<E: Error>(self) -> Result<f64, E> {
         match self {
             Self::Number(value) => Ok(value),
             Self::Word(word) => word.parse().map_err(|_| E::custom(format!("{word:?} is no number"))),
@@ -29,55 +29,55 @@ impl Recorded {
 }
 
 pub(super) fn serialize<S: Serializer>(value: &f64, to: S) -> Result<S::Ok, S::Error> {
-    Recorded::of(*value).serialize(to)
+    RecordedNumber::new(*value).serialize(to)
 }
 
 pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
-    Recorded::deserialize(from)?.value()
+    RecordedNumber::deserialize(from)?.into_value()
 }
 
 /// Serialization of a number that can be missing.
 pub(super) mod optional {
-    use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
+    use super::{Deserialize, Deserializer, RecordedNumber, Serialize, Serializer};
 
     pub(in super::super) fn serialize<S: Serializer>(value: &Option<f64>, to: S) -> Result<S::Ok, S::Error> {
-        value.map(Recorded::of).serialize(to)
+        value.map(RecordedNumber::new).serialize(to)
     }
 
     pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
-        Option::<Recorded>::deserialize(from)?.map(Recorded::value).transpose()
+        Option::<RecordedNumber>::deserialize(from)?.map(RecordedNumber::into_value).transpose()
     }
 }
 
 /// Reads a limit. A missing one is infinite, because JSON has no infinity.
 pub(super) fn limit<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
-    Option::<Recorded>::deserialize(from)?.map_or(Ok(f64::INFINITY), Recorded::value)
+    Option::<RecordedNumber>::deserialize(from)?.map_or(Ok(f64::INFINITY), RecordedNumber::into_value)
 }
 
 /// Serialization of pairs of numbers.
 pub(super) mod pairs {
-    use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
+    use super::{Deserialize, Deserializer, RecordedNumber, Serialize, Serializer};
 
     pub(in super::super) fn serialize<S: Serializer>(pairs: &[[f64; 2]], to: S) -> Result<S::Ok, S::Error> {
-        let recorded: Vec<_> = pairs.iter().map(|pair| pair.map(Recorded::of)).collect();
+        let recorded: Vec<_> = pairs.iter().map(|pair| pair.map(RecordedNumber::new)).collect();
         recorded.serialize(to)
     }
 
     pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<[f64; 2]>, D::Error> {
-        let recorded = Vec::<[Recorded; 2]>::deserialize(from)?;
-        recorded.into_iter().map(|[a, b]| Ok([a.value()?, b.value()?])).collect()
+        let recorded = Vec::<[RecordedNumber; 2]>::deserialize(from)?;
+        recorded.into_iter().map(|[a, b]| Ok([a.into_value()?, b.into_value()?])).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use crate::event::{Event, Figures};
-    use crate::table::samples;
+    use crate::table::sample_events;
 
     #[test]
     fn every_event_comes_back_from_the_record_as_it_was() {
         let recorded = |event: &Event| serde_json::to_string(event).unwrap();
-        for event in samples(3) {
+        for event in sample_events(3) {
             let text = recorded(&event);
             let back: Event = serde_json::from_str(&text).unwrap_or_else(|error| panic!("{text}: {error}"));
             assert_eq!(recorded(&back), text);
@@ -97,7 +97,7 @@ mod tests {
     #[test]
     fn a_number_that_is_missing_stays_missing() {
         let Some(Event::Registered { figures, .. }) =
-            samples(1).into_iter().find(|event| matches!(event, Event::Registered { .. }))
+            sample_events(1).into_iter().find(|event| matches!(event, Event::Registered { .. }))
         else {
             panic!("there is one")
         };

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CellPlan {
     /// Start of the first cycle.
-    pub begin_with: Beginning,
+    pub begin_with: FirstStep,
     /// Maximum number of passes of the grinder.
     pub max_cycles: u32,
     /// Accepted tolerance.
@@ -19,13 +19,13 @@ pub struct CellPlan {
     #[serde(default)]
     pub stall_mm: f64,
     /// Action when the run stalls.
-    pub on_stall: Disposal,
+    pub on_stall: HoldOrStop,
     /// Action after two cycles in a row that are worse than the one before.
-    pub on_divergence: Disposal,
+    pub on_divergence: HoldOrStop,
     /// Action when there is no next map for another reason than the budget.
-    pub on_refusal: Disposal,
+    pub on_refusal: HoldOrStop,
     /// Limits that a measurement must satisfy.
-    pub gates: Gates,
+    pub gates: GateLimits,
     /// Maximum removal at any place in the whole run.
     pub removal_budget_mm: f64,
     /// Minimum removal of a pass at any place.
@@ -40,7 +40,7 @@ pub struct CellPlan {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Beginning {
+pub enum FirstStep {
     /// A pass of the grinder.
     Grind,
     /// A measurement of the part as it is; its surface is above the nominal one by the allowance.
@@ -63,27 +63,27 @@ pub struct Tolerance {
     #[serde(default = "Tolerance::usual", skip_serializing_if = "Tolerance::is_usual")]
     pub probability: f64,
     /// Points from which the peak to valley is taken.
-    pub pv_of: PvOf,
+    pub pv_of: PvPoints,
 }
 
 impl Tolerance {
     /// Default probability. For a normal figure the guard band is then the expanded uncertainty with k = 2 (ISO
     /// 14253-1).
-    pub const USUAL: f64 = 0.975;
+    pub const DEFAULT_PROBABILITY: f64 = 0.975;
 
     fn usual() -> f64 {
-        Self::USUAL
+        Self::DEFAULT_PROBABILITY
     }
 
     fn is_usual(probability: &f64) -> bool {
-        *probability == Self::USUAL
+        *probability == Self::DEFAULT_PROBABILITY
     }
 }
 
 /// Points that a peak to valley includes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-pub enum PvOf {
+pub enum PvPoints {
     /// The points that were touched.
     #[serde(rename = "all")]
     All,
@@ -97,7 +97,7 @@ pub enum PvOf {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Disposal {
+pub enum HoldOrStop {
     /// Hold with an alarm; a person decides.
     Hold,
     /// End the run in order; the part is not in tolerance.
@@ -106,7 +106,7 @@ pub enum Disposal {
 
 /// Limits that a measurement must satisfy before it is used.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Gates {
+pub struct GateLimits {
     /// Minimum share of the planned points that must be found, 0 to 1.
     pub least_found: f64,
     /// Minimum share of the aperture that must be covered, 0 to 1.

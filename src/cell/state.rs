@@ -93,7 +93,7 @@ pub enum Phase {
 
 impl Phase {
     /// Returns the job of a machine at a step.
-    pub(super) fn of(device: Device, step: JobStep) -> Self {
+    pub(super) fn from_job(device: Device, step: JobStep) -> Self {
         match device {
             Device::Cmm => Self::Measure(step),
             Device::Grinder => Self::Grind(step),
@@ -110,7 +110,7 @@ impl Phase {
     }
 
     /// Returns the machine that may be moving in this phase.
-    pub fn moving(self) -> Option<Device> {
+    pub fn moving_device(self) -> Option<Device> {
         self.job()
             .filter(|(_, step)| matches!(step, JobStep::Start | JobStep::Run | JobStep::Reconcile))
             .map(|(device, _)| device)
@@ -118,7 +118,7 @@ impl Phase {
 
     /// Returns the position in a cycle: a later phase has a higher number. A job that is being reconciled counts as
     /// less far than one that is seen running.
-    pub(super) fn place(self) -> u8 {
+    pub(super) fn position(self) -> u8 {
         let step = |step: JobStep| match step {
             JobStep::Send => 0,
             JobStep::Clear => 1,

@@ -5,13 +5,13 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
 use std::time::Duration;
 
-use super::command::{Command, spelled};
+use super::command::{Command, format_label};
 use super::event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
-    LeftOut, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
+    Actor, MachineRequest, CompensationRefusal, CompensationSummary, Condition, Event, Figures, GateResult, GateFailure, JobResult,
+    OutlierFigures, ConnectionRefusal, Occupation, Reconciliation, RecordFailure, PartResponse, FurtherTouches,
 };
-use super::memory::Cell;
-use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
+use super::cell::Cell;
+use super::plan::{FirstStep, CellPlan, Deadlines, HoldOrStop, GateLimits, PvPoints, Tolerance};
 use super::state::{Device, JobStep, Phase, State};
 
 /// Version of the table. Only a program of the version that began a run can continue it. Any change of a reaction is a
@@ -42,11 +42,11 @@ pub struct Answer {
 }
 
 /// Next state, and the labels of the commands.
-type Labelled = (State, Vec<(&'static str, Option<Device>)>);
+type LabelledAnswer = (State, Vec<(&'static str, Option<Device>)>);
 
 impl Answer {
-    fn of((next, labels): Labelled) -> Self {
-        Self { next, commands: labels.into_iter().map(spelled).collect() }
+    fn from_labels((next, labels): LabelledAnswer) -> Self {
+        Self { next, commands: labels.into_iter().map(format_label).collect() }
     }
 
     /// Returns true if the event did not fit.
@@ -56,18 +56,18 @@ impl Answer {
 }
 
 /// Returns the table, sorted by state and event.
-pub fn table() -> Vec<Row> {
-    let mut answers: HashMap<State, Vec<Vec<Labelled>>> = HashMap::new();
-    let mut open: VecDeque<Cell> = [Disposal::Hold, Disposal::Stop].into_iter().map(|d| Cell::new(plan(d))).collect();
+pub fn transition_table() -> Vec<Row> {
+    let mut answers: HashMap<State, Vec<Vec<LabelledAnswer>>> = HashMap::new();
+    let mut open: VecDeque<Cell> = [HoldOrStop::Hold, HoldOrStop::Stop].into_iter().map(|d| Cell::new(sample_plan(d))).collect();
     let (mut seen, mut sampled) = (HashSet::new(), HashMap::new());
     while let Some(cell) = open.pop_front() {
-        let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| samples(cell.cycle()));
+        let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| sample_events(cell.cycle()));
         let answers = answers.entry(cell.state()).or_insert_with(|| vec![Vec::new(); events.len()]);
         // Late enough for every deadline.
         let now = cell.next_deadline().unwrap_or(Duration::ZERO);
         let mut next = cell.clone();
         for (event, answers) in events.iter().zip(answers) {
-            let answered = next.answer(now, event);
+            let answered = next.apply_event(now, event);
             let state = next.state();
             let labels = || next.commands.iter().map(Command::label).chain(answered.is_err().then_some((REFUSE, None)));
             // Almost all of the millions of answers are already known.
@@ -77,63 +77,63 @@ pub fn table() -> Vec<Row> {
             next.commands.clear();
             // An event that does not fit at all has changed nothing: the next event gets the cell as it was.
             if answered != Err(None) {
-                if seen.insert(key(&next)) {
+                if seen.insert(behaviour_key(&next)) {
                     open.push_back(next);
                 }
                 next = cell.clone();
             }
         }
     }
-    let names: Vec<String> = samples(0).iter().map(name_of).collect();
+    let names: Vec<String> = sample_events(0).iter().map(event_label).collect();
     let mut rows: BTreeMap<(State, &str), BTreeSet<Answer>> = BTreeMap::new();
     for (state, answers) in answers {
         for (name, answers) in names.iter().zip(answers) {
-            rows.entry((state, name)).or_default().extend(answers.into_iter().map(Answer::of));
+            rows.entry((state, name)).or_default().extend(answers.into_iter().map(Answer::from_labels));
         }
     }
     rows.into_iter().map(|((state, event), answers)| Row { state, event: event.to_owned(), answers }).collect()
 }
 
 /// Returns everything that decides the answer of a cell, without times and counts, and only as fine as the table needs.
-fn key(cell: &Cell) -> impl Eq + Hash + use<> {
-    let known = cell.known.map(|known| (known.ready, known.met && known.stands));
-    let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
-    let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
-    let grinds = cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
-    let by_hand = cell.known.iter().any(|known| known.manual);
+fn behaviour_key(cell: &Cell) -> impl Eq + Hash + use<> {
+    let known = cell.machines.map(|known| (known.ready, known.was_connected && known.abort_confirmed));
+    let clear = cell.machines.map(|known| (known.clear, known.clear_confirmed, known.clear_requested));
+    let memory = (cell.diverging_cycles.min(1), cell.abort_repeated, cell.previous.is_some(), cell.pass_count >= cell.plan.max_cycles);
+    let grinds = cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
+    let by_hand = cell.machines.iter().any(|known| known.manual);
     // Only a reconciliation reads it.
     let asked = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Reconcile);
-    let begun = asked.map(|(device, _)| (cell.begun[device as usize], cell.vain[device as usize].told));
+    let begun = asked.map(|(device, _)| (cell.job_observed[device as usize], cell.failure_series[device as usize].reported));
     let discarded = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Discard);
-    let keeps = discarded.is_some_and(|(device, _)| cell.keeps[device as usize]);
-    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand, begun, keeps);
-    (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
+    let keeps = discarded.is_some_and(|(device, _)| cell.acknowledge_refused[device as usize]);
+    let memory = (memory, cell.hold_deadline.is_some(), grinds && cell.pass_record_doubted, cell.stall_notified, by_hand, begun, keeps);
+    (cell.state, known, clear, cell.suspension_causes.is_empty(), memory, cell.plan.on_stall == HoldOrStop::Hold)
 }
 
-fn name_of(event: &Event) -> String {
+fn event_label(event: &Event) -> String {
     match event.device() {
         Some(device) => format!("{} ({device})", event.name()),
         None => event.name().to_owned(),
     }
 }
 
-fn plan(disposal: Disposal) -> CellPlan {
+fn sample_plan(disposal: HoldOrStop) -> CellPlan {
     CellPlan {
-        begin_with: Beginning::Grind,
+        begin_with: FirstStep::Grind,
         max_cycles: 3,
         tolerance: Tolerance {
             pv_mm: 0.010,
             rms_mm: 0.002,
             with_uncertainty: false,
-            probability: Tolerance::USUAL,
-            pv_of: PvOf::All,
+            probability: Tolerance::DEFAULT_PROBABILITY,
+            pv_of: PvPoints::All,
         },
         stall_share: 0.05,
         stall_mm: 0.0,
         on_stall: disposal,
         on_divergence: disposal,
         on_refusal: disposal,
-        gates: Gates {
+        gates: GateLimits {
             least_found: 0.9,
             min_coverage: 0.9,
             most_shift_mm: 1.0,
@@ -142,10 +142,10 @@ fn plan(disposal: Disposal) -> CellPlan {
         },
         removal_budget_mm: 1.0,
         least_depth_mm: 0.001,
-        clear_at_start: disposal == Disposal::Stop,
+        clear_at_start: disposal == HoldOrStop::Stop,
         // One of the two plans retries nothing, so that the table shows the reaction to a failure that recurs.
         deadlines: Deadlines {
-            vain_failures: if disposal == Disposal::Stop { 1 } else { u32::MAX },
+            vain_failures: if disposal == HoldOrStop::Stop { 1 } else { u32::MAX },
             vain: Duration::MAX,
             ..Deadlines::default()
         },
@@ -153,12 +153,12 @@ fn plan(disposal: Disposal) -> CellPlan {
 }
 
 /// Returns sample events of every kind for a cycle, with the values on which the cell decides.
-pub fn samples(cycle: u32) -> Vec<Event> {
-    let mut events = orders();
+pub fn sample_events(cycle: u32) -> Vec<Event> {
+    let mut events = order_events();
     for device in Device::BOTH {
-        events.extend(of_machine(device, cycle));
+        events.extend(machine_events(device, cycle));
     }
-    events.extend(of_computations(cycle));
+    events.extend(computation_events(cycle));
     events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
     events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
     events.push(Event::NotOnRecord { command: Command::Acknowledge { device: Device::Cmm }.name() });
@@ -169,7 +169,7 @@ pub fn samples(cycle: u32) -> Vec<Event> {
     events
 }
 
-fn orders() -> Vec<Event> {
+fn order_events() -> Vec<Event> {
     let (actor, reason) = (Actor { name: "somebody".to_owned(), station: "console".to_owned() }, String::new());
     let evidence = String::new();
     vec![
@@ -187,7 +187,7 @@ fn orders() -> Vec<Event> {
     ]
 }
 
-fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
+fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     let text = String::new;
     let mut events = vec![
         Event::LinkLost { device, why: text() },
@@ -217,8 +217,8 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
     for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }
-    let unlike = [Mismatch::Unreachable(text()), Mismatch::WrongDevice(text()), Mismatch::WordOrder(text())];
-    let more = [Mismatch::Inches, Mismatch::Owned(text()), Mismatch::AtAnotherJob(text())];
+    let unlike = [ConnectionRefusal::Unreachable(text()), ConnectionRefusal::WrongDevice(text()), ConnectionRefusal::WordOrder(text())];
+    let more = [ConnectionRefusal::Inches, ConnectionRefusal::Owned(text()), ConnectionRefusal::AtAnotherJob(text())];
     for why in unlike.into_iter().chain(more) {
         events.push(Event::NotConnected { device, why });
     }
@@ -230,14 +230,14 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
     for outcome in outcomes.into_iter().chain([Reconciliation::Unknown(text())]) {
         events.push(Event::Reconciled { device, cycle, outcome });
     }
-    use Asked::{Abort, Acknowledge, Clear, Collect, Discard, Hold, Load, Prepare, Resume, Start, Stop};
+    use MachineRequest::{Abort, Acknowledge, Clear, Collect, Discard, Hold, Load, Prepare, Resume, Start, Stop};
     for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge, Discard] {
         events.push(Event::Refused { device, what, why: text() });
     }
     events
 }
 
-fn of_computations(cycle: u32) -> Vec<Event> {
+fn computation_events(cycle: u32) -> Vec<Event> {
     let text = String::new;
     let failures = [GateFailure::NoPart, GateFailure::Contacts, GateFailure::Inches, GateFailure::Coverage(text())];
     let more = [
@@ -246,9 +246,9 @@ fn of_computations(cycle: u32) -> Vec<Event> {
         GateFailure::Temperature(text()),
         GateFailure::Moved(text()),
     ];
-    let gates = failures.into_iter().chain(more).map(Gate::Failed).chain([Gate::Passed]);
+    let gates = failures.into_iter().chain(more).map(GateResult::Failed).chain([GateResult::Passed]);
     let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
-    events.push(Event::Collected { cycle, targets: 100, found: 10, gate: Gate::Passed });
+    events.push(Event::Collected { cycle, targets: 100, found: 10, gate: GateResult::Passed });
     events.push(Event::PassLoaded { cycle });
     events.push(Event::RecordDoubted { cycle, why: text() });
     events.push(Event::PlanLoaded { cycle });
@@ -300,13 +300,13 @@ fn sample_figures() -> Vec<Figures> {
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: false })),
+            left_out: Some(Box::new(OutlierFigures { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: false })),
             ..plain.clone()
         },
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: true })),
+            left_out: Some(Box::new(OutlierFigures { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: true })),
             ..plain.clone()
         },
         Figures { coverage: 0.5, ..plain.clone() },
@@ -314,14 +314,14 @@ fn sample_figures() -> Vec<Figures> {
         Figures { turn_rad: 3.0, ..plain.clone() },
         Figures { removed_mm: Some(2.0), ..plain.clone() },
         Figures {
-            touch_on: Some(Box::new(TouchOn { targets: 20, why: String::new() })),
+            touch_on: Some(Box::new(FurtherTouches { targets: 20, why: String::new() })),
             coverage: 0.1,
             ..plain.clone()
         },
         Figures { pv_mm: f64::NAN, ..plain.clone() },
     ];
     for response in
-        [Response::Expected, Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled]
+        [PartResponse::Expected, PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled]
     {
         all.push(Figures { response: Some(response), ..plain.clone() });
     }

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
-use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Samples, Trust, accuracy};
-use regrind::surface::{Nominal, Projection};
+use regrind::surface::accuracy::{Accuracy, ErrorEstimate, ErrorFigures, NominalPoints, Reliability, estimate_accuracy};
+use regrind::surface::{Nominal, PlaneProjection};
 use serde::Serialize;
 
 use super::choice::word_of;
@@ -32,8 +32,8 @@ pub(super) struct Arguments {
     #[command(flatten)]
     table: NominalTable,
     /// Projection of scattered points for the triangulation
-    #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
-    projection: Projection,
+    #[arg(long, value_parser = word_of::<PlaneProjection>(), default_value = "auto")]
+    projection: PlaneProjection,
     /// Maximum error of the distance, peak to valley, in nm
     #[arg(long, value_name = "NM", allow_negative_numbers = true, value_parser = finite_above_zero)]
     want: Option<f64>,
@@ -94,25 +94,25 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     let path = &arguments.nominal;
     let projection = arguments.projection;
     match nominal::read(path, arguments.projection, &arguments.table.table())? {
-        NominalFile::Points(points) => accuracy(Samples::Points { points: &points, projection }),
+        NominalFile::Points(points) => estimate_accuracy(NominalPoints::Points { points: &points, projection }),
         NominalFile::Mesh { points, triangles } => {
             // Every command reports a bad mesh with the same message.
             Nominal::from_mesh(points.clone(), triangles)
                 .and_then(|mesh| mesh.check_is_open())
-                .and_then(|()| accuracy(Samples::Points { points: &points, projection }))
+                .and_then(|()| estimate_accuracy(NominalPoints::Points { points: &points, projection }))
         }
         NominalFile::Definition(text) => {
             let grid = nominal::sampled(path, &text)?;
             let (columns, rows) = (grid.columns, grid.rows);
-            accuracy(Samples::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
+            estimate_accuracy(NominalPoints::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
         }
     }
     .map_err(|source| Failure::Nominal { path: path.clone(), source })
 }
 
 impl Kind {
-    fn new(estimate: &Estimate, wanted_nm: Option<f64>) -> Self {
-        let nm = |Figures { pv_mm, rms_mm, max_mm }| [pv_mm, rms_mm, max_mm].map(|mm| 1e6 * mm);
+    fn new(estimate: &ErrorEstimate, wanted_nm: Option<f64>) -> Self {
+        let nm = |ErrorFigures { pv_mm, rms_mm, max_mm }| [pv_mm, rms_mm, max_mm].map(|mm| 1e6 * mm);
         let [pv_nm, rms_nm, max_nm] = nm(estimate.inside);
         let [border_pv_nm, border_rms_nm, border_max_nm] = nm(estimate.border);
         Self {
@@ -128,9 +128,9 @@ impl Kind {
             order: estimate.order,
             observed_order: estimate.observed_order,
             trust: match estimate.reliability {
-                Trust::Extrapolated => "extrapolated",
-                Trust::Rounding => "rounding",
-                Trust::TooCoarse => "too-coarse",
+                Reliability::Extrapolated => "extrapolated",
+                Reliability::Rounding => "rounding",
+                Reliability::TooCoarse => "too-coarse",
             },
             wanted_spacing_mm: wanted_nm.and_then(|nm| estimate.spacing_for(1e-6 * nm)).filter(|h| h.is_finite()),
         }

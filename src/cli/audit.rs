@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use regrind::journal::{
-    Against, Anchor, DATABASE, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against,
+    ExternalEvidence, Anchor, DATABASE, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against,
 };
 use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};
@@ -28,11 +28,11 @@ Examples:
   regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl")]
 pub(super) struct Arguments {
     #[command(subcommand)]
-    what: What,
+    what: AuditCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum AuditCommand {
     Verify(ToVerify),
     Show(ToShow),
     Export(ToExport),
@@ -140,10 +140,10 @@ fn kind(word: &str) -> Result<Kind, String> {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
-        What::Verify(of) => prove(of),
-        What::Show(of) => show(of),
-        What::Export(of) => export(of),
-        What::Key(of) => key::run(of),
+        AuditCommand::Verify(of) => prove(of),
+        AuditCommand::Show(of) => show(of),
+        AuditCommand::Export(of) => export(of),
+        AuditCommand::Key(of) => key::run(of),
     }
 }
 
@@ -183,7 +183,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         return succession::prove(&folder, &arguments.key, arguments.json);
     }
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
-    let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });
+    let found = verify_against(&folder, &ExternalEvidence { anchor, keys: arguments.key.clone() });
     let not_sound = match &found {
         Err(JournalError::Broken { seq, what, .. }) => Some((Some(seq), what)),
         Err(JournalError::NoAuthor { what, .. }) => Some((None, what)),
@@ -237,7 +237,7 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 }
 
 /// Returns the text about files in a run folder that the record does not list.
-fn beside(folder: &Path, unrecorded: &[String]) -> String {
+fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
         && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
@@ -299,7 +299,7 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> S
         mark(begin),
         folder.display(),
         signed(verified, as_given),
-        beside(folder, unrecorded)
+        unrecorded_text(folder, unrecorded)
     )
 }
 

@@ -18,13 +18,13 @@ impl Blocks {
     /// Paints an error map. `most` is the maximum number of characters in width and height.
     ///
     /// Shape: nodes of x, y and error in mm. Half a character is about as wide as it is high.
-    pub(super) fn of(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
+    pub(super) fn paint_error(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::error).collect();
         Self::painted(&nodes, most, |share| ColourMap::Diverging.at(0.5 + 0.5 * share))
     }
 
     /// Paints the standard deviation of the error, from dark (minimum) to bright.
-    pub(super) fn of_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
+    pub(super) fn paint_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::sigma).collect();
         Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
     }
@@ -68,7 +68,7 @@ impl Blocks {
     }
 
     /// Puts another map of the same size to the right, at a distance of `apart` characters.
-    pub(super) fn beside(mut self, other: Self, apart: usize) -> Self {
+    pub(super) fn append_right(mut self, other: Self, apart: usize) -> Self {
         for (row, more) in self.rows.iter_mut().zip(other.rows) {
             row.extend(std::iter::repeat_n([None; 2], apart).chain(more));
         }
@@ -95,16 +95,16 @@ mod tests {
         // Above the surface on the right, below it on the left.
         let node = |i, j| node([f64::from(i), f64::from(j)], 1e-4 * f64::from(i + j) - 2.9e-3);
         let nodes: Vec<MapNode> = (0..40).flat_map(|i| (0..20).map(move |j| node(i, j))).collect();
-        let blocks = Blocks::of(&nodes, [20, 30]).unwrap();
+        let blocks = Blocks::paint_error(&nodes, [20, 30]).unwrap();
         assert!(blocks.rows.iter().all(|row| row.len() == 20) && blocks.rows.len() == 5, "{}", blocks.rows.len());
         let [r, _, b] = blocks.rows[0][19][0].unwrap();
         assert!(r > b, "proud is red");
         let [r, _, b] = blocks.rows[4][0][1].unwrap();
         assert!(b > r, "deep is blue");
-        assert!(Blocks::of(&nodes, [40, 3]).unwrap().rows.len() <= 3);
-        let sigma = Blocks::of_sigma(&nodes, [20, 30]).unwrap();
+        assert!(Blocks::paint_error(&nodes, [40, 3]).unwrap().rows.len() <= 3);
+        let sigma = Blocks::paint_sigma(&nodes, [20, 30]).unwrap();
         assert_eq!((sigma.rows.len(), sigma.limit_um), (5, 0.1));
-        let both = blocks.beside(sigma, 2);
+        let both = blocks.append_right(sigma, 2);
         assert!(both.rows.iter().all(|row| row.len() == 42 && row[20..22] == [[None; 2]; 2]));
         assert_eq!(both.rows[0][30][0].unwrap(), ColourMap::Sequential.at(1.0));
     }
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn what_has_no_extent_is_not_painted() {
         let painted = |places: &[[f64; 2]], most| {
-            Blocks::of(&places.iter().map(|at_mm| node(*at_mm, 0.0)).collect::<Vec<_>>(), most)
+            Blocks::paint_error(&places.iter().map(|at_mm| node(*at_mm, 0.0)).collect::<Vec<_>>(), most)
         };
         for places in [&[][..], &[[1.0, 1.0]], &[[1.0, 1.0], [2.0, 1.0]]] {
             assert!(painted(places, [10, 10]).is_none());

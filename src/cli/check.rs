@@ -10,9 +10,9 @@ use clap::Args;
 use console::Term;
 use regrind::config::{CellConfig, read_dialect};
 use regrind::document::{Problem, Problems};
-use regrind::recipe::{NominalSource, Pattern, Recipe};
-use regrind::setup::{nominal_table, plan_table};
-use regrind::surface::Projection;
+use regrind::recipe::{NominalSource, MeasuringPattern, Recipe};
+use regrind::setup::{nominal_table_format, plan_table_format};
+use regrind::surface::PlaneProjection;
 use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
 
@@ -48,7 +48,7 @@ struct CheckedFile {
     sha256: Option<String>,
     /// What is so on this computer and makes the file no worse: a serial port that is not here.
     notes: Vec<String>,
-    problems: Vec<ToldProblem>,
+    problems: Vec<ProblemDocument>,
 }
 
 /// Summary of a valid file.
@@ -59,7 +59,7 @@ struct Good {
 
 /// One problem, as JSON.
 #[derive(Serialize)]
-struct ToldProblem {
+struct ProblemDocument {
     line: usize,
     column: usize,
     key: String,
@@ -86,7 +86,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let (sha256, problems) = match &checked {
             Ok(good) => (Some(good.sha256.clone()), Vec::new()),
             Err(problems) => {
-                (None, problems.problems.iter().map(|problem| ToldProblem::new(problems, problem)).collect())
+                (None, problems.problems.iter().map(|problem| ProblemDocument::new(problems, problem)).collect())
             }
         };
         let notes = checked.as_ref().map_or(Vec::new(), |good| good.notes.clone());
@@ -139,17 +139,17 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
         }
     };
     if let NominalSource::File { path, table, .. } = &recipe.nominal {
-        match nominal_table(table) {
+        match nominal_table_format(table) {
             Err((key, what)) => add(key, &what),
             Ok(table) => {
-                if let Err(failure) = nominal::read(path, Projection::Auto, &table) {
+                if let Err(failure) = nominal::read(path, PlaneProjection::Auto, &table) {
                     add("nominal.file", &failure);
                 }
             }
         }
     }
-    if let Pattern::File { path, table } = &recipe.pattern {
-        match plan_table(table) {
+    if let MeasuringPattern::File { path, table } = &recipe.pattern {
+        match plan_table_format(table) {
             Err((key, what)) => add(key, &what),
             Ok(table) => {
                 if let Err(failure) = regrind::formats::read_plan(path, &table) {
@@ -213,7 +213,7 @@ fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> Strin
     format!("{}\n\n", renderer.render(&[group.elements(remedy)]))
 }
 
-impl ToldProblem {
+impl ProblemDocument {
     fn new(problems: &Problems, problem: &Problem) -> Self {
         let (line, column) = problems.place(problem);
         let Problem { key, found, allowed, remedy, .. } = problem.clone();

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::compensation::Correction;
-use regrind::compensation::path::{Wanted, height_of, spline_of};
+use regrind::compensation::path::{TargetSurface, nominal_height_field, correction_spline};
 use regrind::formats::gcode::{
     AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, read_program_map,
 };
 use regrind::formats::{Table, is_same_file};
 use regrind::geometry::Grid;
-use regrind::surface::Projection;
+use regrind::surface::PlaneProjection;
 use serde::Serialize;
 
 use super::failure::Failure;
@@ -107,7 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
     let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
-    let shift = spline_of(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
+    let shift = correction_spline(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
     let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;
     let amendment = Amendment {
         shift: &shift,
@@ -115,7 +115,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tolerance_mm: 1e-3 * arguments.tolerance_um,
         map: &map,
         gain: arguments.gain,
-        largest_mm: 1e-3 * arguments.max_correction_um,
+        max_shift_mm: 1e-3 * arguments.max_correction_um,
     };
     let amended = correct_program(&arguments.program, &arguments.out, &amendment).map_err(Failure::Program)?;
     if arguments.json {
@@ -154,10 +154,10 @@ fn summary(amended: &Amended) -> String {
 const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.
-fn ground(file: &std::path::Path, table: &Table) -> Result<Wanted, Failure> {
-    let surface = nominal::surface(file, Projection::Auto, table)?;
+fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
+    let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
-    let (field, _) = height_of(&surface).map_err(failed)?;
+    let (field, _) = nominal_height_field(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };
-    Wanted::new(field, &Correction::zero(grid, 0.0), 1.0).map_err(failed)
+    TargetSurface::new(field, &Correction::zero(grid, 0.0), 1.0).map_err(failed)
 }

@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
-use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, ask, is_live};
+use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, send_request, is_live};
 use regrind::journal::{Kind, MachineLock, Reader};
-use regrind_control::{ask_at, is_live_at};
+use regrind_control::{send_request_at, is_live_at};
 
 use super::Outcome;
 use super::choice::word_of;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name, so_far};
+use super::show::{how_far, limits, pv_name, preview_text};
 use super::words::time_left;
 
 /// Returns the text after the help of each order.
@@ -59,7 +59,7 @@ Exit codes: 0 the cell accepted it; 2 no such run; 3 the cell refused it, or did
 pub(super) struct Confirmation {
     /// Fact to confirm
     #[arg(value_enum)]
-    what: What,
+    what: ConfirmedState,
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
@@ -81,7 +81,7 @@ pub(super) struct Confirmation {
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum What {
+enum ConfirmedState {
     /// The right part is loaded and clamped, wheel and probe are clear of it
     Loaded,
     /// The machine that a person serves has started its job
@@ -103,16 +103,16 @@ pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Resu
 
 pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
     let request = match (arguments.what, arguments.machine) {
-        (What::Loaded, _) => Request::Loaded,
-        (What::Started, _) => Request::Started { map: named_map(arguments)? },
-        (What::Done, _) => Request::Done { map: named_map(arguments)?, file: named_file(arguments)? },
-        (What::Clear, Some(device)) => Request::Clear { device },
-        (What::Clear, None) => return Err(Failure::NoMachine),
-        (What::Still, device) => Request::Still { device },
-        (What::Over, Some(device)) if !arguments.evidence.trim().is_empty() => {
+        (ConfirmedState::Loaded, _) => Request::Loaded,
+        (ConfirmedState::Started, _) => Request::Started { map: named_map(arguments)? },
+        (ConfirmedState::Done, _) => Request::Done { map: named_map(arguments)?, file: named_file(arguments)? },
+        (ConfirmedState::Clear, Some(device)) => Request::Clear { device },
+        (ConfirmedState::Clear, None) => return Err(Failure::NoMachine),
+        (ConfirmedState::Still, device) => Request::Still { device },
+        (ConfirmedState::Over, Some(device)) if !arguments.evidence.trim().is_empty() => {
             Request::Over { device, evidence: arguments.evidence.clone() }
         }
-        (What::Over, _) => return Err(Failure::Evidence),
+        (ConfirmedState::Over, _) => return Err(Failure::Evidence),
     };
     give(arguments.run.as_deref(), &request, arguments.json)
 }
@@ -150,9 +150,9 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
 /// Sends a request to the cell of a run folder. If nobody listens there, uses the socket next to the lock of its
 /// machines.
 fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
-    match ask(folder, request) {
+    match send_request(folder, request) {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
-            door_beside_lock(folder).map_or(Err(error), |door| ask_at(&door, request))
+            door_beside_lock(folder).map_or(Err(error), |door| send_request_at(&door, request))
         }
         asked => asked,
     }
@@ -170,7 +170,7 @@ fn door_beside_lock(folder: &Path) -> Option<PathBuf> {
 
 /// Returns the runs that hold machines on this computer and whose cells listen next to the machine locks.
 fn beside_locks() -> impl Iterator<Item = (PathBuf, PathBuf)> {
-    MachineLock::doors().into_iter().filter(|(_, door)| is_live_at(door))
+    MachineLock::control_sockets().into_iter().filter(|(_, door)| is_live_at(door))
 }
 
 /// Returns true if two paths have the same components. The files need not exist.
@@ -185,11 +185,11 @@ fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(
     if *request != Request::Status {
         return if reply.taken { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
     }
-    super::print(&told(&reply.status, folder))
+    super::print(&status_text(&reply.status, folder))
 }
 
 /// Returns the status of a cell as text, the most urgent information first.
-fn told(status: &Snapshot, folder: &Path) -> String {
+fn status_text(status: &Snapshot, folder: &Path) -> String {
     let mut text = String::new();
     let marked = if status.simulation { "SIMULATION  " } else { "" };
     let cycle = match status.cycle {
@@ -202,7 +202,7 @@ fn told(status: &Snapshot, folder: &Path) -> String {
         let _ = writeln!(text, "{}{left}", how_far(device, done, total));
     }
     if let Some(told) = &status.so_far {
-        let _ = writeln!(text, "{}", so_far(told));
+        let _ = writeln!(text, "{}", preview_text(told));
     }
     for alarm in &status.alarms {
         let _ = writeln!(text, "ALARM    {}\n         {}", alarm.what, alarm.consequence);

@@ -5,11 +5,11 @@ use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use regrind::cell::Device;
-use regrind::config::{BUILT_IN, CellConfig, Link};
+use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
 use regrind::device::{
     DeviceError, DriverError, LineAddress, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status,
 };
-use regrind::drive::recover::{in_short, look};
+use regrind::drive::recovery::{describe_status, read_status};
 use regrind::formats::{ResultFolder, try_writing};
 use regrind::journal::{free_bytes, is_open_to_all, utc};
 use regrind::recipe::Recipe;
@@ -18,7 +18,7 @@ use regrind::setup;
 use serde::Serialize;
 
 use super::failure::Failure;
-use super::live::take;
+use super::live::lock_machine;
 use super::run::within;
 use super::{Outcome, check, control, key};
 
@@ -36,7 +36,7 @@ Example:
 Exit codes: 0 no obstacle; 1 an obstacle to a run; 2 bad cell file.")]
 pub(super) struct Arguments {
     /// Cell to check
-    #[arg(value_name = "CELL", default_value = BUILT_IN)]
+    #[arg(value_name = "CELL", default_value = BUILT_IN_CELL)]
     cell: PathBuf,
     /// Recipe to run on it
     #[arg(long, value_name = "FILE")]
@@ -53,13 +53,13 @@ pub(super) struct Arguments {
 #[derive(Serialize)]
 struct Finding {
     what: String,
-    found: Found,
+    found: FindingLevel,
     words: String,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum Found {
+enum FindingLevel {
     Good,
     /// No obstacle, and worth knowing.
     Notice,
@@ -68,14 +68,14 @@ enum Found {
 }
 
 impl Finding {
-    fn new(what: impl Into<String>, found: Found, words: impl Into<String>) -> Self {
+    fn new(what: impl Into<String>, found: FindingLevel, words: impl Into<String>) -> Self {
         Self { what: what.into(), found, words: words.into() }
     }
 
-    fn of<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
+    fn from_result<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
         match looked {
-            Ok(words) => Self::new(what, Found::Good, words),
-            Err(why) => Self::new(what, Found::Obstacle, why.to_string()),
+            Ok(words) => Self::new(what, FindingLevel::Good, words),
+            Err(why) => Self::new(what, FindingLevel::Obstacle, why.to_string()),
         }
     }
 }
@@ -83,27 +83,27 @@ impl Finding {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let Arguments { cell: path, recipe, runs, json } = arguments;
     let cell = check::or_show(CellConfig::read(path))?;
-    let mut findings = vec![Finding::new("cell", Found::Good, format!("{} is a good cell file", path.display()))];
-    findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", Found::Notice, note)));
+    let mut findings = vec![Finding::new("cell", FindingLevel::Good, format!("{} is a good cell file", path.display()))];
+    findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", FindingLevel::Notice, note)));
     findings.extend([folder(runs), clock(runs), signing()]);
     findings.extend(open_runs(runs));
-    findings.extend(recipe.as_ref().map(|recipe| Finding::of("recipe", fits(recipe, &cell))));
+    findings.extend(recipe.as_ref().map(|recipe| Finding::from_result("recipe", fits(recipe, &cell))));
     findings.extend(super::runtime()?.block_on(machines(&cell)));
     if *json {
         super::print_json(&findings)?;
     } else {
         super::print(&findings.iter().map(in_words).collect::<String>())?;
     }
-    let obstacle = findings.iter().any(|finding| finding.found == Found::Obstacle);
+    let obstacle = findings.iter().any(|finding| finding.found == FindingLevel::Obstacle);
     Ok(if obstacle { Outcome::NotInTolerance } else { Outcome::Accepted })
 }
 
 fn in_words(finding: &Finding) -> String {
     let Finding { what, found, words } = finding;
     let mark = match found {
-        Found::Good => "ok",
-        Found::Notice => "note",
-        Found::Obstacle => "OBSTACLE",
+        FindingLevel::Good => "ok",
+        FindingLevel::Notice => "note",
+        FindingLevel::Obstacle => "OBSTACLE",
     };
     format!("{mark:<9}{what}: {words}\n")
 }
@@ -115,15 +115,15 @@ fn folder(runs: &Path) -> Finding {
     let written = if runs.is_dir() { try_writing(runs) } else { ResultFolder::prepare(runs).map(drop) };
     let free = free_bytes(runs).unwrap_or(u64::MAX);
     match written {
-        Err(error) => Finding::new("folder of the runs", Found::Obstacle, error.to_string()),
+        Err(error) => Finding::new("folder of the runs", FindingLevel::Obstacle, error.to_string()),
         Ok(()) if free < LITTLE_BYTES => {
             let words =
                 format!("{} has {} MB free; a run of many points requires hundreds of MB", runs.display(), free >> 20);
-            Finding::new("folder of the runs", Found::Notice, words)
+            Finding::new("folder of the runs", FindingLevel::Notice, words)
         }
         Ok(()) => Finding::new(
             "folder of the runs",
-            Found::Good,
+            FindingLevel::Good,
             format!("{} is writable, {} GB are free", runs.display(), free >> 30),
         ),
     }
@@ -138,7 +138,7 @@ fn open_runs(runs: &Path) -> Option<Finding> {
          {}/*`",
         runs.display()
     );
-    (open > 0).then(|| Finding::new("runs", Found::Notice, words))
+    (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
 }
 
 /// Checks that the clock is not before the recorded times.
@@ -156,22 +156,22 @@ fn clock(runs: &Path) -> Finding {
             "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the numbers of the \
              records keep their order"
         );
-        return Finding::new("clock", Found::Notice, words);
+        return Finding::new("clock", FindingLevel::Notice, words);
     }
-    Finding::new("clock", Found::Good, format!("{now:.19} UTC"))
+    Finding::new("clock", FindingLevel::Good, format!("{now:.19} UTC"))
 }
 
 fn signing() -> Finding {
     match key::of_this_user() {
         Ok(Some(key)) => {
-            Finding::new("audit key", Found::Good, format!("records are signed with {}", key.public().fingerprint()))
+            Finding::new("audit key", FindingLevel::Good, format!("records are signed with {}", key.public().fingerprint()))
         }
         Ok(None) => Finding::new(
             "audit key",
-            Found::Notice,
+            FindingLevel::Notice,
             "there is no key, so records are not signed; to make one: regrind audit key",
         ),
-        Err(error) => Finding::new("audit key", Found::Obstacle, error.to_string()),
+        Err(error) => Finding::new("audit key", FindingLevel::Obstacle, error.to_string()),
     }
 }
 
@@ -180,7 +180,7 @@ fn signing() -> Finding {
 fn fits(recipe: &Path, cell: &CellConfig) -> Result<String, Failure> {
     let recipe = check::or_show(Recipe::read(recipe))?;
     let (task, _) = setup::prepare(&recipe, cell).map_err(Failure::Setup)?;
-    let sphere = if task.sphere.is_some() { ", and the reference sphere is clear of the part" } else { "" };
+    let sphere = if task.reference_sphere.is_some() { ", and the reference sphere is clear of the part" } else { "" };
     Ok(format!("{} is within the limits of this cell{sphere}", recipe.path().display()))
 }
 
@@ -188,82 +188,82 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     if within(cell) {
         return vec![Finding::new(
             "machines",
-            Found::Good,
+            FindingLevel::Good,
             "simulated within the program: there is nothing to connect",
         )];
     }
-    let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
+    let settings = |link| setup::modbus_settings(link, cell.simulated, 1, 1);
     let [cmm, grinder] = [&cell.cmm.link, &cell.grinder.link];
     vec![
         match cmm.wire.ippdme_address() {
-            Some(_) => server(MachineKind::Cmm, cmm, setup::cmm(cell)).await,
-            None if cmm.wire.hit_source().is_some() => heard(cmm, setup::cmm(cell)).await,
+            Some(_) => server(MachineKind::Cmm, cmm, setup::create_cmm(cell)).await,
+            None if cmm.wire.hit_source().is_some() => heard(cmm, setup::create_cmm(cell)).await,
             None => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
         },
         match grinder.wire.linuxcncrsh_address() {
-            Some(_) => server(MachineKind::Grinder, grinder, setup::grinder(cell)).await,
+            Some(_) => server(MachineKind::Grinder, grinder, setup::create_grinder(cell)).await,
             None => machine(Device::Grinder, cell, settings(grinder), ModbusGrinder::new).await,
         },
     ]
 }
 
 /// Checks a server that runs no job: opens a session, requests identity and status, and ends the session.
-async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, DriverError>) -> Finding {
+async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M, DriverError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,
         MachineKind::Grinder => Device::Grinder,
     };
     let what = what.to_string();
-    let _taken = match take(link, kind, Path::new("regrind doctor")) {
+    let _taken = match lock_machine(link, kind, Path::new("regrind doctor")) {
         Ok(taken) => taken,
-        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+        Err(failure) => return Finding::new(what, FindingLevel::Notice, failure.to_string()),
     };
     let mut machine = match made {
         Ok(machine) => machine,
-        Err(error) => return Finding::new(what, Found::Obstacle, error.to_string()),
+        Err(error) => return Finding::new(what, FindingLevel::Obstacle, error.to_string()),
     };
     let looked = async {
         let identity = machine.connect().await?;
         let status = machine.status().await?;
-        let words = format!("{}: {} is {}", machine.name(), identity.name, in_short(&status));
+        let words = format!("{}: {} is {}", machine.name(), identity.name, describe_status(&status));
         let told = machine.notes().iter().fold(words, |words, note| format!("{words}; {note}"));
         machine.release().await?;
         Ok::<_, DeviceError>(told)
     };
-    Finding::of(&what, looked.await)
+    Finding::from_result(&what, looked.await)
 }
 
 /// Time for which a line is listened to.
 const LISTENS: Duration = Duration::from_secs(5);
 
 /// Checks a machine that only prints: opens its line, and reports the lines that arrive with the matching formats.
-async fn heard(link: &Link, made: Result<impl Machine, DriverError>) -> Finding {
+async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Finding {
     let what = Device::Cmm.to_string();
-    let _taken = match take(link, MachineKind::Cmm, Path::new("regrind doctor")) {
+    let _taken = match lock_machine(link, MachineKind::Cmm, Path::new("regrind doctor")) {
         Ok(taken) => taken,
-        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+        Err(failure) => return Finding::new(what, FindingLevel::Notice, failure.to_string()),
     };
     let mut machine = match made {
         Ok(machine) => machine,
-        Err(error) => return Finding::new(what, Found::Obstacle, error.to_string()),
+        Err(error) => return Finding::new(what, FindingLevel::Obstacle, error.to_string()),
     };
     let name = machine.name().to_owned();
     if let Err(error) = machine.connect().await {
-        return Finding::new(what, Found::Obstacle, error.to_string());
+        return Finding::new(what, FindingLevel::Obstacle, error.to_string());
     }
     let until = tokio::time::Instant::now() + LISTENS;
     while machine.notes().is_empty() && tokio::time::Instant::now() < until {
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     match machine.notes().pop() {
-        Some(note) => Finding::new(what, Found::Notice, format!("{name}: {note}")),
+        Some(note) => Finding::new(what, FindingLevel::Notice, format!("{name}: {note}")),
         None => {
             let listened = LISTENS.as_secs();
             let words = format!(
                 "{name} is open, and no line arrived in {listened} s: touch something within this time to see the \
                  formats that it matches"
             );
-            Finding::new(what, Found::Notice, words)
+            Finding::new(what, FindingLevel::Notice, words)
         }
     }
 }
@@ -277,9 +277,9 @@ async fn machine<M: Machine>(
     let what = device.to_string();
     let Some(settings) = settings else {
         let words = "it reports nothing over a wire; its folders and settings are valid";
-        return match setup::is_there(cell, device) {
-            Ok(()) => Finding::new(what, Found::Notice, words),
-            Err(error) => Finding::new(what, Found::Obstacle, error.to_string()),
+        return match setup::check_machine(cell, device) {
+            Ok(()) => Finding::new(what, FindingLevel::Notice, words),
+            Err(error) => Finding::new(what, FindingLevel::Obstacle, error.to_string()),
         };
     };
     let (kind, link) = match device {
@@ -287,25 +287,25 @@ async fn machine<M: Machine>(
         Device::Grinder => (MachineKind::Grinder, &cell.grinder.link),
     };
     // The holder of the lock works with the machine, and a second client would disturb it.
-    let _taken = match take(link, kind, Path::new("regrind doctor")) {
+    let _taken = match lock_machine(link, kind, Path::new("regrind doctor")) {
         Ok(taken) => taken,
-        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+        Err(failure) => return Finding::new(what, FindingLevel::Notice, failure.to_string()),
     };
     if let Some((LineAddress::Rtu { device: port, .. }, _)) = link.wire.modbus_line()
         && !Path::new(&port).exists()
     {
         return Finding::new(
             what,
-            Found::Obstacle,
+            FindingLevel::Obstacle,
             format!("there is no port {port}: check the cable, and the name in the cell file"),
         );
     }
     match make(settings) {
-        Err(error) => Finding::new(what, Found::Obstacle, format!("its port cannot be opened: {error}")),
+        Err(error) => Finding::new(what, FindingLevel::Obstacle, format!("its port cannot be opened: {error}")),
         Ok(mut machine) => {
-            let looked = look(&mut machine).await;
+            let looked = read_status(&mut machine).await;
             let name = machine.name().to_owned();
-            Finding::of(&what, looked.map(|status: Status| format!("{name} is {}", in_short(&status))))
+            Finding::from_result(&what, looked.map(|status: Status| format!("{name} is {}", describe_status(&status))))
         }
     }
 }

@@ -184,7 +184,7 @@ pub(super) enum Failure {
     #[error("the port of the {device} is not available: {source}")]
     Port { device: regrind::cell::Device, source: io::Error },
     #[error("{device}: {source}")]
-    Recover { device: regrind::cell::Device, source: regrind::drive::recover::RecoverError },
+    Recover { device: regrind::cell::Device, source: regrind::drive::recovery::RecoveryError },
     #[error("it is unknown whether both machines are idle; begin again, or check the machine without a wire")]
     NotHome,
     #[error(transparent)]

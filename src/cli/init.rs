@@ -99,14 +99,14 @@ impl Machines {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Wanted { folder, machines, part } = wanted(arguments)?;
+    let InitSettings { folder, machines, part } = read_settings(arguments)?;
     let (recipe, shipped_name) = machines.recipe();
     let name = part.as_deref().unwrap_or(shipped_name);
     make(&folder, machines, recipe_of(recipe, shipped_name, name), name)
 }
 
 /// Files to create.
-struct Wanted {
+struct InitSettings {
     folder: PathBuf,
     machines: Machines,
     part: Option<String>,
@@ -114,10 +114,10 @@ struct Wanted {
 
 /// Returns the values from the arguments. A person at a terminal is asked for missing ones, unless the folder was
 /// given.
-fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
+fn read_settings(arguments: &Arguments) -> Result<InitSettings, Failure> {
     let Arguments { folder, machines, part } = arguments.clone();
     if let Some(folder) = folder {
-        return Ok(Wanted { folder, machines: machines.unwrap_or(Machines::Simulated), part });
+        return Ok(InitSettings { folder, machines: machines.unwrap_or(Machines::Simulated), part });
     }
     if !(io::stdin().is_terminal() && io::stdout().is_terminal()) {
         return Err(Failure::NoFolder);
@@ -132,7 +132,7 @@ fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
         Some(part) => part,
         None => ask("Name of the part", shipped, super::name)?,
     };
-    Ok(Wanted { folder, machines, part: Some(part) })
+    Ok(InitSettings { folder, machines, part: Some(part) })
 }
 
 fn ask_for_machines() -> Result<Machines, Failure> {

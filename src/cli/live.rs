@@ -4,13 +4,13 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use regrind::cell::{Actor, Ending};
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{AnyCmm, AnyGrinder, MachineKind};
-use regrind::drive::{Beside, Drive, Interrupted, Ledger, Orders, Request, Run, Task};
+use regrind::drive::{BlockingExecutor, Drive, InterruptedRun, JournalSink, OrderSender, Request, RunInputs, Task};
 use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
-use regrind_control::Next;
+use regrind_control::NextStep;
 use tokio::sync::mpsc;
 
 use super::Outcome;
@@ -19,7 +19,7 @@ use super::outside::{self, Endings};
 use super::show::{Show, reads_keys};
 
 /// Context of a run.
-pub(super) struct Live<'a> {
+pub(super) struct RunContext<'a> {
     pub(super) recipe: &'a Recipe,
     pub(super) cell: &'a CellConfig,
     /// Name of the part in files.
@@ -40,39 +40,39 @@ pub(super) struct Machines {
 }
 
 /// Inputs of a run besides its machines.
-pub(super) struct Work {
+pub(super) struct PreparedRun {
     pub(super) task: Task,
     pub(super) plan: regrind::cell::CellPlan,
     pub(super) journal: Journal,
     /// True if no confirmation that the part is loaded is required.
     pub(super) loaded: bool,
-    pub(super) interrupted: Option<Interrupted>,
+    pub(super) interrupted: Option<InterruptedRun>,
 }
 
-impl Live<'_> {
+impl RunContext<'_> {
     /// Locks the machines and opens their wires. Sends nothing to them. `now` is the time as an epoch.
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
         let taken =
-            [take(&cell.cmm.link, MachineKind::Cmm, folder)?, take(&cell.grinder.link, MachineKind::Grinder, folder)?];
+            [lock_machine(&cell.cmm.link, MachineKind::Cmm, folder)?, lock_machine(&cell.grinder.link, MachineKind::Grinder, folder)?];
         let client = [owner(&self.actor, folder), MachineLock::epoch(taken.iter().flatten(), now)];
-        let (cmm, grinder) = setup::machines(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
+        let (cmm, grinder) = setup::create_drivers(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
         Ok(Machines { cmm, grinder, taken })
     }
 
     /// Runs until the end and writes the report.
-    pub(super) async fn carry_out(self, machines: Machines, work: Work) -> Result<Ending, Failure> {
+    pub(super) async fn carry_out(self, machines: Machines, work: PreparedRun) -> Result<Ending, Failure> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
         let showing = tokio::spawn(
-            Show::new(self.json, cell.is_marked(), self.recipe, work.plan.tolerance, self.folder).follow(shown),
+            Show::new(self.json, cell.is_marked_simulation(), self.recipe, work.plan.tolerance, self.folder).follow(shown),
         );
-        let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
-        let Work { task, plan, journal, loaded, interrupted } = work;
-        let (journal, beside): (Box<dyn Ledger>, _) = (Box::new(journal), Beside::Threads);
+        let poll = [setup::poll_interval(&cell.cmm.link), setup::poll_interval(&cell.grinder.link)];
+        let PreparedRun { task, plan, journal, loaded, interrupted } = work;
+        let (journal, beside): (Box<dyn JournalSink>, _) = (Box::new(journal), BlockingExecutor::Threads);
         let actor_of_run = actor.clone();
         let run =
-            Run { plan, task, journal, job: self.job, actor: actor_of_run, loaded, poll, notices, interrupted, beside };
+            RunInputs { plan, task, journal, job: self.job, actor: actor_of_run, load_confirmed: loaded, poll_intervals: poll, notices, interrupted, executor: beside };
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
         // The record is closed. A failed report or a closed terminal must not change the result of the run.
@@ -86,14 +86,14 @@ impl Live<'_> {
 }
 
 /// Gives the machines to the run and starts it.
-async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
+async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let Machines { cmm, grinder, taken } = machines;
     let (mut drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
     // One socket next to the locks is enough. A cell without it still receives orders in its folder.
-    if let Some(door) = taken.iter().flatten().map(MachineLock::door).next()
-        && let Err(error) = drive.listen_beside(door)
+    if let Some(door) = taken.iter().flatten().map(MachineLock::control_socket).next()
+        && let Err(error) = drive.listen_also_at(door)
     {
         eprintln!("{}: no orders come in there: {error}", regrind::document::visible(&door.display().to_string()));
     }
@@ -109,25 +109,25 @@ async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failur
 }
 
 /// Holds at the next safe place on the first Ctrl-C and aborts on the second. After a resume the count starts again.
-async fn heed_ctrl_c(orders: Orders, actor: Actor) {
+async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
-        let again = held_at.is_some_and(|at| at.elapsed() < IN_ONE_GO || !orders.is_working());
+        let again = held_at.is_some_and(|at| at.elapsed() < IN_ONE_GO || !orders.is_executing());
         held_at = if again { held_at } else { Some(Instant::now()) };
         let request = if again {
             Request::Abort { reason: "Ctrl-C, twice".into() }
         } else {
             Request::Hold { reason: "Ctrl-C".into() }
         };
-        orders.give(request, actor.clone()).await;
+        orders.send(request, actor.clone()).await;
     }
 }
 
 /// Confirms the loaded part on Enter, if a person at this terminal is asked for it. Keys pressed earlier confirm
 /// nothing.
-async fn heed_enter(orders: Orders, actor: Actor) {
+async fn heed_enter(orders: OrderSender, actor: Actor) {
     let mut status = orders.status();
-    if status.wait_for(|seen| seen.next_step == Next::Load).await.is_err() || !reads_keys() {
+    if status.wait_for(|seen| seen.next_step == NextStep::Load).await.is_err() || !reads_keys() {
         return;
     }
     // If earlier input cannot be discarded, Enter is not accepted as a confirmation.
@@ -136,7 +136,7 @@ async fn heed_enter(orders: Orders, actor: Actor) {
     }
     // Own thread, because reading a terminal blocks. It stops when nobody is asked or when the program loses the
     // terminal.
-    let still_asked = move || status.has_changed().is_ok() && status.borrow().next_step == Next::Load;
+    let still_asked = move || status.has_changed().is_ok() && status.borrow().next_step == NextStep::Load;
     let typed = tokio::task::spawn_blocking(move || {
         while still_asked() {
             if let Some(entered) = outside::enter_within(BETWEEN_LOOKS, reads_keys) {
@@ -146,7 +146,7 @@ async fn heed_enter(orders: Orders, actor: Actor) {
         false
     });
     if typed.await.unwrap_or(false) {
-        orders.give(Request::Loaded, actor).await;
+        orders.send(Request::Loaded, actor).await;
     }
 }
 
@@ -154,7 +154,7 @@ async fn heed_enter(orders: Orders, actor: Actor) {
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
 /// Ends the run in order on the first event and aborts it on the next. A closing terminal can send the event twice.
-async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
+async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     let mut first: Option<Instant> = None;
     while let Some(outside::Ending { by, hung_up }) = endings.next().await {
         let request = match first {
@@ -163,12 +163,12 @@ async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
             Some(_) => Request::Abort { reason: format!("{by}, again") },
         };
         first = first.or_else(|| Some(Instant::now()));
-        orders.give(request, actor.clone()).await;
+        orders.send(request, actor.clone()).await;
     }
 }
 
 /// Locks a machine on a line against all other runs on this computer.
-pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
+pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.modbus_line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
     let served = link
@@ -177,7 +177,7 @@ pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<
         .or(link.wire.linuxcncrsh_address())
         .map(|(host, port)| format!("{kind} at {host}:{port}"));
     let heard = link.wire.hit_source().map(|line| format!("{kind} at {line}"));
-    let taken = on_line.or(served).or(heard).map(|machine| MachineLock::take(&machine, &run));
+    let taken = on_line.or(served).or(heard).map(|machine| MachineLock::acquire(&machine, &run));
     let taken = taken.transpose().map_err(Failure::Machine)?;
     for note in taken.iter().flat_map(MachineLock::notes) {
         eprintln!("lock: {}", regrind::document::visible(note));

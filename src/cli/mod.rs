@@ -4,7 +4,7 @@ mod accuracy;
 mod audit;
 mod blocks;
 #[cfg(feature = "plant")]
-mod cell_now;
+mod cell_monitor;
 mod check;
 mod choice;
 mod compensate;
@@ -30,19 +30,19 @@ mod schema;
 mod serve;
 mod shell;
 #[cfg(feature = "plant")]
-mod ship;
+mod replicate;
 mod show;
 mod simulate;
 mod simulated;
 mod states;
 mod succession;
 #[cfg(feature = "plant")]
-mod tell;
+mod publish;
 mod users;
 mod watch;
 mod words;
 #[cfg(feature = "plant")]
-mod work;
+mod run_queue;
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -88,13 +88,13 @@ enum Command {
     Serve(serve::Arguments),
     Users(users::Arguments),
     #[cfg(feature = "plant")]
-    Ship(ship::Arguments),
+    Ship(replicate::Arguments),
     #[cfg(feature = "plant")]
-    Work(work::Arguments),
+    Work(run_queue::Arguments),
     #[cfg(feature = "plant")]
     Study(plant::studies::Arguments),
     #[cfg(feature = "plant")]
-    Tell(tell::Arguments),
+    Tell(publish::Arguments),
     #[cfg(feature = "plant")]
     Plant(plant::Arguments),
     Audit(audit::Arguments),
@@ -155,13 +155,13 @@ fn run() -> ExitCode {
         Command::Serve(arguments) => serve::run(&arguments),
         Command::Users(arguments) => users::run(&arguments),
         #[cfg(feature = "plant")]
-        Command::Ship(arguments) => ship::run(&arguments),
+        Command::Ship(arguments) => replicate::run(&arguments),
         #[cfg(feature = "plant")]
-        Command::Work(arguments) => work::run(&arguments),
+        Command::Work(arguments) => run_queue::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Study(arguments) => plant::studies::run(&arguments),
         #[cfg(feature = "plant")]
-        Command::Tell(arguments) => tell::run(&arguments),
+        Command::Tell(arguments) => publish::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Plant(arguments) => plant::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),

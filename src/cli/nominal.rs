@@ -5,7 +5,7 @@ use std::path::Path;
 use clap::Args;
 use regrind::formats::{Columns, NominalFile, Table, Unit, read_nominal_as};
 use regrind::setup;
-use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
+use regrind::surface::{DefinedSurface, Nominal, NominalKind, PlaneProjection, SampledSurface};
 
 use super::failure::Failure;
 use super::words::count;
@@ -35,14 +35,14 @@ impl NominalTable {
 /// # Errors
 /// Returns an error if the file cannot be read, if columns are missing, or if a projection is given for anything but a
 /// point cloud.
-pub(super) fn read(path: &Path, projection: Projection, table: &Table) -> Result<NominalFile, Failure> {
+pub(super) fn read(path: &Path, projection: PlaneProjection, table: &Table) -> Result<NominalFile, Failure> {
     let file = read_nominal_as(path, table)?;
     let what = match file {
         NominalFile::Points(_) => return Ok(file),
         NominalFile::Mesh { .. } => "a mesh",
         NominalFile::Definition(_) => "a definition",
     };
-    if projection != Projection::Auto {
+    if projection != PlaneProjection::Auto {
         return Err(Failure::Projection { path: path.to_owned(), what });
     }
     Ok(file)
@@ -52,8 +52,8 @@ pub(super) fn read(path: &Path, projection: Projection, table: &Table) -> Result
 ///
 /// # Errors
 /// Returns the errors of [`read`], and an error with the file name if the content does not make a surface.
-pub(super) fn surface(path: &Path, projection: Projection, table: &Table) -> Result<Nominal, Failure> {
-    setup::surface(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
+pub(super) fn surface(path: &Path, projection: PlaneProjection, table: &Table) -> Result<Nominal, Failure> {
+    setup::nominal_from_file(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
 }
 
 /// Samples a defined surface at its spacing.
@@ -74,9 +74,9 @@ pub(super) fn kind_in_words(kind: NominalKind) -> String {
         NominalKind::Grid { columns, rows } => format!("grid of {} x {}", count(columns), count(rows)),
         NominalKind::Scattered { projection } => {
             let plane = match projection {
-                Projection::Auto | Projection::Xy => "xy",
-                Projection::BestFit => "best-fit",
-                Projection::Spherical => "spherical",
+                PlaneProjection::Auto | PlaneProjection::Xy => "xy",
+                PlaneProjection::BestFit => "best-fit",
+                PlaneProjection::Spherical => "spherical",
             };
             format!("scattered, {plane} projection")
         }

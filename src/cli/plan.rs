@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::cell::Beginning;
-use regrind::compensation::path::{ArcSummary, Peak, Scallops, Summary, ToolPath};
-use regrind::config::{BUILT_IN, CellConfig};
+use regrind::cell::FirstStep;
+use regrind::compensation::path::{ArcSummary, Peak, Scallops, PathSummary, ToolPath};
+use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::gcode::GcodeError;
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::Recipe;
-use regrind::setup::{self, SCALLOP_SHARE};
+use regrind::setup::{self, MAX_SCALLOP_SHARE};
 use serde::Serialize;
 
 use super::Outcome;
@@ -30,7 +30,7 @@ pub(super) struct Arguments {
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
     /// Cell that would make the part
-    #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN_CELL)]
     cell: PathBuf,
     /// Write the program of the first pass, which has no correction, to this file
     #[arg(long, value_name = "FILE")]
@@ -62,7 +62,7 @@ struct Document {
     track_mm: f64,
     /// What the tracks leave between them; absent where no path can be laid.
     #[serde(skip_serializing_if = "Option::is_none")]
-    scallops: Option<ScallopsTold>,
+    scallops: Option<ScallopsDocument>,
     path_mm: f64,
     grinding_minutes: f64,
     /// What one pass takes off, reckoned as depth of cut times the ground that its tracks cover.
@@ -85,12 +85,12 @@ struct Document {
     program_points: Option<u64>,
     /// What becomes of these points in arcs; absent where the cell asks for none.
     #[serde(skip_serializing_if = "Option::is_none")]
-    arcs: Option<ArcsTold>,
+    arcs: Option<ArcsDocument>,
     /// The dialect that it is written in.
     dialect: String,
     /// How the head tilts the wheel; absent where it does not.
     #[serde(skip_serializing_if = "Option::is_none")]
-    tilt: Option<TiltTold>,
+    tilt: Option<TiltDocument>,
     /// Why none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     no_program: Option<String>,
@@ -100,7 +100,7 @@ struct Document {
 
 /// Pass in arcs, compared with the same pass in lines.
 #[derive(Serialize)]
-struct ArcsTold {
+struct ArcsDocument {
     arcs: u64,
     /// Lines at feed that are left.
     lines: u64,
@@ -115,8 +115,8 @@ struct ArcsTold {
     lines_alone_corner_mrad: f64,
 }
 
-impl ArcsTold {
-    fn of(arcs: &ArcSummary, summary: &Summary, within_mm: f64) -> Self {
+impl ArcsDocument {
+    fn new(arcs: &ArcSummary, summary: &PathSummary, within_mm: f64) -> Self {
         let [largest_corner_mrad, lines_alone_corner_mrad] = arcs.corner_rad.map(|rad| 1e3 * rad);
         Self {
             arcs: arcs.arcs,
@@ -149,7 +149,7 @@ impl ArcsTold {
 
 /// Tilt of the wheel by the head, on the scale of its axis.
 #[derive(Serialize)]
-struct TiltTold {
+struct TiltDocument {
     axis: char,
     least_deg: f64,
     most_deg: f64,
@@ -158,17 +158,17 @@ struct TiltTold {
     least_lean_deg: f64,
 }
 
-impl TiltTold {
-    fn of(path: &ToolPath, summary: &Summary) -> Option<Self> {
+impl TiltDocument {
+    fn new(path: &ToolPath, summary: &PathSummary) -> Option<Self> {
         let turned = summary.head_rotation?;
-        let on_scale = |peak: Peak| turned.rotary.on_scale_rad(peak.value).to_degrees();
+        let on_scale = |peak: Peak| turned.rotary.scale_reading_rad(peak.value).to_degrees();
         let [a, b] = [on_scale(turned.min_tilt_rad), on_scale(turned.max_tilt_rad)];
         Some(Self {
             axis: turned.rotary.letter,
             least_deg: a.min(b),
             most_deg: a.max(b),
             largest_rate_deg_min: 60.0 * turned.max_rate_rad_s.value.to_degrees(),
-            least_lean_deg: path.least_lean_rad().to_degrees(),
+            least_lean_deg: path.min_head_angle_rad().to_degrees(),
         })
     }
 
@@ -187,7 +187,7 @@ impl TiltTold {
 
 /// Scallops, compared with the tolerances for form and scallops together.
 #[derive(Serialize)]
-struct ScallopsTold {
+struct ScallopsDocument {
     pv_um: f64,
     rms_um: f64,
     mean_um: f64,
@@ -197,8 +197,8 @@ struct ScallopsTold {
     allowed_rms_um: Option<f64>,
 }
 
-impl ScallopsTold {
-    fn of(scallops: &Scallops, recipe: &Recipe) -> Self {
+impl ScallopsDocument {
+    fn new(scallops: &Scallops, recipe: &Recipe) -> Self {
         let [pv_um, rms_um, mean_um] = [scallops.height_mm, scallops.rms_mm, scallops.mean_mm].map(|mm| 1e3 * mm);
         let [allowed_pv_um, allowed_rms_um] =
             [recipe.acceptance.pv_um, recipe.acceptance.rms_um].map(|um| um.map(|um| um.0));
@@ -213,7 +213,7 @@ impl ScallopsTold {
         ];
         let of = |(key, found, allowed): (&str, f64, Option<f64>)| {
             let share = found / allowed?;
-            (share > SCALLOP_SHARE * (1.0 + 1e-9)).then(|| format!("{} % of {key}", three_digits(100.0 * share)))
+            (share > MAX_SCALLOP_SHARE * (1.0 + 1e-9)).then(|| format!("{} % of {key}", three_digits(100.0 * share)))
         };
         taken.into_iter().filter_map(of).collect()
     }
@@ -251,20 +251,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
     // Without a program, tracks over the box around the part are the best estimate.
     let (tracks, pass_mm) = match &program {
-        Some((path, summary)) => (path.tracks() as f64, summary.length_mm),
+        Some((path, summary)) => (path.track_count() as f64, summary.length_mm),
         None => {
             let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
             (tracks, tracks * width)
         }
     };
     let path_mm = pass_mm * f64::from(1 + task.pass.spark_out_passes);
-    let depth_um = 1e3 * task.limits.depth_of_cut_mm;
+    let depth_um = 1e3 * task.correction_limits.depth_of_cut_mm;
     let passes = f64::from(plan.max_cycles.max(1) - 1);
-    let first_um = 1e3 * task.limits.allowance_mm;
+    let first_um = 1e3 * task.correction_limits.allowance_mm;
     let grinding_minutes = path_mm / task.pass.feed_mm_min;
-    let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.limits.depth_of_cut_mm;
-    let most_measurements = plan.max_cycles + u32::from(plan.begin_with == Beginning::Measure);
-    let least_measuring_minutes = least_measuring_minutes(&task);
+    let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
+    let most_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
+    let least_measuring_minutes = min_measuring_minutes(&task);
     let least_minutes = f64::from(plan.max_cycles) * grinding_minutes
         + f64::from(most_measurements) * least_measuring_minutes.unwrap_or(0.0);
     let document = Document {
@@ -274,15 +274,15 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         nominal_points: task.nominal.len(),
         targets: task.targets.len(),
         touches_are_chosen: task.adaptive.is_some(),
-        sphere_points: task.sphere.map_or(0, |s| s.points),
+        sphere_points: task.reference_sphere.map_or(0, |s| s.points),
         most_cycles: plan.max_cycles,
         first_level_um: first_um,
         depth_of_cut_um: depth_um,
-        last_level_um: first_um - (passes * depth_um).min(1e3 * task.limits.removal_budget_mm),
-        removal_budget_um: 1e3 * task.limits.removal_budget_mm,
+        last_level_um: first_um - (passes * depth_um).min(1e3 * task.correction_limits.removal_budget_mm),
+        removal_budget_um: 1e3 * task.correction_limits.removal_budget_mm,
         tracks: tracks as u64,
         track_mm: task.pass.track_spacing_mm,
-        scallops: task.scallops.map(|scallops| ScallopsTold::of(&scallops, &recipe)),
+        scallops: task.scallops.map(|scallops| ScallopsDocument::new(&scallops, &recipe)),
         path_mm,
         grinding_minutes,
         removed_mm3_a_pass,
@@ -298,7 +298,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         program_points: program.as_ref().map(|(_, summary)| summary.points),
         arcs,
         dialect: cell.grinder.program.dialect.dialect.name.clone(),
-        tilt: program.as_ref().and_then(|(path, summary)| TiltTold::of(path, summary)),
+        tilt: program.as_ref().and_then(|(path, summary)| TiltDocument::new(path, summary)),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
     };
@@ -311,16 +311,16 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 /// Returns the arcs in the program of the first pass, if the cell uses arcs.
-fn arcs_of(task: &Task, program: Option<&(ToolPath, Summary)>) -> Result<Option<ArcsTold>, Failure> {
+fn arcs_of(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> Result<Option<ArcsDocument>, Failure> {
     let (Some((path, summary)), Ok(programs)) = (program, &task.programs) else { return Ok(None) };
-    let arcs = programs.arcs(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
-    Ok(arcs.zip(programs.arcs_within_mm).map(|(arcs, within_mm)| ArcsTold::of(&arcs, summary, within_mm)))
+    let arcs = programs.arc_summary(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
+    Ok(arcs.zip(programs.arcs_within_mm).map(|(arcs, within_mm)| ArcsDocument::new(&arcs, summary, within_mm)))
 }
 
 /// Returns the minimum measuring time in minutes: the time in which the probe searches every target from its approach
 /// distance. The moves between targets are not included, because the measuring machine chooses them.
-fn least_measuring_minutes(task: &Task) -> Option<f64> {
-    let targets = task.targets.len() + task.sphere.map_or(0, |sphere| sphere.points);
+fn min_measuring_minutes(task: &Task) -> Option<f64> {
+    let targets = task.targets.len() + task.reference_sphere.map_or(0, |sphere| sphere.points);
     let seconds = targets as f64 * task.probing.approach_mm / task.probing.speed_mm_s;
     (!task.targets.is_empty()).then_some(seconds / 60.0)
 }
@@ -356,13 +356,13 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
 /// Returns a warning if the scallops leave too little of the tolerances for the errors that a correction can remove.
 fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let scallops = task.scallops?;
-    let beyond = ScallopsTold::of(&scallops, recipe).beyond();
+    let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
     (!beyond.is_empty()).then(|| {
         format!(
             "the scallops between the tracks take {}, more than {} %, and no correction takes them back; write grinding.track_mm = {} or less, or \
              take a wheel that is blunter across the tracks",
             beyond.join(" and "),
-            100.0 * SCALLOP_SHARE,
+            100.0 * MAX_SCALLOP_SHARE,
             setup::track_for_tolerance_mm(recipe, &scallops),
         )
     })
@@ -404,7 +404,7 @@ pub(super) fn first_path(
     task: &Task,
     recipe: &Recipe,
     cell: &CellConfig,
-) -> Result<Option<(ToolPath, Summary)>, Failure> {
+) -> Result<Option<(ToolPath, PathSummary)>, Failure> {
     let (recipe, cell) = (recipe.path().to_owned(), cell.path().to_owned());
     task.first_path().map_err(|source| Failure::FirstPath { recipe, cell, source })
 }
@@ -423,7 +423,7 @@ fn words(d: &Document) -> String {
     } else {
         ""
     };
-    let tilt = d.tilt.as_ref().map_or(String::new(), TiltTold::in_words);
+    let tilt = d.tilt.as_ref().map_or(String::new(), TiltDocument::in_words);
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\

@@ -6,15 +6,15 @@ use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use regrind::cell::{Actor, Device};
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, State};
-use regrind::drive::recover::{self, RecoverError, Step, in_short, look};
+use regrind::drive::recovery::{self, RecoveryError, RecoveryStep, describe_status, read_status};
 use regrind::journal::{Header, Journal, Kind, MachineLock, Reader};
 use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::live::{owner, take};
+use super::live::{owner, lock_machine};
 use super::run::{epoch, free_folder, operator};
 use super::succession::Place;
 use super::{Outcome, check, control, key};
@@ -48,9 +48,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let began = SystemTime::now();
     let folder = free_folder(&arguments.runs, "recover", began, cell.simulated);
     let taken =
-        [take(&cell.cmm.link, MachineKind::Cmm, &folder)?, take(&cell.grinder.link, MachineKind::Grinder, &folder)?];
+        [lock_machine(&cell.cmm.link, MachineKind::Cmm, &folder)?, lock_machine(&cell.grinder.link, MachineKind::Grinder, &folder)?];
     let epoch = MachineLock::epoch(taken.iter().flatten(), epoch(began));
-    let settings = |link| setup::modbus(link, cell.simulated, owner(&actor, &folder), epoch);
+    let settings = |link| setup::modbus_settings(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
     let mut content = json!({ "recover": true, "cell": cell.path() });
     let (place, turn) = Place::next(&arguments.runs)?;
@@ -69,14 +69,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let mut recovery = Recovery { actor, journal, folder, runs: arguments.runs.clone(), simulated: cell.simulated };
     super::runtime()?.block_on(async {
         let cmm = recovery.bring_home(Device::Cmm, &cell.cmm.link, cmm, ModbusCmm::new).await;
-        let cmm = told(cmm)?;
+        let cmm = print_failure(cmm)?;
         let grinder = recovery.bring_home(Device::Grinder, &cell.grinder.link, grinder, ModbusGrinder::new).await;
-        recovery.end([cmm, told(grinder)?])
+        recovery.end([cmm, print_failure(grinder)?])
     })
 }
 
 /// Prints the reason why a machine did not reach idle. The other machine can still succeed.
-fn told(home: Result<bool, Failure>) -> Result<bool, Failure> {
+fn print_failure(home: Result<bool, Failure>) -> Result<bool, Failure> {
     match home {
         Err(failure @ Failure::Terminal(_)) => Err(failure),
         Err(failure) => super::print(&format!("{failure}\n")).map(|()| false),
@@ -102,7 +102,7 @@ impl Recovery {
     async fn bring_home<M: Machine>(
         &mut self,
         device: Device,
-        link: &Link,
+        link: &LinkConfig,
         settings: Option<ModbusSettings>,
         machine: fn(ModbusSettings) -> io::Result<M>,
     ) -> Result<bool, Failure> {
@@ -122,28 +122,28 @@ impl Recovery {
         let mark = if self.simulated { "SIMULATION  " } else { "" };
         let failed = |source| Failure::Recover { device, source };
         loop {
-            let seen = look(&mut machine).await.map_err(failed)?;
-            super::print(&format!("{mark}{}: {}\n", machine.name(), in_short(&seen)))?;
+            let seen = read_status(&mut machine).await.map_err(failed)?;
+            super::print(&format!("{mark}{}: {}\n", machine.name(), describe_status(&seen)))?;
             if matches!(seen.state, State::Stopping | State::Aborting) {
                 // The machine is changing its state by itself.
                 tokio::time::sleep(BETWEEN_LOOKS).await;
                 continue;
             }
-            let Some(step) = Step::after(seen.state) else { return Ok(true) };
+            let Some(step) = RecoveryStep::for_state(seen.state) else { return Ok(true) };
             if let Some(run) = seen.job.and_then(|job| self.run_of(job.job)) {
                 super::print(&format!(
                     "  this is the job of {run}, which broke off: `regrind resume {run}` goes on with it; recover only if that is refused\n"
                 ))?;
             }
-            super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.meaning(device)))?;
+            super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.consequence(device)))?;
             if answer()? != step.name() {
                 super::print("it is left as it is\n")?;
                 return Ok(false);
             }
-            match recover::take(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
+            match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
                 // A new state is shown. Without a change the same question would repeat for ever.
                 Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
-                Ok(_) | Err(RecoverError::Changed { .. }) => {}
+                Ok(_) | Err(RecoveryError::Changed { .. }) => {}
                 Err(error) => return Err(failed(error)),
             }
         }

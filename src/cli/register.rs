@@ -11,7 +11,7 @@ use regrind::formats::{
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, Interval, IsoFigures, ModelInputs, SlopeFigures};
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
-use regrind::surface::{Distance, Nominal, NominalKind, Projection};
+use regrind::surface::{DistanceModel, Nominal, NominalKind, PlaneProjection};
 
 use super::choice::word_of;
 use super::failure::Failure;
@@ -50,14 +50,14 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Shape of the surface between the nominal points
-    #[arg(long, value_parser = word_of::<Distance>(), default_value = "curved")]
-    distance: Distance,
+    #[arg(long, value_parser = word_of::<DistanceModel>(), default_value = "curved")]
+    distance: DistanceModel,
     /// Meaning of the measured points
     #[arg(long, value_parser = word_of::<Method>(), default_value = "offset")]
     method: Method,
     /// Projection of scattered nominal points for the triangulation
-    #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
-    projection: Projection,
+    #[arg(long, value_parser = word_of::<PlaneProjection>(), default_value = "auto")]
+    projection: PlaneProjection,
     /// Locked directions of the pose, separated by commas: they keep their values from --initial, or zero, and no
     /// search is made
     #[arg(long, value_parser = word_of::<Coordinate>(), value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]

@@ -8,7 +8,7 @@ use std::time::SystemTime;
 use clap::Args;
 use regrind::cell::{Actor, CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
-use regrind::drive::{Interrupted, Request, Task};
+use regrind::drive::{InterruptedRun, Request, Task};
 use regrind::formats::{FormatError, Learned};
 use regrind::journal::{
     Artefact, DATABASE, Entry, Journal, JournalError, Kind, LOCK, Reader, RunLock, may_be_lost, newest_cycle, verify,
@@ -19,7 +19,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::failure::Failure;
-use super::live::{Live, Work, outcome};
+use super::live::{RunContext, PreparedRun, outcome};
 use super::run::{LEARNED_FROM, epoch, operator, within};
 use super::{Outcome, check, control, key};
 
@@ -77,8 +77,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
     // From here on, another program that resumes or verifies the run finds it driven.
-    let lock = RunLock::take(folder).map_err(Failure::Journal)?;
-    let begun = Begun::read(folder, arguments.despite_loss)?;
+    let lock = RunLock::acquire(folder).map_err(Failure::Journal)?;
+    let begun = RunStart::read(folder, arguments.despite_loss)?;
     // If the working folder is gone, a recipe without files there still works. Any other recipe reports the missing
     // file.
     let _ = std::env::set_current_dir(&begun.working_folder);
@@ -89,16 +89,16 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         return Err(Failure::WorldGone { run: folder.to_owned() });
     }
     let (task, plan) = begun.prepared(folder, &recipe, &cell)?;
-    let interrupted = Interrupted::read(folder, plan.clone(), &task).map_err(Failure::Replay)?;
+    let interrupted = InterruptedRun::read(folder, plan.clone(), &task).map_err(Failure::Replay)?;
     if !arguments.json {
-        let marked = if cell.is_marked() { "SIMULATION  " } else { "" };
-        let state = interrupted.state();
+        let marked = if cell.is_marked_simulation() { "SIMULATION  " } else { "" };
+        let state = interrupted.describe_state();
         super::print(&format!("{marked}broke off in {state}\nthe record is whole, and done again nothing differs\n"))?;
     }
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
-        let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
+        let live = RunContext { recipe, cell, part, folder, job: begun.job, actor, json };
         let machines = live.open(epoch(SystemTime::now()))?;
         let mut journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
         if let Some(what) = &begun.lost {
@@ -109,7 +109,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
             journal.append(entry).map_err(Failure::Journal)?;
         }
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
-        outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)
+        outcome(&live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted }).await?)
     })
 }
 
@@ -121,7 +121,7 @@ fn is_bare(run: &Path) -> bool {
 
 /// What the first record of a run tells of how to go on with it.
 #[derive(Deserialize)]
-struct Begun {
+struct RunStart {
     recipe: PathBuf,
     cell: PathBuf,
     /// Where relative paths begin.
@@ -146,7 +146,7 @@ struct Begun {
     files: BTreeMap<String, Artefact>,
 }
 
-impl Begun {
+impl RunStart {
     /// Verifies the record of a run without an end, and reads how the run began. If records are lost, reports the loss.
     /// Then continues only if `despite_loss` confirms it.
     fn read(run: &Path, despite_loss: bool) -> Result<Self, Failure> {
@@ -224,9 +224,9 @@ impl Begun {
         }
         if let Some(learned) = self.files.get(LEARNED_FROM) {
             let text = learned.read(run).map_err(Failure::Journal)?;
-            let learned = Learned::of(&run.join(LEARNED_FROM), &text).map_err(Failure::Learned)?;
+            let learned = Learned::from_saved(&run.join(LEARNED_FROM), &text).map_err(Failure::Learned)?;
             let from = learned.run.clone();
-            task.begin_with(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
+            task.start_from_learned(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
         }
         let identity: String = task.part_identity.iter().map(|b| format!("{b:02x}")).collect();
         let differs = |what: &'static str| Err(Failure::OtherTask { run: run.to_owned(), what });

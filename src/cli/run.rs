@@ -6,18 +6,18 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
-use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
-use regrind::config::{BUILT_IN, CellConfig, Link};
+use regrind::cell::{Actor, FirstStep, CellPlan, Ending, TABLE_VERSION};
+use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
 use regrind::device::{LineAddress, Wire};
 use regrind::drive::Task;
-use regrind::formats::{LEARNED, Learned, LearnedError, TaughtBy};
+use regrind::formats::{LEARNED, Learned, LearnedError, KnowledgeOrigin};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::live::{Live, Work, outcome};
+use super::live::{RunContext, PreparedRun, outcome};
 use super::succession::Place;
 use super::{Outcome, check, key, outside, plan, serve, simulated};
 
@@ -41,7 +41,7 @@ pub(super) struct Arguments {
     #[arg(value_name = "RECIPE")]
     pub(super) recipe: PathBuf,
     /// Cell that makes the part; `sim` is the built-in simulated cell
-    #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN_CELL)]
     pub(super) cell: PathBuf,
     /// Serial number of the part
     #[arg(long, value_name = "SERIAL", value_parser = super::name)]
@@ -72,7 +72,7 @@ pub(super) struct Arguments {
     /// The part of a plant's queue that it makes
     #[cfg(feature = "plant")]
     #[arg(skip)]
-    pub(super) work: Option<Box<super::work::Taken>>,
+    pub(super) work: Option<Box<super::run_queue::ConfirmedPart>>,
     /// File for the true state of the simulated part at the end
     #[cfg(feature = "plant")]
     #[arg(long, hide = true)]
@@ -90,7 +90,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             super::print(&format!("note     {}, {note}\n", path.display()))?;
         }
     }
-    if arguments.rehearsal && !cell.is_by_person() {
+    if arguments.rehearsal && !cell.is_manual() {
         return Err(Failure::NoRehearsal { cell: arguments.cell.clone() });
     }
     cell.rehearsal = arguments.rehearsal;
@@ -109,7 +109,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
     // The inputs of a run are checked before anything opens. The path of a later pass is checked when its map exists,
     // and the run may not need a later pass at all.
-    if plan.begin_with == Beginning::Grind {
+    if plan.begin_with == FirstStep::Grind {
         plan::first_path(&task, &recipe, &cell)?;
     }
     let spec = match within(&cell) {
@@ -147,17 +147,17 @@ async fn carry_out(
     let job = epoch(began);
     // These checks come before the record: with a missing folder or a busy line there is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
-    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.is_marked());
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.is_marked_simulation());
     let (free, needed) = (free_bytes(&folder).unwrap_or(u64::MAX), task.cycle_bytes());
     if free < needed {
         return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
     }
-    let page = arguments.serve.map(|at| serve::Beside::begin(&arguments.runs, at, arguments.json));
+    let page = arguments.serve.map(|at| serve::PageProcess::begin(&arguments.runs, at, arguments.json));
     let _page = page.transpose()?;
     #[cfg(feature = "plant")]
     let _plant =
-        arguments.plant.as_ref().map(|plant| super::plant::Beside::begin(&arguments.runs, plant)).transpose()?;
-    let live = Live { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
+        arguments.plant.as_ref().map(|plant| super::plant::PlantProcesses::begin(&arguments.runs, plant)).transpose()?;
+    let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
@@ -182,7 +182,7 @@ async fn carry_out(
         record_first_correction(&task, &mut journal)?;
     }
     let loaded = arguments.loaded || cell.simulated;
-    live.carry_out(machines, Work { task, plan, journal, loaded, interrupted: None }).await
+    live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await
 }
 
 /// Returns a number that increases from program to program.
@@ -199,7 +199,7 @@ struct Earlier {
     /// Errors of runs that could not be read during the search.
     left_alone: Vec<LearnedError>,
     /// Messages about the knowledge of the plant.
-    told: Vec<String>,
+    messages: Vec<String>,
 }
 
 impl Earlier {
@@ -208,7 +208,7 @@ impl Earlier {
         let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
             let run = learned.run.clone();
-            task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
+            task.start_from_learned(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
         }
         #[cfg(feature = "plant")]
         if let (None, Some(plant)) = (&earlier.learned, &arguments.plant) {
@@ -221,14 +221,14 @@ impl Earlier {
     #[cfg(feature = "plant")]
     fn or_with_others(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::ask(plant, task)?;
-        self.told = told.words;
+        self.messages = told.words;
         if let Some(learned) = told.learned {
             // Read back in the same way as by a program that resumes the run.
             let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
-            match task.begin_with(learned.clone()) {
+            match task.start_from_learned(learned.clone()) {
                 Ok(()) => self.learned = Some((learned, text)),
                 Err(source) => {
-                    self.told.push(format!("the knowledge from {} cannot be used: {source}", learned.run));
+                    self.messages.push(format!("the knowledge from {} cannot be used: {source}", learned.run));
                 }
             }
         }
@@ -254,7 +254,7 @@ impl Earlier {
 
     fn in_words(&self, runs: &Path) -> String {
         let mut text: String = self.left_alone.iter().map(|error| format!("ignored: {error}\n")).collect();
-        text.extend(self.told.iter().map(|words| format!("{words}\n")));
+        text.extend(self.messages.iter().map(|words| format!("{words}\n")));
         text += &match &self.learned {
             Some((Learned { taught_by: Some(others), .. }, _)) => others_in_words(others),
             Some((learned, _)) => format!("begins with the error that {} found in every pass\n", learned.run),
@@ -268,7 +268,7 @@ impl Earlier {
 }
 
 /// Returns the text about the knowledge of other cells with which a first part begins.
-fn others_in_words(others: &TaughtBy) -> String {
+fn others_in_words(others: &KnowledgeOrigin) -> String {
     let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
     let runs = runs.join(" and ");
     let percent =
@@ -292,7 +292,7 @@ fn others_in_words(others: &TaughtBy) -> String {
 
 /// Returns true if the machines of a cell are simulated in this process. Only then can a port be left open.
 pub(super) fn within(cell: &CellConfig) -> bool {
-    let open = |link: &Link| {
+    let open = |link: &LinkConfig| {
         matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
             || matches!(link.wire.ippdme_address(), Some((_, 0)))
             || matches!(&link.wire, Wire::HitLines(wire) if wire.has_dynamic_address())
@@ -301,14 +301,14 @@ pub(super) fn within(cell: &CellConfig) -> bool {
 }
 
 /// Returns the header of the record: everything that a program needs to resume the run.
-fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), earlier: Option<&Earlier>) -> Header {
-    let Live { recipe, cell, folder, actor, .. } = live;
+fn header(arguments: &Arguments, live: &RunContext, (task, plan): (&Task, &CellPlan), earlier: Option<&Earlier>) -> Header {
+    let RunContext { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
     let taught_by =
         earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
-    let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.told.clone())).collect();
+    let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.messages.clone())).collect();
     // The open ports are assigned by now. The text of the file shows whether they were open.
     let machines_within = CellConfig::parse(cell.path(), cell.text()).is_ok_and(|cell| within(&cell));
     Header {
@@ -316,7 +316,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
         part: arguments.part.clone().unwrap_or_else(|| "unnamed".into()),
         actor: actor.name.clone(),
         station: actor.station.clone(),
-        simulation: cell.is_marked(),
+        simulation: cell.is_marked_simulation(),
         first_command_id: 1,
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
@@ -332,7 +332,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
 
 fn begin(
     header: Header,
-    live: &Live,
+    live: &RunContext,
     learned: Option<(Learned, Vec<u8>)>,
     key: Option<AuditKey>,
 ) -> Result<Journal, Failure> {
@@ -349,7 +349,7 @@ fn begin(
 /// made it.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
     let folder = journal.folder().join("cycle-0");
-    for name in task.save_first(&folder).map_err(Failure::Programs)? {
+    for name in task.save_first_pass(&folder).map_err(Failure::Programs)? {
         journal.adopt(&format!("cycle-0/{name}"), 0, 0).map_err(Failure::Journal)?;
     }
     Ok(())

@@ -44,7 +44,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
     #[command(flatten)]
-    door: Door,
+    door: PageAccess,
     /// End when standard input does: with the program that began this one
     #[arg(long, hide = true)]
     while_stdin: bool,
@@ -52,7 +52,7 @@ pub(super) struct Arguments {
 
 /// Certificate and users of a page.
 #[derive(Args, Debug)]
-pub(super) struct Door {
+pub(super) struct PageAccess {
     /// Certificate of the page in PEM, followed by those of its issuers; required for addresses other than this
     /// computer's own. The packages support it. From source: `--features https`
     #[arg(long, value_name = "FILE", requires = "key")]
@@ -65,7 +65,7 @@ pub(super) struct Door {
     users: Option<PathBuf>,
 }
 
-impl Door {
+impl PageAccess {
     /// Listens at an address, if the page can be served there.
     pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
         let Self { certificate, key, users } = self;
@@ -87,11 +87,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::runtime()?.block_on(async {
         let (listener, entrance) = door.open(*listen).await?;
         let taken = |source| Failure::Page { address: *listen, source };
-        let planned = Planned::default();
+        let planned = PlannedPointsCache::default();
         let page = Page::new(
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
             entrance,
-            Box::new(move |run| planned.of(run)),
+            Box::new(move |run| planned.points(run)),
             Box::new(|what| eprintln!("page: {what}")),
         );
         let page = page.map_err(taken)?;
@@ -118,11 +118,11 @@ async fn end_of_input() {
 }
 
 /// Page of a run. It ends shortly after the program that holds this value.
-pub(super) struct Beside {
+pub(super) struct PageProcess {
     _page: Child,
 }
 
-impl Beside {
+impl PageProcess {
     /// Starts the page for the runs in a folder as a separate process, so it can neither slow the run down nor stop it.
     pub(super) fn begin(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
@@ -139,10 +139,10 @@ impl Beside {
 
 /// Plan of the run that was requested last.
 #[derive(Default)]
-struct Planned(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
+struct PlannedPointsCache(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
 
-impl Planned {
-    fn of(&self, run: &Path) -> Option<Vec<[f64; 2]>> {
+impl PlannedPointsCache {
+    fn points(&self, run: &Path) -> Option<Vec<[f64; 2]>> {
         let mut last = self.0.lock().ok()?;
         if let Some((known, points)) = &*last
             && known == run

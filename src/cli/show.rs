@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance, TouchOn};
+use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvPoints, Tolerance, FurtherTouches};
 use regrind::document::visible;
-use regrind::drive::{CycleRow, Notice, SoFar};
+use regrind::drive::{CycleRow, Notice, PreviewStatistics};
 use regrind::formats::read_error_map;
 use regrind::model::FIRST_BATCH;
-use regrind::recipe::{Mode, Recipe};
+use regrind::recipe::{SelectionMode, Recipe};
 use regrind::report::in_air;
 use tokio::sync::mpsc;
 
@@ -51,7 +51,7 @@ impl Show {
             head: format!("{}, {}", recipe.part.name, recipe.path().display()),
             tolerance,
             folder: folder.display().to_string(),
-            is_chosen: recipe.measure.mode == Mode::Adaptive,
+            is_chosen: recipe.measure.mode == SelectionMode::Adaptive,
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
@@ -191,7 +191,7 @@ impl Show {
         let compared = self.tolerance.compare(figures);
         let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
-        if let Some(TouchOn { targets, why }) = figures.touch_on.as_deref() {
+        if let Some(FurtherTouches { targets, why }) = figures.touch_on.as_deref() {
             // The first touches only show that they belong to this part.
             let known = figures
                 .form
@@ -205,7 +205,7 @@ impl Show {
             let _ = write!(text, "\n         {words}");
         }
         self.line(&text)?;
-        self.rms_mm.push(compared[1].found_mm);
+        self.rms_mm.push(compared[1].median_mm);
         self.picture(cycle)
     }
 
@@ -224,14 +224,14 @@ impl Show {
             // For chosen touches, the map of the error and the map of its standard deviation are shown side by side.
             const APART: usize = 2;
             let room = [(columns.min(110) - 4 - APART) / 2, 16];
-            let both = Blocks::of(&nodes, room).zip(Blocks::of_sigma(&nodes, room));
+            let both = Blocks::paint_error(&nodes, room).zip(Blocks::paint_sigma(&nodes, room));
             let Some((blocks, sigma)) = both else { return Ok(()) };
             let wide = blocks.rows.first().map_or(0, Vec::len) + APART;
             let known = format!("standard deviation: up to {} µm", three_digits(sigma.limit_um));
             let below = format!("{:wide$}{known}\n{falls}", error(&blocks));
-            (blocks.beside(sigma, APART), below)
+            (blocks.append_right(sigma, APART), below)
         } else {
-            let Some(blocks) = Blocks::of(&nodes, [columns.min(72) - 4, 16]) else { return Ok(()) };
+            let Some(blocks) = Blocks::paint_error(&nodes, [columns.min(72) - 4, 16]) else { return Ok(()) };
             let below = format!("{}   {falls}", error(&blocks));
             (blocks, below)
         };
@@ -340,7 +340,7 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
 }
 
 /// Returns the text about the touches of a measurement that is still running.
-pub(super) fn so_far(SoFar { touched, rms_um, least_um, most_um }: &SoFar) -> String {
+pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_um }: &PreviewStatistics) -> String {
     format!(
         "preliminary, relative to the planned position: {touched} touched, RMS {rms_um:.2} µm, {least_um:+.2} to {most_um:+.2} µm"
     )
@@ -349,8 +349,8 @@ pub(super) fn so_far(SoFar { touched, rms_um, least_um, most_um }: &SoFar) -> St
 /// Returns the name of the peak to valley that is judged.
 pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     match tolerance.pv_of {
-        PvOf::All => "PV",
-        PvOf::MostPoints => "PV 99.8 %",
+        PvPoints::All => "PV",
+        PvPoints::MostPoints => "PV 99.8 %",
     }
 }
 

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{HitSource, LineAddress};
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
@@ -67,7 +67,7 @@ async fn until_stopped() -> Result<Outcome, Failure> {
 }
 
 /// Returns the address of a machine. An open port is replaced by the assigned one.
-fn wire(link: &Link) -> Value {
+fn wire(link: &LinkConfig) -> Value {
     match link.wire.modbus_line() {
         Some((LineAddress::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
         Some((LineAddress::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),

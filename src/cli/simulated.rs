@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::SystemTime;
 
-use regrind::compensation::path::Pattern;
-use regrind::config::{CellConfig, Link, RotaryLetter};
+use regrind::compensation::path::TrackPattern;
+use regrind::config::{CellConfig, LinkConfig, RotaryLetter};
 use regrind::device::{Coordinates, HitLinesWire, HitSource, IppdmeWire, LineAddress, RegisterMap, Wire};
-use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
+use regrind::formats::{JsonlAppender, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::journal::utc;
-use regrind::recipe::{Recipe, Wheel};
+use regrind::recipe::{Recipe, WheelDimensions};
 use regrind_sim::cmm::TouchProbe;
 use regrind_sim::head::Head;
 use regrind_sim::options::{MachineOptions, RegisterLayout};
@@ -112,7 +112,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         simulated.serve_dme(wire, world.touch_probe(), speed, probe_radius_mm, path).await.map_err(&failed)?;
         return Ok(simulated);
     }
-    let line = |link: &Link| {
+    let line = |link: &LinkConfig| {
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.modbus_line().ok_or_else(|| failed(none.into()))
     };
@@ -164,7 +164,7 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
             "the simulated wheel beside LinuxCNC stays upright; leave grinding.tilt or the simulation out".into()
         );
     }
-    let (Wheel::Sphere { radius_mm }, Pattern::Raster) = (grinding.wheel, grinding.pattern) else {
+    let (WheelDimensions::Sphere { radius_mm }, TrackPattern::Raster) = (grinding.wheel, grinding.pattern) else {
         return Err(
             "the simulated wheel is a ball on tracks along x; take another recipe, or leave the simulation out".into(),
         );
@@ -216,7 +216,7 @@ impl SimulatedCell {
     /// # Errors
     /// Returns an error if the file cannot be written.
     pub(super) fn log_to(&self, path: &Path) -> Result<(), FormatError> {
-        let lines = AddedLines::open(path)?;
+        let lines = JsonlAppender::open(path)?;
         let machines = self.servings.iter().flat_map(|serving| serving.machines());
         for (unit, machine) in machines {
             let (unit, lines) = (*unit, lines.clone());
@@ -224,7 +224,7 @@ impl SimulatedCell {
                 let name = machine.name();
                 machine.set_observer(Box::new(move |seen| {
                     let utc = utc(SystemTime::now());
-                    lines.add(&Witnessed { utc, machine: &name, unit, seen });
+                    lines.append(&Witnessed { utc, machine: &name, unit, seen });
                 }));
             });
         }
@@ -374,7 +374,7 @@ fn boot_id() -> u32 {
     rand::random::<u32>().max(1)
 }
 
-fn options(link: &Link, speed: f64, seed: u64) -> MachineOptions {
+fn options(link: &LinkConfig, speed: f64, seed: u64) -> MachineOptions {
     let RegisterMap { word_order, .. } = link.registers;
     MachineOptions {
         word_order: if word_order.is_low_first() { words::WordOrder::Little } else { words::WordOrder::Big },

@@ -38,7 +38,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let rows = table();
+    let rows = transition_table();
     if let Some(path) = &arguments.svg {
         save_text(path, &state_picture(&rows)).map_err(Failure::Report)?;
         return Ok(Outcome::Accepted);

@@ -9,7 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use regrind::formats::ResultFolder;
-use regrind::journal::{Against, Anchor, JournalError, PublicKey, Reader, anchor_of, verify_against};
+use regrind::journal::{ExternalEvidence, Anchor, JournalError, PublicKey, Reader, anchor_of, verify_against};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -43,9 +43,9 @@ struct Before {
 
 /// Lock that keeps other runs from beginning in a folder until it is dropped, so that two simultaneous runs receive
 /// different numbers. `None` if the system cannot lock folders.
-pub(super) struct Turn(Option<File>);
+pub(super) struct SuccessionLock(Option<File>);
 
-impl Drop for Turn {
+impl Drop for SuccessionLock {
     fn drop(&mut self) {
         // Unlocks explicitly. After a plain close, a child that another thread has just forked would share the lock
         // until its exec.
@@ -55,7 +55,7 @@ impl Drop for Turn {
 
 impl Place {
     /// Returns the next place in a folder of runs, and its lock. Keep the lock until the run has its first record.
-    pub(super) fn next(runs: &Path) -> Result<(Self, Turn), Failure> {
+    pub(super) fn next(runs: &Path) -> Result<(Self, SuccessionLock), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
         // Any user can hold this lock. It does not prevent a run, but without it the run can receive the number of
         // another run.
@@ -66,7 +66,7 @@ impl Place {
             Some(Before { run: name_of(folder), records, head })
         });
         let number = last.map_or(0, |(number, _)| number).saturating_add(1);
-        Ok((Self { number, before }, Turn(folder)))
+        Ok((Self { number, before }, SuccessionLock(folder)))
     }
 
     /// Adds the place to the first record of a run.
@@ -76,7 +76,7 @@ impl Place {
     }
 
     /// Reads the place from the first record of a run. Returns `None` for a run from before runs had numbers.
-    fn of(folder: &Path) -> Option<Self> {
+    fn read(folder: &Path) -> Option<Self> {
         let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
         serde_json::from_value(first.value()["content"].clone()).ok()
     }
@@ -113,7 +113,7 @@ fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let mut newest: BTreeSet<PathBuf> = all.iter().take(NEWEST).cloned().collect();
     all.sort_by_cached_key(|folder| Reverse(time_in(&name_of(folder)).map(str::to_owned)));
     newest.extend(all.into_iter().take(NEWEST));
-    newest.into_iter().filter_map(|folder| Some((Place::of(&folder)?.number, folder))).collect()
+    newest.into_iter().filter_map(|folder| Some((Place::read(&folder)?.number, folder))).collect()
 }
 
 /// Returns the time in the name of a run, as 20260704T120000Z, or `None` if there is none.
@@ -145,11 +145,11 @@ struct Proof {
 /// successor names.
 pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
     let mut proof = Proof::default();
-    let mut all: Vec<(Option<Place>, PathBuf)> = folders(runs).map(|folder| (Place::of(&folder), folder)).collect();
+    let mut all: Vec<(Option<Place>, PathBuf)> = folders(runs).map(|folder| (Place::read(&folder), folder)).collect();
     all.sort_by_key(|(place, folder)| (place.as_ref().map_or(0, |place| place.number), folder.clone()));
     let mut last: Option<(u64, &Path)> = None;
     for (place, folder) in &all {
-        proof.take(place.as_ref(), folder, keys);
+        proof.verify_run(place.as_ref(), folder, keys);
         let Some(Place { number, before }) = place else { continue };
         proof.follows((*number, folder), before.as_ref(), last);
         last = Some((*number, folder));
@@ -171,10 +171,10 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
 
 impl Proof {
     /// Verifies a single run.
-    fn take(&mut self, place: Option<&Place>, folder: &Path, keys: &[PublicKey]) {
+    fn verify_run(&mut self, place: Option<&Place>, folder: &Path, keys: &[PublicKey]) {
         let name = name_of(folder);
         let number = place.map_or("-".to_owned(), |place| place.number.to_string());
-        let stands = match verify_against(folder, &Against { anchor: None, keys: keys.to_vec() }) {
+        let stands = match verify_against(folder, &ExternalEvidence { anchor: None, keys: keys.to_vec() }) {
             Err(JournalError::Absent { .. }) => return,
             Err(error) => {
                 self.flaws.push(error.to_string());

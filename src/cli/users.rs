@@ -25,11 +25,11 @@ Example:
 Exit codes: 0 done; 2 bad arguments, a password that is too short, or a list that cannot be read or written.")]
 pub(super) struct Arguments {
     #[command(subcommand)]
-    what: What,
+    what: UsersCommand,
 }
 
 #[derive(Subcommand, Debug)]
-enum What {
+enum UsersCommand {
     /// Add a person, or change the role and password of a person
     Add {
         /// Name for signing in, which is recorded with each order
@@ -39,7 +39,7 @@ enum What {
         #[arg(long)]
         role: PageRole,
         #[command(flatten)]
-        list: Kept,
+        list: UserListFile,
     },
     /// Remove a person from the list
     Remove {
@@ -47,12 +47,12 @@ enum What {
         #[arg(value_name = "NAME")]
         name: String,
         #[command(flatten)]
-        list: Kept,
+        list: UserListFile,
     },
     /// Print the list
     List {
         #[command(flatten)]
-        list: Kept,
+        list: UserListFile,
         /// Print JSON instead of text
         #[arg(long)]
         json: bool,
@@ -60,7 +60,7 @@ enum What {
 }
 
 #[derive(Args, Debug)]
-struct Kept {
+struct UserListFile {
     /// File of the list
     #[arg(long = "users", value_name = "FILE", default_value = "users.toml")]
     path: PathBuf,
@@ -68,9 +68,9 @@ struct Kept {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
-        What::Add { name, role, list } => add(name, *role, &list.path)?,
-        What::Remove { name, list } => remove(name, &list.path)?,
-        What::List { list, json } => tell(&Users::read(&list.path)?, *json)?,
+        UsersCommand::Add { name, role, list } => add(name, *role, &list.path)?,
+        UsersCommand::Remove { name, list } => remove(name, &list.path)?,
+        UsersCommand::List { list, json } => print_users(&Users::read(&list.path)?, *json)?,
     }
     Ok(Outcome::Accepted)
 }
@@ -94,7 +94,7 @@ fn remove(name: &str, path: &Path) -> Result<(), Failure> {
     super::print(&format!("{name} may sign in no more\n"))
 }
 
-fn tell(users: &Users, as_json: bool) -> Result<(), Failure> {
+fn print_users(users: &Users, as_json: bool) -> Result<(), Failure> {
     if as_json {
         let people: Vec<_> = users.people().map(|of| json!({ "name": of.name, "role": of.role })).collect();
         return super::print_json(&people);

@@ -12,7 +12,7 @@ use ratatui::style::{Color, Style, Stylize};
 use ratatui::text::{Line, Span, Text};
 use ratatui::widgets::{Block, Gauge, Paragraph, Wrap};
 use regrind::cell::StateName;
-use regrind::drive::{CycleRow, JobProgress, Request, Snapshot, ask};
+use regrind::drive::{CycleRow, JobProgress, Request, Snapshot, send_request};
 use regrind::formats::{MapNode, read_error_map};
 use regrind::report::run_summary;
 use tokio::sync::mpsc;
@@ -21,7 +21,7 @@ use super::Outcome;
 use super::blocks::{Blocks, sparkline};
 use super::control;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name, so_far};
+use super::show::{how_far, limits, pv_name, preview_text};
 use super::words::time_left;
 
 /// Time between two checks for a new map on record.
@@ -53,18 +53,18 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             return in_lines(first, &mut watch, &folder).await;
         }
         let mut view =
-            View { seen: first, folder: folder.clone(), map: None, as_sigma: false, looked: None, said: String::new() };
+            View { snapshot: first, folder: folder.clone(), map: None, as_sigma: false, looked: None, said: String::new() };
         let mut terminal = ratatui::init();
         let ended = view.follow(&mut terminal, &mut watch).await;
         ratatui::restore();
         // The full-screen view is gone, so the last status is printed again.
-        super::print(&format!("{}\n{}\n", folder.display(), view.seen.message))?;
+        super::print(&format!("{}\n{}\n", folder.display(), view.snapshot.message))?;
         ended
     })
 }
 
 /// Prints one line per new state, for a file or a pipe.
-async fn in_lines(first: Snapshot, watch: &mut regrind_control::Watch, folder: &Path) -> Result<Outcome, Failure> {
+async fn in_lines(first: Snapshot, watch: &mut regrind_control::StatusStream, folder: &Path) -> Result<Outcome, Failure> {
     let mut told = String::new();
     let mut seen = Ok(Some(first));
     while let Ok(Some(now)) = &seen {
@@ -91,7 +91,7 @@ fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Fa
 
 /// Content of the terminal.
 struct View {
-    seen: Snapshot,
+    snapshot: Snapshot,
     folder: PathBuf,
     /// Nodes of the last error map, and its name in the run folder.
     map: Option<(String, Vec<MapNode>)>,
@@ -107,7 +107,7 @@ impl View {
     async fn follow(
         &mut self,
         terminal: &mut ratatui::DefaultTerminal,
-        watch: &mut regrind_control::Watch,
+        watch: &mut regrind_control::StatusStream,
     ) -> Result<Outcome, Failure> {
         let mut keys = keys();
         loop {
@@ -115,9 +115,9 @@ impl View {
             terminal.draw(|frame| self.draw(frame)).map_err(Failure::Terminal)?;
             tokio::select! {
                 seen = watch.next() => match seen {
-                    Ok(Some(seen)) => self.seen = seen,
+                    Ok(Some(seen)) => self.snapshot = seen,
                     told => {
-                        self.seen.message = ended(&self.folder, told)?;
+                        self.snapshot.message = ended(&self.folder, told)?;
                         return Ok(Outcome::Accepted);
                     }
                 },
@@ -134,7 +134,7 @@ impl View {
     async fn hold(&mut self) {
         let folder = self.folder.clone();
         let asked =
-            tokio::task::spawn_blocking(move || ask(&folder, &Request::Hold { reason: "regrind watch".into() }));
+            tokio::task::spawn_blocking(move || send_request(&folder, &Request::Hold { reason: "regrind watch".into() }));
         self.said = match asked.await {
             Ok(Ok(reply)) => format!("hold: {}", reply.message),
             Ok(Err(error)) => format!("hold: {error}"),
@@ -144,7 +144,7 @@ impl View {
 
     /// Reads the newest map on record when a new one is possible.
     fn read_map(&mut self) {
-        let number = self.seen.number;
+        let number = self.snapshot.number;
         if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
             return;
         }
@@ -175,7 +175,7 @@ impl View {
         let wide = rest.width >= 70;
         let [left, right] = match wide {
             true => Layout::horizontal([Constraint::Percentage(55), Constraint::Percentage(45)]).areas(rest),
-            false => Layout::vertical([Constraint::Length(3 + self.seen.cycles.len() as u16), Constraint::Min(0)])
+            false => Layout::vertical([Constraint::Length(3 + self.snapshot.cycles.len() as u16), Constraint::Min(0)])
                 .areas(rest),
         };
         let (figures, map) = if wide { (right, left) } else { (left, right) };
@@ -186,7 +186,7 @@ impl View {
     }
 
     fn head(&self) -> Paragraph<'_> {
-        let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, serial, .. } = &self.seen;
+        let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, serial, .. } = &self.snapshot;
         let colour = match state {
             StateName::Execute | StateName::Starting | StateName::Unholding | StateName::Unsuspending => Color::Green,
             StateName::Complete => Color::Green,
@@ -206,7 +206,7 @@ impl View {
     }
 
     fn job(&self, frame: &mut Frame, area: Rect) {
-        let Some(JobProgress { device, done, total, left_s }) = self.seen.progress else { return };
+        let Some(JobProgress { device, done, total, left_s }) = self.snapshot.progress else { return };
         let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
         let ratio = (f64::from(done) / f64::from(total.max(1))).clamp(0.0, 1.0);
         let gauge = Gauge::default()
@@ -215,8 +215,8 @@ impl View {
             .label(format!("{}{left}", how_far(device, done, total)));
         let [bar, below] = Layout::vertical([Constraint::Length(1), Constraint::Min(0)]).areas(area);
         frame.render_widget(gauge, bar);
-        if let Some(told) = &self.seen.so_far {
-            frame.render_widget(Paragraph::new(so_far(told)).dim(), below);
+        if let Some(told) = &self.snapshot.so_far {
+            frame.render_widget(Paragraph::new(preview_text(told)).dim(), below);
         }
     }
 
@@ -225,25 +225,25 @@ impl View {
             let remedy = alarm.remedy.iter().zip(1..).map(|(remedy, k)| format!("  {k}. {remedy}")).collect::<String>();
             [Line::from(format!("ALARM  {}", alarm.what)).bold(), Line::from(format!("{}{remedy}", alarm.consequence))]
         };
-        Text::from(self.seen.alarms.iter().flat_map(of).collect::<Vec<_>>())
+        Text::from(self.snapshot.alarms.iter().flat_map(of).collect::<Vec<_>>())
     }
 
     fn figures(&self) -> Paragraph<'_> {
-        let Some(tolerance) = self.seen.tolerance else { return Paragraph::default() };
+        let Some(tolerance) = self.snapshot.tolerance else { return Paragraph::default() };
         let row = |row: &CycleRow| {
             let (cycle, [pv_um, rms_um]) = (row.cycle, row.judged_um());
             Line::from(format!("{cycle:>5} {pv_um:>12.2} {rms_um:>8.3}"))
         };
-        let falls = sparkline(self.seen.cycles.iter().map(|row| row.judged_um()[1]));
+        let falls = sparkline(self.snapshot.cycles.iter().map(|row| row.judged_um()[1]));
         let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS um"));
-        let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.seen.cycles.iter().map(row));
+        let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
         Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })
     }
 
     fn map(&self, frame: &mut Frame, area: Rect) {
         let Some((_, nodes)) = &self.map else { return };
         let room = [area.width.saturating_sub(2), area.height.saturating_sub(2)].map(usize::from);
-        let painted = if self.as_sigma { Blocks::of_sigma } else { Blocks::of };
+        let painted = if self.as_sigma { Blocks::paint_sigma } else { Blocks::paint_error };
         let Some(blocks) = painted(nodes, room) else { return };
         let colour = |pixel: Option<[u8; 3]>| pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b));
         let cell = |[above, below]: &[Option<[u8; 3]>; 2]| {

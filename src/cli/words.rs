@@ -1,6 +1,6 @@
 //! Numbers in a readable form.
 
-use regrind::cell::Compared;
+use regrind::cell::ComparedFigure;
 
 /// Returns a count with separated thousands: 451,401.
 pub(super) fn count(n: usize) -> String {
@@ -34,11 +34,11 @@ pub(super) fn three_digits(value: f64) -> String {
 }
 
 /// Returns a judged figure, with its limit if it has one.
-pub(super) fn judged(compared: &Compared) -> String {
+pub(super) fn judged(compared: &ComparedFigure) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
-    let Compared { name, found_mm, limit_mm, .. } = compared;
+    let ComparedFigure { name, median_mm: found_mm, limit_mm, .. } = compared;
     let of = if limit_mm.is_finite() { format!(", limit {} µm", um(*limit_mm)) } else { String::new() };
-    let within = compared.within_in_words().map_or(String::new(), |words| format!(", {words}"));
+    let within = compared.probability_in_words().map_or(String::new(), |words| format!(", {words}"));
     format!("{name}: {} µm{of}{within}", um(*found_mm))
 }
 

@@ -3,10 +3,10 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::written::{
-    CellFile, FixtureTable, GrinderTable, RotaryTable, SphereTable, TimingTable, TravelTable, Turns, UncertaintyTable,
+use super::tables::{
+    CellFile, FixtureTable, GrinderTable, RotaryTable, SphereTable, TimingTable, TravelTable, RotatedElement, UncertaintyTable,
 };
-use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Rotary, Travel, dialect};
+use super::{CellConfig, CmmConfig, GrinderConfig, GrinderLimits, LinkConfig, ProgramConfig, ReferenceSphere, RotaryConfig, TravelLimits, dialect};
 use crate::device::{MachineTable, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::{Document, sha256};
 use crate::formats::gcode::{DialectError, LINUXCNC};
@@ -14,15 +14,15 @@ use crate::geometry::{Point, Pose, Twist};
 use crate::model;
 
 /// Checked values of a cell without path and text. A field is `None` if a key is missing, which is already reported.
-pub(super) struct Checked {
+pub(super) struct CheckedCell {
     name: Option<String>,
     simulated: Option<bool>,
     require_signature: bool,
-    cmm: Option<Cmm>,
-    grinder: Option<Grinder>,
+    cmm: Option<CmmConfig>,
+    grinder: Option<GrinderConfig>,
 }
 
-impl Checked {
+impl CheckedCell {
     /// Returns the cell, or `None` if a value is missing.
     pub(super) fn into_cell(self, path: &Path, text: &str, renamed: Vec<String>) -> Option<CellConfig> {
         Some(CellConfig {
@@ -41,7 +41,7 @@ impl Checked {
 }
 
 /// Tables that both machines have.
-struct Machine<'w> {
+struct MachineTables<'w> {
     key: &'static str,
     wire: Option<&'w Wire>,
     expected_name: Option<&'w String>,
@@ -51,10 +51,10 @@ struct Machine<'w> {
 }
 
 /// Checks a cell file as written. Errors are reported to `document`.
-pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> Checked {
+pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> CheckedCell {
     let (cmm, grinder) = (&written.cmm, &written.grinder);
     let machines = [
-        Machine {
+        MachineTables {
             key: "cmm",
             wire: cmm.wire.as_ref(),
             expected_name: cmm.expected_name.as_ref(),
@@ -62,7 +62,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
             registers: cmm.registers.as_ref(),
             signals: &cmm.signals,
         },
-        Machine {
+        MachineTables {
             key: "grinder",
             wire: grinder.wire.as_ref(),
             expected_name: grinder.expected_name.as_ref(),
@@ -89,11 +89,11 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     // An incomplete table is already reported.
     let rotary = grinder.rotary.as_ref().map(|rotary| self::rotary(rotary, document));
     let complete = !matches!(sphere, Some(None)) && !matches!(travel, Some(None));
-    Checked {
+    CheckedCell {
         name: written.cell.name.clone(),
         simulated,
         require_signature: written.cell.require_signature,
-        cmm: cmm_link.filter(|_| complete).map(|link| Cmm {
+        cmm: cmm_link.filter(|_| complete).map(|link| CmmConfig {
             link,
             fixture_cmm_from_model: fixture(&cmm.fixture),
             scale_expansion_um_m_k: cmm.temperature.scale_expansion_um_m_k,
@@ -104,16 +104,16 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
         }),
         grinder: (grinder_link.zip(limits).zip(program))
             .filter(|_| !matches!(rotary, Some(None)))
-            .map(|((link, limits), program)| Grinder { link, limits, program, rotary: rotary.flatten() }),
+            .map(|((link, limits), program)| GrinderConfig { link, limits, program, rotary: rotary.flatten() }),
     }
 }
 
-impl Machine<'_> {
+impl MachineTables<'_> {
     fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.key)
     }
 
-    fn link(&self, simulated: Option<bool>, document: &mut Document) -> Option<Link> {
+    fn link(&self, simulated: Option<bool>, document: &mut Document) -> Option<LinkConfig> {
         let place = MachineTable { table: self.key, simulated };
         let timing = self.timing(document);
         let registers = self.registers.copied().unwrap_or_default();
@@ -129,7 +129,7 @@ impl Machine<'_> {
             }
         }
         let expected_name = self.expected_name.cloned();
-        Some(Link { wire: wire.clone(), timing, registers, signals: signals?, expected_name })
+        Some(LinkConfig { wire: wire.clone(), timing, registers, signals: signals?, expected_name })
     }
 
     fn timing(&self, document: &mut Document) -> Timing {
@@ -180,7 +180,7 @@ fn fixture(written: &FixtureTable) -> Pose {
     Pose { rotation: turn(2) * turn(1) * turn(0), translation_mm: written.translation_mm.into() }.orthonormalised()
 }
 
-fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> Option<Programming> {
+fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> Option<ProgramConfig> {
     let written = &grinder.program;
     // LinuxCNC reads only its own dialect and frame.
     if matches!(grinder.wire, Some(Wire::Linuxcnc(_))) {
@@ -193,11 +193,11 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             document.report("grinder.program.folder", found, "the wire has its own folder", "remove it");
         }
     }
-    let dialect = match dialect::read(&written.dialect, path) {
+    let dialect = match dialect::read_named_dialect(&written.dialect, path) {
         Ok(dialect) => dialect,
         Err(problems) => {
             let known = dialect::dialects().collect::<Vec<_>>().join(", ");
-            let file = dialect::file_of(&written.dialect, path).unwrap_or_default();
+            let file = dialect::dialect_path(&written.dialect, path).unwrap_or_default();
             let found =
                 format!("is {:?}: {}", written.dialect, problems.to_string().lines().next().unwrap_or_default());
             let remedy = format!("name one of these, or correct the file: regrind check {}", file.display());
@@ -222,7 +222,7 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
         ),
         _ => {}
     }
-    Some(Programming {
+    Some(ProgramConfig {
         dialect,
         arcs_within_mm,
         controller_tolerance_mm: written.controller_tolerance_um.map(|um| 1e-3 * um),
@@ -263,7 +263,7 @@ fn reference_sphere(
     Some(ReferenceSphere { centre: Point::from(centre_mm), radius_mm, points: written.points })
 }
 
-fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Option<Travel> {
+fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Option<TravelLimits> {
     let (least_mm, most_mm) = (written.min_mm?, written.max_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
         if least_mm[k] >= most_mm[k] {
@@ -276,11 +276,11 @@ fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Opti
             );
         }
     }
-    Some(Travel { least_mm, most_mm })
+    Some(TravelLimits { min_mm: least_mm, max_mm: most_mm })
 }
 
-fn rotary(written: &RotaryTable, document: &mut Document) -> Option<Rotary> {
-    if written.turns == Turns::Table {
+fn rotary(written: &RotaryTable, document: &mut Document) -> Option<RotaryConfig> {
+    if written.turns == RotatedElement::Table {
         document.report(
             "grinder.rotary.turns",
             "is \"table\"",
@@ -298,7 +298,7 @@ fn rotary(written: &RotaryTable, document: &mut Document) -> Option<Rotary> {
         );
     }
     let max_rate_deg_min = written.max_rate_deg_min?;
-    Some(Rotary { letter, reversed: written.reversed, range_deg, max_rate_deg_min, pivot_mm: written.pivot_mm })
+    Some(RotaryConfig { letter, reversed: written.reversed, range_deg, max_rate_deg_min, pivot_mm: written.pivot_mm })
 }
 
 fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimits> {

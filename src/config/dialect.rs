@@ -9,7 +9,7 @@ use crate::formats::gcode::Dialect;
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<Dialect>);
 
 /// Built-in dialects, by name.
-const BUILT_IN: [(&str, &str); 4] = [
+const BUILT_IN_DIALECTS: [(&str, &str); 4] = [
     ("linuxcnc", include_str!("../../config/dialects/linuxcnc.toml")),
     ("fanuc", include_str!("../../config/dialects/fanuc.toml")),
     ("sinumerik", include_str!("../../config/dialects/sinumerik.toml")),
@@ -23,11 +23,11 @@ pub fn dialect_schema() -> &'static serde_json::Value {
 
 /// Returns the names of the built-in dialects.
 pub fn dialects() -> impl Iterator<Item = &'static str> {
-    BUILT_IN.iter().map(|(name, _)| *name)
+    BUILT_IN_DIALECTS.iter().map(|(name, _)| *name)
 }
 
 /// Returns the path of the dialect file that a cell file at `cell` names, or `None` for a built-in dialect.
-pub(super) fn file_of(dialect: &str, cell: &Path) -> Option<PathBuf> {
+pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
     let is_built_in = dialects().any(|name| name == dialect);
     (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))
 }
@@ -36,10 +36,10 @@ pub(super) fn file_of(dialect: &str, cell: &Path) -> Option<PathBuf> {
 ///
 /// # Errors
 /// Returns an error if the file cannot be read, and all errors of its text.
-pub(super) fn read(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
-    match BUILT_IN.iter().find(|(name, _)| *name == dialect) {
+pub(super) fn read_named_dialect(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
+    match BUILT_IN_DIALECTS.iter().find(|(name, _)| *name == dialect) {
         Some((name, text)) => parse_dialect(Path::new(name), text).map(|(dialect, _)| dialect),
-        None => read_dialect(&file_of(dialect, cell).unwrap_or_default()).map(|(dialect, _)| dialect),
+        None => read_dialect(&dialect_path(dialect, cell).unwrap_or_default()).map(|(dialect, _)| dialect),
     }
 }
 
@@ -58,7 +58,7 @@ pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
 /// Returns all errors of the text.
 pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
     let mut document = Document::parse(path, text)?;
-    document.hold_against(&SCHEMA);
+    document.check_schema(&SCHEMA);
     let written: Option<Dialect> = document.as_written();
     for fault in written.iter().flat_map(Dialect::faults) {
         // A missing key is already reported.
@@ -79,14 +79,14 @@ mod tests {
     #[test]
     fn what_ships_is_read_by_its_name() {
         for name in dialects() {
-            let dialect = read(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
+            let dialect = read_named_dialect(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
             assert_eq!(dialect.dialect.name, name);
         }
     }
 
     #[test]
     fn everything_wrong_is_told_at_its_place_with_a_remedy() {
-        let text = BUILT_IN[1]
+        let text = BUILT_IN_DIALECTS[1]
             .1
             .replace("\ndecimals = 4 ", "\ndecimals = 9 ")
             .replace("\nline = ", "\nlines = ")
@@ -107,7 +107,7 @@ mod tests {
     #[test]
     fn arcs_without_the_words_of_their_centre_are_told_at_their_place() {
         for (k, missing) in [(1, "centre_words"), (3, "centre_block")] {
-            let lines = BUILT_IN[k].1.lines().filter(|line| !line.starts_with(missing));
+            let lines = BUILT_IN_DIALECTS[k].1.lines().filter(|line| !line.starts_with(missing));
             let text = lines.collect::<Vec<_>>().join("\n");
             let problems = parse_dialect(Path::new("ours.toml"), &text).unwrap_err().to_string();
             let at = 1 + text.lines().position(|line| line.starts_with("[arcs]")).unwrap();

@@ -10,7 +10,7 @@ mod check;
 mod dialect;
 #[cfg(feature = "plant")]
 mod plant;
-mod written;
+mod tables;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -24,7 +24,7 @@ use crate::model::MachineUncertainty;
 pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
 #[cfg(feature = "plant")]
 pub use plant::{PlantConfig, plant_schema};
-pub use written::RotaryLetter;
+pub use tables::RotaryLetter;
 
 /// Checked configuration of a cell.
 #[derive(Clone, Debug)]
@@ -40,9 +40,9 @@ pub struct CellConfig {
     /// True if a run needs a key that signs its record.
     pub require_signature: bool,
     /// The measuring machine.
-    pub cmm: Cmm,
+    pub cmm: CmmConfig,
     /// The grinder.
-    pub grinder: Grinder,
+    pub grinder: GrinderConfig,
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
@@ -52,9 +52,9 @@ pub struct CellConfig {
 
 /// A measuring machine.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Cmm {
+pub struct CmmConfig {
     /// Connection to the machine.
-    pub link: Link,
+    pub link: LinkConfig,
     /// Pose of the part in the fixture. It maps model coordinates to CMM coordinates.
     pub fixture_cmm_from_model: Pose,
     /// Thermal expansion of its scales in µm/(m K), as far as the machine does not compensate it.
@@ -66,26 +66,26 @@ pub struct Cmm {
     /// Reference sphere on which the probe is checked.
     pub reference_sphere: Option<ReferenceSphere>,
     /// Travel limits of the probe's centre.
-    pub travel: Option<Travel>,
+    pub travel: Option<TravelLimits>,
 }
 
 /// A grinder.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Grinder {
+pub struct GrinderConfig {
     /// Connection to the machine.
-    pub link: Link,
+    pub link: LinkConfig,
     /// Limits of the machine.
     pub limits: GrinderLimits,
     /// Format and settings of its programs.
-    pub program: Programming,
+    pub program: ProgramConfig,
     /// The rotary axis of its head, if it has one.
-    pub rotary: Option<Rotary>,
+    pub rotary: Option<RotaryConfig>,
 }
 
 /// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::Rotary`] is the
 /// same axis in the form that paths use.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rotary {
+pub struct RotaryConfig {
     /// Letter of the axis in programs: A turns about x, B about y.
     pub letter: RotaryLetter,
     /// True if the scale counts left-handed.
@@ -101,7 +101,7 @@ pub struct Rotary {
 
 /// Format and settings of the programs of a grinder.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Programming {
+pub struct ProgramConfig {
     /// Dialect of its control.
     pub dialect: Dialect,
     /// Tolerance with which the control rounds corners by its own setting, if known.
@@ -114,7 +114,7 @@ pub struct Programming {
 
 /// Connection to a machine.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Link {
+pub struct LinkConfig {
     /// Wire to the machine.
     pub wire: Wire,
     /// Timeouts and polling times.
@@ -140,11 +140,11 @@ pub struct ReferenceSphere {
 
 /// Box of allowed positions: in the CMM frame for the probe, in the model frame for the wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Travel {
+pub struct TravelLimits {
     /// Minimum x, y, z.
-    pub least_mm: [f64; 3],
+    pub min_mm: [f64; 3],
     /// Maximum x, y, z.
-    pub most_mm: [f64; 3],
+    pub max_mm: [f64; 3],
 }
 
 /// Limits of a grinder.
@@ -163,11 +163,11 @@ pub struct GrinderLimits {
     /// Maximum jerk of an axis, if known.
     pub max_jerk_mm_s3: Option<f64>,
     /// Travel limits of the wheel's centre in the model frame, if known.
-    pub travel: Option<Travel>,
+    pub travel: Option<TravelLimits>,
 }
 
 /// Name of the built-in simulated cell.
-pub const BUILT_IN: &str = "sim";
+pub const BUILT_IN_CELL: &str = "sim";
 
 /// Keys that have a new name since version 0.2.
 const RENAMED: &[RenamedKey] = &[
@@ -197,7 +197,7 @@ const RENAMED: &[RenamedKey] = &[
     RenamedKey { old: "grinder.limits.largest_jerk_mm_s3", new: "grinder.limits.max_jerk_mm_s3" },
 ];
 
-static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);
+static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<tables::CellFile>);
 
 /// Returns the JSON schema of a cell file.
 pub fn json_schema() -> &'static serde_json::Value {
@@ -210,7 +210,7 @@ impl CellConfig {
     /// # Errors
     /// Returns an error if the file cannot be read, and all errors of its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
-        if path == Path::new(BUILT_IN) {
+        if path == Path::new(BUILT_IN_CELL) {
             return Self::parse(path, include_str!("../../config/sim.toml"));
         }
         let text = read_text(path)?;
@@ -224,7 +224,7 @@ impl CellConfig {
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         let renamed = document.rename_keys(RENAMED);
-        document.hold_against(&SCHEMA);
+        document.check_schema(&SCHEMA);
         let checked = document.as_written().map(|written| check::check(&written, path, &mut document));
         document.finish()?;
         let cell = checked.and_then(|checked| checked.into_cell(path, text, renamed));
@@ -252,12 +252,12 @@ impl CellConfig {
     }
 
     /// Returns true if every record is marked SIMULATION: the machines are simulated, or the run is a rehearsal.
-    pub fn is_marked(&self) -> bool {
+    pub fn is_marked_simulation(&self) -> bool {
         self.simulated || self.rehearsal
     }
 
     /// Returns true if people serve both machines.
-    pub fn is_by_person(&self) -> bool {
+    pub fn is_manual(&self) -> bool {
         [&self.cmm.link, &self.grinder.link].iter().all(|link| link.wire.is_by_person())
     }
 

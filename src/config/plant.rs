@@ -89,22 +89,22 @@ impl PlantConfig {
     /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
-        document.hold_against(&SCHEMA);
+        document.check_schema(&SCHEMA);
         let written: Option<PlantFile> = document.as_written();
         let at = path.parent().unwrap_or(Path::new(""));
         let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
             cell: plant.cell,
             machines_differ: plant.machines_differ,
             database: database.map(|database| DatabaseSettings {
-                password_file: beside(at, database.password_file),
-                certificates: beside(at, database.certificates),
+                password_file: resolve_path(at, database.password_file),
+                certificates: resolve_path(at, database.certificates),
                 ..database
             }),
             approvers: approver,
             artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
             sparkplug: sparkplug.map(|broker| SparkplugSettings {
-                password_file: beside(at, broker.password_file),
-                certificates: beside(at, broker.certificates),
+                password_file: resolve_path(at, broker.password_file),
+                certificates: resolve_path(at, broker.certificates),
                 ..broker
             }),
             opcua,
@@ -135,6 +135,6 @@ impl PlantConfig {
 }
 
 /// Returns a file path resolved relative to the folder of the plant file.
-fn beside(at: &Path, file: Option<PathBuf>) -> Option<PathBuf> {
+fn resolve_path(at: &Path, file: Option<PathBuf>) -> Option<PathBuf> {
     file.map(|file| at.join(file))
 }

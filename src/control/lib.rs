@@ -9,11 +9,11 @@
 //! All clients use this one interface, so an order is recorded in the same way whoever gave it. The operating system
 //! identifies the user of the client. A program that acts for other people names the person.
 
-mod door;
+mod endpoint;
 mod request;
 mod snapshot;
 mod socket;
 
 pub use request::{OnBehalf, Reply, Request};
-pub use snapshot::{CycleRow, JobProgress, Next, PartVerdict, Snapshot, SoFar};
-pub use socket::{Control, DoorChange, Ordered, Watch, ask, ask_at, ask_for, is_live, is_live_at, watch};
+pub use snapshot::{CycleRow, JobProgress, NextStep, PartVerdict, Snapshot, PreviewStatistics};
+pub use socket::{Control, EndpointChange, ReceivedOrder, StatusStream, send_request, send_request_at, send_request_on_behalf, is_live, is_live_at, watch};

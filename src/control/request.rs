@@ -97,17 +97,17 @@ pub struct OnBehalf {
 
 /// Line of text as it is sent over the socket.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Line {
+pub(super) struct RequestLine {
     #[serde(flatten)]
     pub(super) request: Request,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) by: Option<OnBehalf>,
 }
 
-impl Line {
+impl RequestLine {
     /// Returns true if a text in the request displays differently from its characters. It would be on record in that
     /// form for years.
-    pub(super) fn misleads(&self) -> bool {
+    pub(super) fn has_misleading_text(&self) -> bool {
         let text = match &self.request {
             Request::Hold { reason }
             | Request::Resume { reason, .. }

@@ -45,7 +45,7 @@ pub struct Snapshot {
     pub progress: Option<JobProgress>,
     /// Preliminary result of the current measurement, if the CMM reports touches before the end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub so_far: Option<SoFar>,
+    pub so_far: Option<PreviewStatistics>,
     /// Tolerance against which the figures of a cycle are judged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tolerance: Option<Tolerance>,
@@ -59,7 +59,7 @@ pub struct Snapshot {
     pub waits_for: Vec<String>,
     /// Next step of a person.
     #[serde(default)]
-    pub next_step: Next,
+    pub next_step: NextStep,
     /// The next step as a sentence, with the commands of the terminal.
     #[serde(default)]
     pub next: String,
@@ -80,7 +80,7 @@ pub enum PartVerdict {
 
 impl PartVerdict {
     /// Returns the verdict that belongs to a state. Only an accepted part completes a run.
-    pub fn at(state: StateName) -> Self {
+    pub fn from_state(state: StateName) -> Self {
         match state {
             StateName::Complete => Self::Accepted,
             StateName::Stopped | StateName::Aborted => Self::NotAccepted,
@@ -93,7 +93,7 @@ impl PartVerdict {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "step", rename_all = "snake_case")]
 #[non_exhaustive]
-pub enum Next {
+pub enum NextStep {
     /// No action needed.
     #[default]
     Nothing,
@@ -122,7 +122,7 @@ pub enum Next {
     ReadReport,
 }
 
-impl fmt::Display for Next {
+impl fmt::Display for NextStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Nothing => "no action needed",
@@ -174,7 +174,7 @@ pub struct JobProgress {
 /// Preliminary statistics of the touches of a measurement that still runs. Deviations refer to the planned position of
 /// the part, so they include its placement error on the table. No gate has checked them, and no verdict uses them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SoFar {
+pub struct PreviewStatistics {
     /// Number of touches of the part so far.
     pub touched: u32,
     /// Root mean square of their deviations along the normals, in µm.

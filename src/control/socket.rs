@@ -14,31 +14,31 @@ use regrind_cell::Actor;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 
-use super::door::{self, Caller, CellSays, Door, TellCaller, TellCell};
-use super::request::{Line, OnBehalf, Reply, Request};
+use super::endpoint::{self, Client, CellReader, Endpoint, ClientWriter, CellWriter};
+use super::request::{RequestLine, OnBehalf, Reply, Request};
 use super::snapshot::Snapshot;
 
 /// Maximum length of a line from a client, in bytes.
-const LONGEST_LINE: u64 = 4096;
+const MAX_LINE_BYTES: u64 = 4096;
 /// Timeout of a read or write. A client that sends nothing for this time is considered gone.
-const PATIENCE: Duration = Duration::from_secs(10);
+const IO_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Timeout of an order in the cell. The client then gets a reply that says so, while it still listens.
-const ANSWERS_WITHIN: Duration = Duration::from_secs(8);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(8);
 /// Maximum number of clients that watch at the same time. Each keeps a file descriptor, and orders also need
 /// descriptors.
-const WATCHERS: usize = 16;
+const MAX_WATCHERS: usize = 16;
 /// Pause after a failed attempt to accept a client.
-const BETWEEN_TRIES: Duration = Duration::from_millis(50);
+const ACCEPT_RETRY_INTERVAL: Duration = Duration::from_millis(50);
 /// Minimum and maximum time between two lines to a client that watches. A person cannot follow more lines. A cell that
 /// is silent for longer than the maximum is gone.
-const LEAST_BETWEEN_LINES: Duration = Duration::from_millis(100);
-const MOST_BETWEEN_LINES: Duration = Duration::from_secs(1);
+const MIN_LINE_INTERVAL: Duration = Duration::from_millis(100);
+const MAX_LINE_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum silence after which a client that watches considers the cell gone.
-const SILENCE: Duration = Duration::from_millis(2500);
+const SILENCE_TIMEOUT: Duration = Duration::from_millis(2500);
 
 /// Order on its way to the loop of the cell.
-pub struct Ordered {
+pub struct ReceivedOrder {
     /// The request.
     pub request: Request,
     /// Person or program that asks.
@@ -48,32 +48,32 @@ pub struct Ordered {
 }
 
 /// Time between two checks that the door in the run folder still exists.
-const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Change of the door in the run folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum DoorChange {
+pub enum EndpointChange {
     /// The door is missing or was replaced, so clients may not find the cell. Contains the reason if it could not be
     /// made again; otherwise empty.
     Lost(String),
     /// The door was made again, or is back in its place.
-    MadeAgain,
+    Restored,
 }
 
 /// Channels and limits for serving the clients.
 #[derive(Clone)]
-struct Desk {
-    orders: mpsc::Sender<Ordered>,
+struct ControlService {
+    orders: mpsc::Sender<ReceivedOrder>,
     status: watch::Receiver<Snapshot>,
-    places: Arc<Semaphore>,
+    watcher_permits: Arc<Semaphore>,
 }
 
 /// Doors of a cell. Dropping this closes and removes them.
 pub struct Control {
     folder: PathBuf,
-    beside: Option<PathBuf>,
-    desk: Desk,
-    changes: mpsc::UnboundedReceiver<DoorChange>,
+    second_place: Option<PathBuf>,
+    service: ControlService,
+    changes: mpsc::UnboundedReceiver<EndpointChange>,
     tasks: Vec<tokio::task::JoinHandle<()>>,
 }
 
@@ -85,37 +85,37 @@ impl Control {
     /// program has the pipe.
     pub fn listen(
         folder: &Path,
-        orders: mpsc::Sender<Ordered>,
+        orders: mpsc::Sender<ReceivedOrder>,
         status: watch::Receiver<Snapshot>,
         watched: bool,
     ) -> io::Result<Self> {
-        let door = Door::open(folder)?;
-        let desk = Desk { orders, status, places: Arc::new(Semaphore::new(WATCHERS)) };
+        let door = Endpoint::open(folder)?;
+        let desk = ControlService { orders, status, watcher_permits: Arc::new(Semaphore::new(MAX_WATCHERS)) };
         let (tell, changes) = mpsc::unbounded_channel();
         let (hand_over, made_again) = mpsc::channel(1);
         let mut tasks = Vec::new();
         match door.mark().filter(|_| watched) {
-            Some(mark) => tasks.push(tokio::spawn(keep_in_place(mark, tell, hand_over))),
+            Some(mark) => tasks.push(tokio::spawn(restore_if_removed(mark, tell, hand_over))),
             None => drop(hand_over),
         }
-        tasks.push(tokio::spawn(attend(door, made_again, desk.clone())));
-        Ok(Self { folder: folder.to_owned(), beside: None, desk, changes, tasks })
+        tasks.push(tokio::spawn(accept_clients(door, made_again, desk.clone())));
+        Ok(Self { folder: folder.to_owned(), second_place: None, service: desk, changes, tasks })
     }
 
     /// Listens also at a second place, for the user of this program and root only.
     ///
     /// # Errors
     /// No socket can be made at that place.
-    pub fn listen_beside(&mut self, place: &Path) -> io::Result<()> {
-        let Some(door) = Door::open_for_user(place)? else { return Ok(()) };
-        self.beside = Some(place.to_owned());
+    pub fn listen_also_at(&mut self, place: &Path) -> io::Result<()> {
+        let Some(door) = Endpoint::open_for_user(place)? else { return Ok(()) };
+        self.second_place = Some(place.to_owned());
         let (_, none) = mpsc::channel(1);
-        self.tasks.push(tokio::spawn(attend(door, none, self.desk.clone())));
+        self.tasks.push(tokio::spawn(accept_clients(door, none, self.service.clone())));
         Ok(())
     }
 
     /// Waits until the door in the run folder is lost or made again, and returns the change.
-    pub async fn changed(&mut self) -> DoorChange {
+    pub async fn changed(&mut self) -> EndpointChange {
         match self.changes.recv().await {
             Some(change) => change,
             // The door is not watched.
@@ -127,18 +127,18 @@ impl Control {
 impl Drop for Control {
     fn drop(&mut self) {
         self.tasks.iter().for_each(tokio::task::JoinHandle::abort);
-        door::take_away(&self.folder);
-        if let Some(place) = &self.beside {
-            door::take_away_at(place);
+        endpoint::remove_endpoint(&self.folder);
+        if let Some(place) = &self.second_place {
+            endpoint::remove_endpoint_at(place);
         }
     }
 }
 
 /// Accepts the clients of a door, and of the door that replaces it.
-async fn attend(mut door: Door, mut made_again: mpsc::Receiver<Door>, desk: Desk) {
+async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpoint>, desk: ControlService) {
     loop {
         let caller = tokio::select! {
-            caller = door.let_in() => caller,
+            caller = door.accept() => caller,
             Some(new) = made_again.recv() => {
                 door = new;
                 continue;
@@ -147,19 +147,19 @@ async fn attend(mut door: Door, mut made_again: mpsc::Receiver<Door>, desk: Desk
         let Ok(caller) = caller else {
             // No descriptor is left, or the client has gone. Both conditions pass, and orders must get through
             // afterwards.
-            tokio::time::sleep(BETWEEN_TRIES).await;
+            tokio::time::sleep(ACCEPT_RETRY_INTERVAL).await;
             continue;
         };
         let desk = desk.clone();
         // A client that misbehaves affects only its own task.
-        tokio::spawn(async move { drop(serve(caller, desk).await) });
+        tokio::spawn(async move { drop(serve_client(caller, desk).await) });
     }
 }
 
 /// Checks periodically that a door still exists, and makes it again if not. Disk access runs on a thread of its own: a
 /// disk that does not answer blocks no order.
-async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorChange>, hand_over: mpsc::Sender<Door>) {
-    let mut looks = tokio::time::interval(BETWEEN_LOOKS);
+async fn restore_if_removed(mut mark: endpoint::EndpointIdentity, tell: mpsc::UnboundedSender<EndpointChange>, hand_over: mpsc::Sender<Endpoint>) {
+    let mut looks = tokio::time::interval(CHECK_INTERVAL);
     let mut is_lost = false;
     loop {
         looks.tick().await;
@@ -172,17 +172,17 @@ async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorCha
         let Some(made) = made else {
             // The door was moved away and back.
             if std::mem::take(&mut is_lost) {
-                let _ = tell.send(DoorChange::MadeAgain);
+                let _ = tell.send(EndpointChange::Restored);
             }
             continue;
         };
         if !std::mem::replace(&mut is_lost, true) {
             let why = made.as_ref().map_or_else(io::Error::to_string, |_| String::new());
-            let _ = tell.send(DoorChange::Lost(why));
+            let _ = tell.send(EndpointChange::Lost(why));
         }
         let Some((door, new)) = made.ok().and_then(|door| Some((door.mark()?, door))) else { continue };
         (mark, is_lost) = (door, false);
-        let _ = tell.send(DoorChange::MadeAgain);
+        let _ = tell.send(EndpointChange::Restored);
         if hand_over.send(new).await.is_err() {
             return;
         }
@@ -190,40 +190,40 @@ async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorCha
 }
 
 /// Reads the request of a client, and answers it.
-async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
-    let Desk { orders, mut status, places } = desk;
+async fn serve_client(caller: Client, desk: ControlService) -> io::Result<()> {
+    let ControlService { orders, mut status, watcher_permits: places } = desk;
     let peer = caller.actor()?;
     let (read, mut write) = caller.into_halves();
     let mut text = String::new();
-    let mut read = BufReader::new(read).take(LONGEST_LINE);
-    tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
-    if door::has_gone(read.get_ref().get_ref()) {
+    let mut read = BufReader::new(read).take(MAX_LINE_BYTES);
+    tokio::time::timeout(IO_TIMEOUT, read.read_line(&mut text)).await??;
+    if endpoint::is_closed(read.get_ref().get_ref()) {
         // This process was suspended, and the client has given up. An order that nobody waits for is not executed.
         return Ok(());
     }
     let reply = match serde_json::from_str(&text) {
-        Ok(Line { request: Request::Watch, .. }) => match places.try_acquire() {
-            Ok(_place) => return told_on(&mut write, &mut status).await,
+        Ok(RequestLine { request: Request::Watch, .. }) => match places.try_acquire() {
+            Ok(_place) => return stream_status(&mut write, &mut status).await,
             Err(_) => refusal(
-                format!("{WATCHERS} clients already watch this cell, which is the limit; close one of them"),
+                format!("{MAX_WATCHERS} clients already watch this cell, which is the limit; close one of them"),
                 &status,
             ),
         },
-        Ok(line) if line.misleads() => refusal(
+        Ok(line) if line.has_misleading_text() => refusal(
             "not an order: it contains characters that are invisible or change the reading direction".into(),
             &status,
         ),
-        Ok(Line { request, by }) => answer(request, on_behalf(peer, by), &orders, &status).await,
+        Ok(RequestLine { request, by }) => forward_request(request, on_behalf(peer, by), &orders, &status).await,
         Err(error) => refusal(format!("not an order: {error}"), &status),
     };
-    tell(&mut write, &reply).await
+    send_reply(&mut write, &reply).await
 }
 
 /// Passes an order to the cell, and waits for its reply.
-async fn answer(
+async fn forward_request(
     request: Request,
     actor: Actor,
-    orders: &mpsc::Sender<Ordered>,
+    orders: &mpsc::Sender<ReceivedOrder>,
     status: &watch::Receiver<Snapshot>,
 ) -> Reply {
     if request == Request::Status {
@@ -232,10 +232,10 @@ async fn answer(
     let over = || refusal("the run is over".into(), status);
     let (answer, answered) = oneshot::channel();
     let handed_over = async {
-        orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
+        orders.send(ReceivedOrder { request, actor, answer: Some(answer) }).await.ok()?;
         answered.await.ok()
     };
-    match tokio::time::timeout(ANSWERS_WITHIN, handed_over).await {
+    match tokio::time::timeout(ANSWER_TIMEOUT, handed_over).await {
         Ok(reply) => reply.unwrap_or_else(over),
         Err(_) => refusal(
             "the cell did not answer in time; it is unknown whether it took the order: check its status".into(),
@@ -250,22 +250,22 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
 
 /// Sends the state of the cell after every change, and repeats it after [`MOST_BETWEEN_LINES`] without a change, so
 /// that silence means that the cell is gone.
-async fn told_on(write: &mut TellCaller, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
+async fn stream_status(write: &mut ClientWriter, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
-        tell(write, &Reply { taken: true, message: String::new(), status: now }).await?;
-        tokio::time::sleep(LEAST_BETWEEN_LINES).await;
+        send_reply(write, &Reply { taken: true, message: String::new(), status: now }).await?;
+        tokio::time::sleep(MIN_LINE_INTERVAL).await;
         // A timeout sends the state again, as a change does.
-        if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN_LINES, status.changed()).await {
+        if let Ok(Err(_)) = tokio::time::timeout(MAX_LINE_INTERVAL, status.changed()).await {
             return Ok(());
         }
     }
 }
 
-async fn tell(write: &mut TellCaller, reply: &Reply) -> io::Result<()> {
+async fn send_reply(write: &mut ClientWriter, reply: &Reply) -> io::Result<()> {
     let mut text = serde_json::to_vec(reply)?;
     text.push(b'\n');
-    tokio::time::timeout(PATIENCE, write.write_all(&text)).await?
+    tokio::time::timeout(IO_TIMEOUT, write.write_all(&text)).await?
 }
 
 /// Returns the person for whom a program acts. The result also names the user of the program, because the name of the
@@ -278,28 +278,28 @@ fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
 
 /// Returns true if a run is active in a folder: a cell listens for its orders.
 pub fn is_live(folder: &Path) -> bool {
-    door::is_open(folder)
+    endpoint::is_listening(folder)
 }
 
 /// Returns true if a cell listens on a door outside a run folder.
 pub fn is_live_at(place: &Path) -> bool {
-    door::is_open_at(place)
+    endpoint::is_listening_at(place)
 }
 
 /// Sends a request to a running cell, and blocks until its reply.
 ///
 /// # Errors
 /// No cell runs in that folder, or it does not answer.
-pub fn ask(folder: &Path, request: &Request) -> io::Result<Reply> {
-    ask_for(folder, request, None)
+pub fn send_request(folder: &Path, request: &Request) -> io::Result<Reply> {
+    send_request_on_behalf(folder, request, None)
 }
 
 /// Sends a request to a running cell on behalf of another person, and blocks until its reply.
 ///
 /// # Errors
 /// Those of [`ask`].
-pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
-    let text = door::ask(folder, &line(request, by)?, PATIENCE)?;
+pub fn send_request_on_behalf(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
+    let text = endpoint::exchange_line(folder, &encode_line(request, by)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)
 }
 
@@ -307,41 +307,41 @@ pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Re
 ///
 /// # Errors
 /// No cell listens there, the door belongs to another user, or the cell does not answer.
-pub fn ask_at(place: &Path, request: &Request) -> io::Result<Reply> {
-    let text = door::ask_at(place, &line(request, None)?, PATIENCE)?;
+pub fn send_request_at(place: &Path, request: &Request) -> io::Result<Reply> {
+    let text = endpoint::exchange_line_at(place, &encode_line(request, None)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)
 }
 
-fn line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
-    let mut text = serde_json::to_vec(&Line { request: request.clone(), by })?;
+fn encode_line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
+    let mut text = serde_json::to_vec(&RequestLine { request: request.clone(), by })?;
     text.push(b'\n');
     Ok(text)
 }
 
 /// Connection that watches a running cell.
-pub struct Watch {
-    lines: Lines<BufReader<CellSays>>,
+pub struct StatusStream {
+    lines: Lines<BufReader<CellReader>>,
     /// Kept open: the cell stops sending when the client closes its end.
-    _write: TellCell,
+    _write: CellWriter,
 }
 
 /// Starts to watch a running cell.
 ///
 /// # Errors
 /// No cell runs in that folder.
-pub async fn watch(folder: &Path) -> io::Result<Watch> {
-    let (read, mut write) = door::knock(folder).await?;
-    write.write_all(&line(&Request::Watch, None)?).await?;
-    Ok(Watch { lines: BufReader::new(read).lines(), _write: write })
+pub async fn watch(folder: &Path) -> io::Result<StatusStream> {
+    let (read, mut write) = endpoint::open_connection(folder).await?;
+    write.write_all(&encode_line(&Request::Watch, None)?).await?;
+    Ok(StatusStream { lines: BufReader::new(read).lines(), _write: write })
 }
 
-impl Watch {
+impl StatusStream {
     /// Waits for the next state of the cell, and returns it; `None` if the cell has closed the connection.
     ///
     /// # Errors
     /// The cell is silent for too long, its line cannot be parsed, or too many clients watch already.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
-        let Some(text) = tokio::time::timeout(SILENCE, self.lines.next_line()).await?? else { return Ok(None) };
+        let Some(text) = tokio::time::timeout(SILENCE_TIMEOUT, self.lines.next_line()).await?? else { return Ok(None) };
         let Reply { taken, message, status } = serde_json::from_str(&text)?;
         if taken { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }

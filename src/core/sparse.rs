@@ -19,7 +19,7 @@ use faer::sparse::{SparseColMatRef, SymbolicSparseColMat};
 use faer::{Accum, Conj, Mat, MatMut, Par, Side};
 
 /// Pattern of the lower triangle of a symmetric matrix, with its symbolic factorization.
-pub(crate) struct Pattern {
+pub(crate) struct SparsityPattern {
     matrix: SymbolicSparseColMat<usize>,
     symbolic: SymbolicCholesky<usize>,
     /// Supernode of each column of the factor.
@@ -27,19 +27,19 @@ pub(crate) struct Pattern {
 }
 
 /// Cholesky factor of a matrix with a given pattern.
-pub(crate) struct Factor<'a> {
-    pattern: &'a Pattern,
+pub(crate) struct CholeskyFactor<'a> {
+    pattern: &'a SparsityPattern,
     values: Vec<f64>,
 }
 
 /// Entries of the inverse within the pattern of the factor.
 pub(crate) struct SelectedInverse<'a> {
-    pattern: &'a Pattern,
+    pattern: &'a SparsityPattern,
     /// For each supernode, the square block and the block below it, stacked.
     blocks: Vec<Mat<f64>>,
 }
 
-impl Pattern {
+impl SparsityPattern {
     /// Orders and analyses a pattern: the columns of the lower triangle, with rows ascending. Returns `None` if there
     /// is not enough memory.
     pub fn new(columns: usize, begins: Vec<usize>, rows: Vec<usize>) -> Option<Self> {
@@ -68,7 +68,7 @@ impl Pattern {
     }
 
     /// Factors a matrix of this pattern; returns `None` if it is not positive definite or memory is not sufficient.
-    pub fn factor(&self, values: &[f64]) -> Option<Factor<'_>> {
+    pub fn factor(&self, values: &[f64]) -> Option<CholeskyFactor<'_>> {
         let matrix = SparseColMatRef::new(self.matrix.as_ref(), values);
         let mut factor = vec![0.0; self.symbolic.len_val()];
         let scratch = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
@@ -78,11 +78,11 @@ impl Pattern {
         self.symbolic
             .factorize_numeric_llt(&mut factor, matrix, side, plain, Par::Seq, stack, Default::default())
             .ok()?;
-        factor.iter().all(|v| v.is_finite()).then_some(Factor { pattern: self, values: factor })
+        factor.iter().all(|v| v.is_finite()).then_some(CholeskyFactor { pattern: self, values: factor })
     }
 }
 
-impl<'a> Factor<'a> {
+impl<'a> CholeskyFactor<'a> {
     /// Solves for one right-hand side; returns `None` if memory is not sufficient.
     pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
         let symbolic = &self.pattern.symbolic;
@@ -196,7 +196,7 @@ mod tests {
             }
             begins.push(rows.len());
         }
-        let pattern = Pattern::new(N, begins, rows).unwrap();
+        let pattern = SparsityPattern::new(N, begins, rows).unwrap();
         let factor = pattern.factor(&values).unwrap();
         let (inverse, selected) = (full.clone().try_inverse().unwrap(), factor.selected_inverse().unwrap());
         for c in 0..N {
@@ -211,7 +211,7 @@ mod tests {
 
     #[test]
     fn what_is_not_definite_has_no_factor() {
-        let pattern = Pattern::new(2, vec![0, 2, 3], vec![0, 1, 1]).unwrap();
+        let pattern = SparsityPattern::new(2, vec![0, 2, 3], vec![0, 1, 1]).unwrap();
         assert!(pattern.factor(&[1.0, 2.0, 1.0]).is_none());
     }
 }

@@ -138,7 +138,7 @@ impl<'t> Document<'t> {
     }
 
     /// Checks the values against a schema. A value that does not fit is reported and removed.
-    pub fn hold_against(&mut self, schema: &Schema) {
+    pub fn check_schema(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
         Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
         if let toml::Value::Table(values) = values {
@@ -452,7 +452,7 @@ impl Shape<'_, '_> {
         };
         let Some(kind) = table.get_mut(tag) else {
             let allowed = format!("one of {}", in_words(&words));
-            self.tell_missing(tag, &allowed, &format!("add `{tag} = \"{}\"`", words[0]));
+            self.report_missing(tag, &allowed, &format!("add `{tag} = \"{}\"`", words[0]));
             return false;
         };
         self.path.push(Step::Key(tag.to_owned()));
@@ -493,7 +493,7 @@ impl Shape<'_, '_> {
                 (least, most) if least == most => format!("there must be {least}"),
                 (least, most) => format!("there must be {least} to {most}"),
             };
-            self.tell(found, &allowed, "add or remove entries");
+            self.report_problem(found, &allowed, "add or remove entries");
             return false;
         }
         let mut all = true;
@@ -577,23 +577,23 @@ impl Shape<'_, '_> {
                 "has the character U+{:04X}, which is invisible or changes the direction of the text",
                 u32::from(hidden)
             );
-            self.tell(found, "it must be text of visible characters", "remove it, or type the text again");
+            self.report_problem(found, "it must be text of visible characters", "remove it, or type the text again");
             return false;
         }
         if (least..=most).contains(&length) {
             return true;
         }
         let found = format!("has {length} characters");
-        self.tell(found, &format!("it must have {least} to {most}"), "write a shorter or longer text");
+        self.report_problem(found, &format!("it must have {least} to {most}"), "write a shorter or longer text");
         false
     }
 
     fn wrong(&mut self, value: &toml::Value, allowed: &str, remedy: &str) -> bool {
-        self.tell(format!("is {}", shown(value)), &format!("it must be {allowed}"), remedy);
+        self.report_problem(format!("is {}", shown(value)), &format!("it must be {allowed}"), remedy);
         false
     }
 
-    fn tell(&mut self, found: String, allowed: &str, remedy: &str) {
+    fn report_problem(&mut self, found: String, allowed: &str, remedy: &str) {
         let span = span_of(&self.document.places, &self.path);
         self.document.push(span, key_of(&self.path), found, allowed, remedy);
     }
@@ -604,7 +604,7 @@ impl Shape<'_, '_> {
         if is_table {
             let mut path = self.path.clone();
             path.push(Step::Key(key.to_owned()));
-            return self.tell_missing(key, "", &format!("add the table [{}]", key_of(&path)));
+            return self.report_missing(key, "", &format!("add the table [{}]", key_of(&path)));
         }
         let allowed = match schema.get("type").and_then(Schema::as_str) {
             _ if choices(schema).is_some() => format!("one of {}", in_words(&choices(schema).unwrap_or_default())),
@@ -620,10 +620,10 @@ impl Shape<'_, '_> {
         };
         let example = schema.get("examples").and_then(|examples| examples.get(0)).map(ToString::to_string);
         let remedy = example.map_or(format!("add `{key}`"), |example| format!("add `{key} = {example}`"));
-        self.tell_missing(key, &allowed, &remedy);
+        self.report_missing(key, &allowed, &remedy);
     }
 
-    fn tell_missing(&mut self, key: &str, allowed: &str, remedy: &str) {
+    fn report_missing(&mut self, key: &str, allowed: &str, remedy: &str) {
         let span = span_of(&self.document.places, &self.path);
         self.path.push(Step::Key(key.to_owned()));
         let allowed = if allowed.is_empty() { String::new() } else { format!("it must be {allowed}") };

@@ -12,23 +12,23 @@
 //! once. Everything else waits in a queue until the journal has all earlier records; this includes the answer to the
 //! person who gave an order.
 
-mod beside;
+mod blocking_executor;
 mod cycles;
-mod maps;
+mod cycle_output;
 mod notice;
 mod outcome;
-mod pace;
+mod progress_estimator;
 mod pass_record;
 mod program;
-mod record;
-pub mod recover;
+mod recorder;
+pub mod recovery;
 mod replay;
 mod snapshot;
-mod so_far;
+mod preview;
 mod station;
 mod task;
-mod touches;
-mod work;
+mod adaptive_measurement;
+mod pipeline;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -43,7 +43,7 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 
 use crate::cell::{
-    Actor, Asked, Cell, CellPlan, Command, Compared, CompensationRefusal, Device, Ending, Event, Gate, GateFailure,
+    Actor, MachineRequest, Cell, CellPlan, Command, ComparedFigure, CompensationRefusal, Device, Ending, Event, GateResult, GateFailure,
     Judgement, Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
@@ -53,69 +53,69 @@ use crate::device::{
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, Kind};
 
-pub use beside::{Beside, Blocking};
+pub use blocking_executor::{BlockingExecutor, BlockingWork};
 use cycles::Cycles;
 pub use notice::Notice;
-use pace::Pace;
+use progress_estimator::ProgressEstimator;
 use program::PROGRAM_FILE;
 pub use program::{ProgramError, Programs};
-pub use record::Ledger;
-use record::{Files, Recorder, Ticket, entry};
-use regrind_control::{Control, DoorChange, Ordered};
-pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, SoFar, ask, is_live};
-pub use replay::{Interrupted, ReplayError};
-use so_far::Touching;
+pub use recorder::JournalSink;
+use recorder::{OutputFiles, Recorder, RecordReceipt, entry};
+use regrind_control::{Control, EndpointChange, ReceivedOrder};
+pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, PreviewStatistics, send_request, is_live};
+pub use replay::{InterruptedRun, ReplayError};
+use preview::PreviewAccumulator;
 use station::{
-    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, Notes, PULSE_EVERY, Pulse, StationDriver,
+    AbortCounter, StationRequest, CmmDriver, FetchedResult, GrinderDriver, MachinePayload, MachineTask, MachineNotes, WATCHDOG_INTERVAL, LoopWatchdog, StationDriver,
     StationReport,
 };
-use task::Product;
+use task::ComputationProduct;
 pub(crate) use task::correction_grid;
-pub use task::{Adaptive, Probing, Sphere, TakenBack, Task};
+pub use task::{AdaptiveOptions, Probing, ReferenceSphere, ParameterCompensation, Task};
 
 /// Inputs of a run besides its machines.
-pub struct Run {
+pub struct RunInputs {
     /// Parameters by which the cell decides.
     pub plan: CellPlan,
     /// Data and options of the computations.
     pub task: Task,
     /// Journal of the run: a new one, or an open one of an interrupted run.
-    pub journal: Box<dyn Ledger>,
+    pub journal: Box<dyn JournalSink>,
     /// Number of the part's run, for the machines.
     pub job: u32,
     /// Person who began the run.
     pub actor: Actor,
     /// True if the cell need not ask to load the part: the cell is simulated, or the person who begins the run has
     /// confirmed it.
-    pub loaded: bool,
+    pub load_confirmed: bool,
     /// Poll interval of each machine: CMM, grinder.
-    pub poll: [Duration; 2],
+    pub poll_intervals: [Duration; 2],
     /// Channel for notices.
     pub notices: mpsc::UnboundedSender<Notice>,
     /// Interrupted run to continue.
-    pub interrupted: Option<Interrupted>,
+    pub interrupted: Option<InterruptedRun>,
     /// Executor of blocking work.
-    pub beside: Beside,
+    pub executor: BlockingExecutor,
 }
 
 /// Channel for orders from this process itself: Ctrl-C, a prompt.
 #[derive(Clone)]
-pub struct Orders {
-    orders: mpsc::Sender<Ordered>,
+pub struct OrderSender {
+    orders: mpsc::Sender<ReceivedOrder>,
     status: watch::Receiver<Snapshot>,
 }
 
-impl Orders {
+impl OrderSender {
     /// Sends an order, which the loop handles in its turn.
-    pub async fn give(&self, request: Request, actor: Actor) {
+    pub async fn send(&self, request: Request, actor: Actor) {
         // A run that is over needs no orders.
-        let _ = self.orders.send(Ordered { request, actor, answer: None }).await;
+        let _ = self.orders.send(ReceivedOrder { request, actor, answer: None }).await;
     }
 
     /// Sends an order, and returns the answer that the control socket would give. Returns `None` if the run is over.
-    pub async fn ask(&self, request: Request, actor: Actor) -> Option<Reply> {
+    pub async fn send_and_wait(&self, request: Request, actor: Actor) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
-        self.orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
+        self.orders.send(ReceivedOrder { request, actor, answer: Some(answer) }).await.ok()?;
         answered.await.ok()
     }
 
@@ -125,7 +125,7 @@ impl Orders {
     }
 
     /// Returns true if the cell is in Execute: neither held nor suspended, and not on the way there or back.
-    pub fn is_working(&self) -> bool {
+    pub fn is_executing(&self) -> bool {
         self.status.borrow().state == StateName::Execute
     }
 }
@@ -140,48 +140,48 @@ pub struct Drive {
     serial: String,
     job: u32,
     actor: Actor,
-    loaded: bool,
-    began: Instant,
+    load_confirmed: bool,
+    started_at: Instant,
     /// Duration of the run before it was interrupted.
-    before: Duration,
-    asks: [mpsc::Sender<Ask>; 2],
+    elapsed_before: Duration,
+    requests: [mpsc::Sender<StationRequest>; 2],
     interrupts: [Interrupt; 2],
     /// Counters of the aborts for each station, which then gives up its present work.
-    aborts: [watch::Sender<u64>; 2],
-    pulse: Pulse,
+    abort_counts: [watch::Sender<u64>; 2],
+    watchdog: LoopWatchdog,
     reports: mpsc::Receiver<StationReport>,
-    beside: Beside,
-    computations: JoinSet<Computed>,
+    executor: BlockingExecutor,
+    computations: JoinSet<ComputationResult>,
     /// Cycle and kind of each computation.
-    computing: HashMap<tokio::task::Id, (u32, Computation)>,
-    orders: mpsc::Receiver<Ordered>,
+    running_computations: HashMap<tokio::task::Id, (u32, Computation)>,
+    orders: mpsc::Receiver<ReceivedOrder>,
     status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
     cycles: Cycles,
-    pace: Pace,
-    touching: Touching,
+    progress_estimator: ProgressEstimator,
+    preview_statistics: PreviewAccumulator,
     /// Notes of each machine on why it waits, in words.
     notes: [Vec<String>; 2],
     /// Disk usage of the files of each cycle, and the maximum of all.
     cycle_bytes: BTreeMap<u32, u64>,
-    largest_cycle_bytes: u64,
+    max_cycle_bytes: u64,
     /// Number of changes of state of the cell.
-    states: u64,
+    state_changes: u64,
     /// Number of attempts of each computation of each cycle.
     attempts: BTreeMap<(u32, Computation), u32>,
     armed: [Option<Value>; 2],
     /// Commands without an answering event so far, by the numbers of the recorder.
-    open: Vec<(u64, Command)>,
+    open_commands: Vec<(u64, Command)>,
     /// Entries that wait to be recorded, in order.
-    backlog: VecDeque<Waiting>,
+    backlog: VecDeque<PendingRecord>,
     /// Reason why nothing is recorded at present.
-    failing: Option<String>,
+    record_failure_reason: Option<String>,
     /// Judgement that the program did not write before it ended.
-    unannounced: Option<(u32, Judgement)>,
+    unannounced_judgement: Option<(u32, Judgement)>,
     /// Files that the program did not record before it ended.
-    left: Vec<String>,
+    unrecorded_files: Vec<String>,
     ending: Option<Ending>,
-    stations: Vec<tokio::task::JoinHandle<()>>,
+    station_tasks: Vec<tokio::task::JoinHandle<()>>,
     control: Control,
 }
 
@@ -192,12 +192,12 @@ enum Computation {
     Registration,
     Compensation,
     /// Registration on which the cell decides, if touches are chosen.
-    Settled,
+    FinalRegistration,
 }
 
 impl Computation {
     /// Returns the computation that writes a file of this name, if there is one.
-    fn of(file: &str) -> Option<Self> {
+    fn from_file_name(file: &str) -> Option<Self> {
         Some(match file {
             "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
             "correction.csv" | "correction.json" | "toolpath_z.csv" => Self::Compensation,
@@ -219,7 +219,7 @@ impl Computation {
 
 /// Returns the folder of a cycle, below that of the run. Recorded files are never overwritten: another attempt has a
 /// folder of its own.
-fn folder_of(cycle: u32, attempt: u32) -> String {
+fn cycle_folder(cycle: u32, attempt: u32) -> String {
     match attempt {
         0 | 1 => format!("cycle-{cycle}"),
         attempt => format!("cycle-{cycle}/attempt-{attempt}"),
@@ -232,37 +232,37 @@ fn batch_folder(cycle: u32, batch: u32) -> String {
 }
 
 /// Record that is not yet written, and the action that follows it.
-struct Waiting {
-    ticket: Ticket,
-    then: Then,
+struct PendingRecord {
+    receipt: RecordReceipt,
+    action: RecordAction,
 }
 
-enum Then {
+enum RecordAction {
     Nothing,
     Execute(Box<Command>),
     Answer { answer: oneshot::Sender<Reply>, accepted: bool, message: String },
-    Confirm { device: Device, word: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
+    Confirm { device: Device, confirmation: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// Converts a change of the channel for orders into an event.
-fn door_event(change: DoorChange) -> Event {
+fn control_event(change: EndpointChange) -> Event {
     match change {
-        DoorChange::Lost(why) => Event::ControlLost { why },
-        DoorChange::MadeAgain => Event::ControlBack,
+        EndpointChange::Lost(why) => Event::ControlLost { why },
+        EndpointChange::Restored => Event::ControlBack,
     }
 }
 
 /// Creates a folder for results if it does not exist.
-fn made(folder: &Path) -> Result<(), FormatError> {
+fn create_folder(folder: &Path) -> Result<(), FormatError> {
     ResultFolder::prepare(folder).map(ResultFolder::keep)
 }
 
 /// Result of a computation.
-struct Computed {
+struct ComputationResult {
     cycle: u32,
     /// `None` if no event follows.
     event: Option<Event>,
-    product: Product,
+    product: ComputationProduct,
     /// Files that it made, written to the disk and read back.
     files: Result<Vec<Artefact>, RecordFailure>,
 }
@@ -273,7 +273,7 @@ impl Drive {
     ///
     /// # Errors
     /// Those of [`Drive::new`].
-    pub fn with_cell(run: Run, cmm: AnyCmm, grinder: AnyGrinder) -> std::io::Result<(Self, Orders)> {
+    pub fn with_cell(run: RunInputs, cmm: AnyCmm, grinder: AnyGrinder) -> std::io::Result<(Self, OrderSender)> {
         Self::new(run, cmm, grinder)
     }
 
@@ -282,27 +282,27 @@ impl Drive {
     /// # Errors
     /// A run folder in which the control socket cannot be created.
     pub fn new<C: Cmm + 'static, G: Grinder + 'static>(
-        run: Run,
+        run: RunInputs,
         cmm: C,
         grinder: G,
-    ) -> std::io::Result<(Self, Orders)> {
+    ) -> std::io::Result<(Self, OrderSender)> {
         let (reports, reported) = mpsc::channel(64);
         let (orders, ordered) = mpsc::channel(16);
         let (status, seen) = watch::channel(Snapshot::default());
-        let mut interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
-        let (ids, open): (Vec<u32>, Vec<Command>) = std::mem::take(&mut interrupted.open).into_iter().unzip();
-        let serial = run.journal.part().to_owned();
-        let recorder = Recorder::new(run.journal, &ids, &run.beside);
+        let mut interrupted = run.interrupted.unwrap_or_else(|| InterruptedRun::new(run.plan));
+        let (ids, open): (Vec<u32>, Vec<Command>) = std::mem::take(&mut interrupted.open_commands).into_iter().unzip();
+        let serial = run.journal.serial().to_owned();
+        let recorder = Recorder::new(run.journal, &ids, &run.executor);
         let folder = recorder.folder().to_owned();
-        let control = Control::listen(&folder, orders.clone(), seen.clone(), matches!(run.beside, Beside::Threads))?;
+        let control = Control::listen(&folder, orders.clone(), seen.clone(), matches!(run.executor, BlockingExecutor::Threads))?;
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
-        let pulse = Pulse::new();
-        let [of_cmm, of_grinder] = Device::BOTH.map(|device| interrupted.left_at(device));
-        let [poll_cmm, poll_grinder] = run.poll;
+        let pulse = LoopWatchdog::new();
+        let [of_cmm, of_grinder] = Device::BOTH.map(|device| interrupted.last_preparation(device));
+        let [poll_cmm, poll_grinder] = run.poll_intervals;
         let (cmm, cmm_task) =
-            spawn(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0], &pulse), &reports, of_cmm, poll_cmm);
-        let (grinder, grinder_task) = spawn(
+            spawn_station(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0], &pulse), &reports, of_cmm, poll_cmm);
+        let (grinder, grinder_task) = spawn_station(
             GrinderDriver(grinder),
             run.job,
             (&interrupts[1], &aborts[1], &pulse),
@@ -318,74 +318,74 @@ impl Drive {
             folder,
             job: run.job,
             actor: run.actor,
-            loaded: run.loaded,
-            began: Instant::now(),
-            before: interrupted.before,
-            asks: [cmm, grinder],
+            load_confirmed: run.load_confirmed,
+            started_at: Instant::now(),
+            elapsed_before: interrupted.elapsed,
+            requests: [cmm, grinder],
             interrupts,
-            aborts,
-            pulse,
+            abort_counts: aborts,
+            watchdog: pulse,
             reports: reported,
-            beside: run.beside,
+            executor: run.executor,
             computations: JoinSet::new(),
-            computing: HashMap::new(),
+            running_computations: HashMap::new(),
             orders: ordered,
             status,
             notices: run.notices,
             cycles: interrupted.cycles,
-            pace: Pace::default(),
-            touching: Touching::default(),
+            progress_estimator: ProgressEstimator::default(),
+            preview_statistics: PreviewAccumulator::default(),
             notes: [Vec::new(), Vec::new()],
             cycle_bytes: BTreeMap::new(),
-            largest_cycle_bytes: 0,
-            states: interrupted.states,
+            max_cycle_bytes: 0,
+            state_changes: interrupted.state_changes,
             attempts: interrupted.attempts,
             armed: interrupted.armed,
-            open: (1..).zip(open).collect(),
+            open_commands: (1..).zip(open).collect(),
             backlog: VecDeque::new(),
-            failing: None,
-            unannounced: interrupted.unannounced,
-            left: interrupted.left,
+            record_failure_reason: None,
+            unannounced_judgement: interrupted.unannounced_judgement,
+            unrecorded_files: interrupted.unrecorded_files,
             ending: interrupted.ending,
-            stations: vec![cmm_task, grinder_task],
+            station_tasks: vec![cmm_task, grinder_task],
             control,
         };
         drive.status.send_replace(drive.snapshot());
-        Ok((drive, Orders { orders, status: seen }))
+        Ok((drive, OrderSender { orders, status: seen }))
     }
 
     /// Listens for orders also at another place, so that the cell can be found if its run folder is gone.
     ///
     /// # Errors
     /// A place where no socket can be created.
-    pub fn listen_beside(&mut self, place: &Path) -> std::io::Result<()> {
-        self.control.listen_beside(place)
+    pub fn listen_also_at(&mut self, place: &Path) -> std::io::Result<()> {
+        self.control.listen_also_at(place)
     }
 
     fn now(&self) -> Duration {
-        self.before + self.began.elapsed()
+        self.elapsed_before + self.started_at.elapsed()
     }
 
     /// Runs until the cell reaches an end state, and returns the ending. Boxed so that it is compiled here.
     pub fn run(self) -> Pin<Box<dyn Future<Output = Ending> + Send>> {
-        Box::pin(self.run_to_its_end())
+        Box::pin(self.run_to_end())
     }
 
-    async fn run_to_its_end(mut self) -> Ending {
+    async fn run_to_end(mut self) -> Ending {
         let first = match self.cell.state() {
             State::Idle => Event::Start { actor: self.actor.clone() },
             _ => Event::Restarted { actor: self.actor.clone() },
         };
-        self.take(first, None).await;
-        let left = std::mem::take(&mut self.left);
-        self.adopt(self.cell.cycle(), record::describe(&self.folder, &left)).await;
-        if let Some((which, judgement)) = self.unannounced.take() {
-            self.leave_judgement(which, &judgement).await;
+        self.handle_event(first, None).await;
+        let left = std::mem::take(&mut self.unrecorded_files);
+        self.record_files(self.cell.cycle(), recorder::sync_and_hash(&self.folder, &left)).await;
+        if let Some((which, judgement)) = self.unannounced_judgement.take() {
+            self.write_judgement(which, &judgement).await;
         }
-        let mut beats = tokio::time::interval(PULSE_EVERY);
+        let mut beats = tokio::time::interval(WATCHDOG_INTERVAL);
         while self.ending.is_none() {
-            self.pulse.beat();
-            let due = self.cell.next_deadline().map(|at| self.began + at.saturating_sub(self.before));
+            self.watchdog.beat();
+            let due = self.cell.next_deadline().map(|at| self.started_at + at.saturating_sub(self.elapsed_before));
             let deadline = async {
                 match due {
                     Some(at) => tokio::time::sleep_until(at).await,
@@ -394,137 +394,137 @@ impl Drive {
             };
             tokio::select! {
                 biased;
-                Some(ordered) = self.orders.recv() => self.order(ordered).await,
-                why = self.recorder.failure() => self.record_failed(why).await,
-                recorded = on_record(&mut self.backlog) => self.recorded(recorded).await,
+                Some(ordered) = self.orders.recv() => self.handle_order(ordered).await,
+                why = self.recorder.next_failure() => self.report_record_failure(why).await,
+                recorded = wait_for_first_record(&mut self.backlog) => self.handle_recorded(recorded).await,
                 Some(computed) = self.computations.join_next_with_id() => match computed {
                     Ok((id, computed)) => {
-                        self.computing.remove(&id);
-                        self.computed(computed).await;
+                        self.running_computations.remove(&id);
+                        self.handle_computed(computed).await;
                     }
-                    Err(error) => self.panicked(error).await,
+                    Err(error) => self.handle_panic(error).await,
                 },
-                Some(report) = self.reports.recv() => self.reported(report).await,
-                change = self.control.changed() => drop(self.take(door_event(change), None).await),
-                () = deadline => drop(self.take(Event::Deadline, None).await),
+                Some(report) = self.reports.recv() => self.handle_report(report).await,
+                change = self.control.changed() => drop(self.handle_event(control_event(change), None).await),
+                () = deadline => drop(self.handle_event(Event::Deadline, None).await),
                 _ = beats.tick() => {}
             }
-            self.withdraw_waiting().await;
+            self.withdraw_pending_commands().await;
         }
         self.end_run().await
     }
 
     /// Reports a computation that panicked for what it is: a fault of this program, and no fact about the part.
-    async fn panicked(&mut self, error: JoinError) {
-        let Some((cycle, kind)) = self.computing.remove(&error.id()) else { return };
-        let why = format!("the computation failed by a fault of the program; report it: {}", words_of(error));
+    async fn handle_panic(&mut self, error: JoinError) {
+        let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
+        let why = format!("the computation failed by a fault of the program; report it: {}", panic_message(error));
         let event = match kind {
             Computation::Gate => {
-                let gate = Gate::Failed(GateFailure::Broken(why));
+                let gate = GateResult::Failed(GateFailure::Broken(why));
                 Event::Collected { cycle, targets: 0, found: 0, gate }
             }
-            Computation::Registration | Computation::Settled => Event::RegistrationFailed { cycle, why },
+            Computation::Registration | Computation::FinalRegistration => Event::RegistrationFailed { cycle, why },
             Computation::Compensation => Event::CompensationRefused { cycle, why: CompensationRefusal::Failed(why) },
         };
-        self.take(event, None).await;
+        self.handle_event(event, None).await;
     }
 
     /// Continues with the first waiting record. An action is executed only if its record was written.
-    async fn recorded(&mut self, recorded: Result<(), RecordFailure>) {
-        let Some(Waiting { then, .. }) = self.backlog.pop_front() else { return };
+    async fn handle_recorded(&mut self, recorded: Result<(), RecordFailure>) {
+        let Some(PendingRecord { action: then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
-            Ok(()) => self.failing = None,
+            Ok(()) => self.record_failure_reason = None,
             Err(why) => {
-                let reason = message_of(&why);
+                let reason = failure_message(&why);
                 match then {
-                    Then::Execute(command) => self.not_on_record(*command).await,
-                    Then::Answer { answer, message, .. } => {
+                    RecordAction::Execute(command) => self.report_not_recorded(*command).await,
+                    RecordAction::Answer { answer, message, .. } => {
                         let message = format!("{message}; not recorded: {reason}");
                         drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
                     }
-                    Then::Confirm { answer, .. } => drop(answer.send(Err(format!("not recorded: {reason}")))),
-                    Then::Nothing => {}
+                    RecordAction::Confirm { answer, .. } => drop(answer.send(Err(format!("not recorded: {reason}")))),
+                    RecordAction::Nothing => {}
                 }
-                return self.record_failed(why).await;
+                return self.report_record_failure(why).await;
             }
         }
         match then {
-            Then::Nothing => {}
-            Then::Execute(command) if self.cell.wants(&command) => self.execute(*command).await,
-            Then::Execute(command) => self.not_carried_out(*command).await,
+            RecordAction::Nothing => {}
+            RecordAction::Execute(command) if self.cell.still_requires(&command) => self.execute(*command).await,
+            RecordAction::Execute(command) => self.report_start_not_sent(*command).await,
             // The person who asked may be gone.
-            Then::Answer { answer, accepted, message } => {
+            RecordAction::Answer { answer, accepted, message } => {
                 drop(answer.send(Reply { taken: accepted, message, status: self.snapshot() }))
             }
-            Then::Confirm { device, word, answer } => self.ask(device, Ask::Confirm { word, answer }).await,
+            RecordAction::Confirm { device, confirmation: word, answer } => self.send_request(device, StationRequest::Confirm { confirmation: word, answer }).await,
         }
     }
 
     /// Reports that a START was not sent: the state of the cell changed while the START waited to be recorded.
-    async fn not_carried_out(&mut self, command: Command) {
+    async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
             let why = "not sent: it was not recorded, or the cell was held first".to_owned();
-            self.take(Event::Refused { device, what: Asked::Start, why }, None).await;
+            self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
         }
     }
 
     /// Reports to the cell that a command whose answer it waits for was not sent, because it was not recorded.
-    async fn not_on_record(&mut self, command: Command) {
-        if !self.cell.wants(&command) && !matches!(command, Command::StartMachine { .. }) {
+    async fn report_not_recorded(&mut self, command: Command) {
+        if !self.cell.still_requires(&command) && !matches!(command, Command::StartMachine { .. }) {
             return;
         }
         match command {
-            Command::StartMachine { .. } => self.not_carried_out(command).await,
-            command if outcome::is_answered(&command) => {
-                drop(self.take(Event::NotOnRecord { command: command.name() }, None).await);
+            Command::StartMachine { .. } => self.report_start_not_sent(command).await,
+            command if outcome::expects_answer(&command) => {
+                drop(self.handle_event(Event::NotOnRecord { command: command.name() }, None).await);
             }
             _ => {}
         }
     }
 
     /// Reports to the cell and to people that a record cannot be written.
-    async fn record_failed(&mut self, why: RecordFailure) {
-        let message = message_of(&why);
-        let is_known = self.failing.replace(message.clone()).is_some();
+    async fn report_record_failure(&mut self, why: RecordFailure) {
+        let message = failure_message(&why);
+        let is_known = self.record_failure_reason.replace(message.clone()).is_some();
         // The consequences of a failure fail too, including the record of the failure itself. They bring nothing new.
         if !is_known {
             self.notify(Notice::RecordFailed { message });
-            self.take(Event::RecordFailed { why }, None).await;
+            self.handle_event(Event::RecordFailed { why }, None).await;
         }
-        self.answer_without_record();
+        self.answer_unrecorded_orders();
     }
 
     /// Withdraws the waiting commands while nothing can be recorded. Otherwise the cell would wait for their answers,
     /// and no one could continue before the disk recovers. The cell requests the withdrawn commands again if it needs
     /// them.
-    async fn withdraw_waiting(&mut self) {
-        if self.failing.is_none() || self.ending.is_some() {
+    async fn withdraw_pending_commands(&mut self) {
+        if self.record_failure_reason.is_none() || self.ending.is_some() {
             return;
         }
-        let leads_on = |then: &Then| matches!(then, Then::Execute(command) if outcome::is_answered(command));
-        let waiting = self.backlog.iter_mut().filter(|waiting| leads_on(&waiting.then));
-        let withdrawn: Vec<Then> = waiting.map(|waiting| std::mem::replace(&mut waiting.then, Then::Nothing)).collect();
+        let leads_on = |then: &RecordAction| matches!(then, RecordAction::Execute(command) if outcome::expects_answer(command));
+        let waiting = self.backlog.iter_mut().filter(|waiting| leads_on(&waiting.action));
+        let withdrawn: Vec<RecordAction> = waiting.map(|waiting| std::mem::replace(&mut waiting.action, RecordAction::Nothing)).collect();
         for then in withdrawn {
-            if let Then::Execute(command) = then {
-                self.not_on_record(*command).await;
+            if let RecordAction::Execute(command) = then {
+                self.report_not_recorded(*command).await;
             }
         }
     }
 
     /// Answers waiting orders while nothing can be recorded, so that no one is kept waiting. The answer says what was
     /// done and what was not.
-    fn answer_without_record(&mut self) {
-        let Some(why) = &self.failing else { return };
+    fn answer_unrecorded_orders(&mut self) {
+        let Some(why) = &self.record_failure_reason else { return };
         let status = self.snapshot();
         for waiting in &mut self.backlog {
-            match std::mem::replace(&mut waiting.then, Then::Nothing) {
-                Then::Answer { answer, message, .. } => {
+            match std::mem::replace(&mut waiting.action, RecordAction::Nothing) {
+                RecordAction::Answer { answer, message, .. } => {
                     let message =
                         format!("{message}; only steps that make the cell safe were carried out; not recorded: {why}");
                     // The person who asked may be gone.
                     drop(answer.send(Reply { taken: false, message, status: status.clone() }));
                 }
-                then => waiting.then = then,
+                then => waiting.action = then,
             }
         }
     }
@@ -536,35 +536,35 @@ impl Drive {
         self.finish_backlog().await;
         // Running computations still write files into the run folder, so wait for them.
         while let Some(computed) = self.computations.join_next().await {
-            if let Ok(Computed { cycle, files, .. }) = computed {
-                self.adopt(cycle, files).await;
+            if let Ok(ComputationResult { cycle, files, .. }) = computed {
+                self.record_files(cycle, files).await;
             }
         }
         let rows: Vec<CycleRow> = self.cycles.rows(&self.cell.plan().tolerance);
         let mut result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
-        let touches = self.task.adaptive.map(|_| self.cycles.touches(&self.task));
+        let touches = self.task.adaptive.map(|_| self.cycles.touch_counts(&self.task));
         if let Some([taken, whole_patterns]) = touches {
             result["touches"] = json!({ "taken": taken, "whole_patterns": whole_patterns });
         }
         let now = self.now();
-        self.leave("result.json".into(), self.cell.cycle(), &result).await;
-        self.keep_what_was_learned(&ending).await;
+        self.write_document("result.json".into(), self.cell.cycle(), &result).await;
+        self.save_learned(&ending).await;
         if let Err(failure) = self.recorder.close(now, self.cell.cycle(), result).await {
-            self.notify(Notice::RecordFailed { message: message_of(&failure) });
+            self.notify(Notice::RecordFailed { message: failure_message(&failure) });
         }
         self.notify(Notice::Finished { ending: ending.clone(), cycles: rows, touches });
         // No more asks: each station gives its machine back and ends.
-        self.asks = [mpsc::channel(1).0, mpsc::channel(1).0];
-        for station in self.stations.drain(..) {
+        self.requests = [mpsc::channel(1).0, mpsc::channel(1).0];
+        for station in self.station_tasks.drain(..) {
             let _ = tokio::time::timeout(Duration::from_secs(2), station).await;
         }
         ending
     }
 
     /// Handles an order and answers its sender.
-    async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
+    async fn handle_order(&mut self, ReceivedOrder { request, actor, answer }: ReceivedOrder) {
         if let Request::Resume { seen: Some(seen), .. } = request
-            && seen != self.states
+            && seen != self.state_changes
         {
             let message =
                 format!("the state of the cell has changed since you saw it; it is now {}", self.cell.in_words());
@@ -576,9 +576,9 @@ impl Drive {
         }
         let event = match request {
             Request::Started { .. } | Request::Done { .. } | Request::Still { .. } => {
-                return self.confirm(&request, &actor, answer);
+                return self.handle_confirmation(&request, &actor, answer);
             }
-            Request::Remark { what } => return self.remark(&what, &actor, answer),
+            Request::Remark { what } => return self.record_remark(&what, &actor, answer),
             Request::Clear { device } => Event::ClearConfirmed { actor, device },
             Request::Hold { reason } => Event::Hold { actor, reason },
             Request::Resume { reason, .. } => Event::Resume { actor, reason },
@@ -588,30 +588,30 @@ impl Drive {
             Request::Over { device, evidence } => Event::DeclaredOver { actor, device, evidence },
             Request::Status | Request::Watch => return,
         };
-        let (refusal, ticket) = self.take(event, None).await;
+        let (refusal, ticket) = self.handle_event(event, None).await;
         if let Some(answer) = answer {
             let accepted = refusal.is_none();
             let message = refusal.unwrap_or_else(|| self.cell.in_words());
-            self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });
-            self.answer_without_record();
+            self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Answer { answer, accepted, message } });
+            self.answer_unrecorded_orders();
         }
     }
 
     /// Records a remark of a program that acts for people.
-    fn remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+    fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let origin = (actor.name.clone(), actor.station.clone());
         let payload = json!({ "remark": what });
         let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
         if let Some(answer) = answer {
-            let then = Then::Answer { answer, accepted: true, message: "recorded".into() };
-            self.backlog.push_back(Waiting { ticket, then });
-            self.answer_without_record();
+            let then = RecordAction::Answer { answer, accepted: true, message: "recorded".into() };
+            self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
+            self.answer_unrecorded_orders();
         }
     }
 
     /// Handles a person's confirmation about a machine that cannot report it itself.
-    fn confirm(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let asked = self.word(request).map(|(device, confirmed, word)| {
+    fn handle_confirmation(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let asked = self.operator_confirmation(request).map(|(device, confirmed, word)| {
             let mut payload = serde_json::to_value(request).unwrap_or_default();
             if let Some(payload) = payload.as_object_mut() {
                 payload.remove("order");
@@ -620,7 +620,7 @@ impl Drive {
             let origin = (actor.name.clone(), actor.station.clone());
             let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
             let (told, taken) = oneshot::channel();
-            self.backlog.push_back(Waiting { ticket, then: Then::Confirm { device, word, answer: told } });
+            self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Confirm { device, confirmation: word, answer: told } });
             taken
         });
         let status = self.snapshot();
@@ -639,10 +639,10 @@ impl Drive {
     }
 
     /// Returns the machine that a person's confirmation is about, its name in the record, and the confirmation.
-    fn word(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
-        let at_work = self.cell.state().phase().and_then(Phase::moving);
+    fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
+        let at_work = self.cell.state().phase().and_then(Phase::moving_device);
         let job = || at_work.ok_or("no job of a machine is in progress");
-        let identity = |map: &Option<String>| map.as_ref().map(|digits| self.named_map(digits)).transpose();
+        let identity = |map: &Option<String>| map.as_ref().map(|digits| self.map_identity(digits)).transpose();
         Ok(match request {
             Request::Started { map } => {
                 (job()?, "started", OperatorConfirmation::Started { map_identity: identity(map)? })
@@ -660,9 +660,9 @@ impl Drive {
     }
 
     /// Returns the full identity of the map of this cycle, if the digits are its beginning.
-    fn named_map(&self, digits: &str) -> Result<[u8; 32], String> {
+    fn map_identity(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
-        let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
+        let grinds = self.cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
         let cycle = self.cycles.get(self.cell.cycle()).filter(|_| grinds);
         let Some(cycle) = cycle else { return Err("no pass is in progress".into()) };
         let identity = self.task.payloads(&cycle.correction).0.identity();
@@ -679,124 +679,124 @@ impl Drive {
         Ok(identity)
     }
 
-    async fn reported(&mut self, report: StationReport) {
+    async fn handle_report(&mut self, report: StationReport) {
         let StationReport { event, detail, fetched, preliminary, notes, files } = report;
-        self.adopt(self.cell.cycle(), record::describe(&self.folder, &files)).await;
-        if let Some(Notes { device, all, new: messages }) = notes {
+        self.record_files(self.cell.cycle(), recorder::sync_and_hash(&self.folder, &files)).await;
+        if let Some(MachineNotes { device, all, new: messages }) = notes {
             self.notes[device as usize] = all;
             self.status.send_replace(self.snapshot());
             if !messages.is_empty() {
                 let payload = json!({ "device": device, "notes": messages });
-                self.note(Kind::Note, (device.to_string(), "wire".into()), payload);
+                self.record_note(Kind::Note, (device.to_string(), "wire".into()), payload);
                 self.notify(Notice::Note { device, messages });
             }
         }
         if let Some(preliminary) = preliminary {
-            self.preview(&preliminary);
+            self.update_preview(&preliminary);
         }
-        if let Some(Fetched::Record(record)) = &fetched {
-            let payload = json!({ "pass_record": pass_record::document(record) });
-            self.note(Kind::Note, ("grinder".into(), "wire".into()), payload);
-            if let Some(why) = self.flaw_of(record) {
-                self.take(Event::RecordDoubted { cycle: self.cell.cycle(), why }, None).await;
+        if let Some(FetchedResult::Record(record)) = &fetched {
+            let payload = json!({ "pass_record": pass_record::pass_record_document(record) });
+            self.record_note(Kind::Note, ("grinder".into(), "wire".into()), payload);
+            if let Some(why) = self.pass_record_flaw(record) {
+                self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), why }, None).await;
             }
         }
-        if let Some(Fetched::Points(measurement, taken)) = fetched {
-            self.transferred(&measurement, taken).await;
+        if let Some(FetchedResult::Points(measurement, taken)) = fetched {
+            self.record_transfer(&measurement, taken).await;
             return self.gate(measurement);
         }
         if let Some(event) = event {
             if let Event::Prepared { device, .. } = &event {
                 self.armed[*device as usize].clone_from(&detail);
             }
-            self.take(event, detail).await;
+            self.handle_event(event, detail).await;
         }
     }
 
     /// Shows the preliminary figures of a measurement that still runs.
-    fn preview(&mut self, preliminary: &PreliminaryPoints) {
+    fn update_preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
         let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };
         let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
         match plan.filter(|_| preliminary.job.job == self.job && preliminary.job.batch_id() == asked) {
-            Some(plan) => self.touching.take(&plan, preliminary),
-            None => self.touching.forget(),
+            Some(plan) => self.preview_statistics.add_points(&plan, preliminary),
+            None => self.preview_statistics.reset(),
         }
         self.status.send_replace(self.snapshot());
     }
 
     /// Returns why a pass record is implausible, compared with the commanded pass.
-    fn flaw_of(&self, record: &PassRecord) -> Option<String> {
+    fn pass_record_flaw(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
         let Some(cycle) = self.cycles.get(number) else { return Some(format!("cycle {number} has no pass")) };
         let (map, pass) = self.task.payloads(&cycle.correction);
         let job = Job { job: self.job, cycle: number as u16, digest: 0 };
-        let max_depth_mm = self.task.limits.max_depth_mm;
+        let max_depth_mm = self.task.correction_limits.max_depth_mm;
         let outline = self.task.nominal.outline();
-        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), max_depth_mm, outline };
-        pass_record::flaw(&told, record)
+        let told = pass_record::CommandedPass { job, pass: &pass, map_identity: map.identity(), max_depth_mm, outline };
+        pass_record::implausible_figure(&told, record)
     }
 
     /// Records and shows the speed of the transfer of points.
-    async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
+    async fn record_transfer(&mut self, measurement: &Measurement, taken: Duration) {
         let cycle = BatchId::decode(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
-        self.note(Kind::Note, ("cmm".into(), "wire".into()), payload);
+        self.record_note(Kind::Note, ("cmm".into(), "wire".into()), payload);
         self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
-    async fn computed(&mut self, computed: Computed) {
-        let Computed { cycle: number, event, product, files } = computed;
+    async fn handle_computed(&mut self, computed: ComputationResult) {
+        let ComputationResult { cycle: number, event, product, files } = computed;
         if matches!(&event, Some(Event::Registered { figures, .. }) if figures.touch_on.is_none()) {
-            *self.attempts.entry((number, Computation::Settled)).or_insert(0) += 1;
+            *self.attempts.entry((number, Computation::FinalRegistration)).or_insert(0) += 1;
         }
         if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
             (&files, &event)
         {
             // A result that is not recorded is not used. It is computed again after a person has repaired the disk.
             let event = Event::NotSaved { cycle: number, why: why.clone() };
-            self.notify(Notice::RecordFailed { message: message_of(why) });
-            self.take(event, None).await;
+            self.notify(Notice::RecordFailed { message: failure_message(why) });
+            self.handle_event(event, None).await;
             return;
         }
-        self.cycles.take(number, product);
-        self.adopt(number, files).await;
+        self.cycles.store(number, product);
+        self.record_files(number, files).await;
         if let Some(Event::RecordFailed { why }) = &event {
-            self.notify(Notice::RecordFailed { message: message_of(why) });
+            self.notify(Notice::RecordFailed { message: failure_message(why) });
         }
         if let Some(event) = event {
-            self.take(event, None).await;
+            self.handle_event(event, None).await;
         }
     }
 
     /// Records files.
-    async fn adopt(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
+    async fn record_files(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
         match files {
             Ok(files) if files.is_empty() => {}
             Ok(files) => {
                 let bytes = self.cycle_bytes.entry(cycle).or_insert(0);
                 *bytes += files.iter().map(|file| file.bytes).sum::<u64>();
-                self.largest_cycle_bytes = self.largest_cycle_bytes.max(*bytes);
-                let ticket = self.recorder.adopt(files, self.now(), cycle);
-                self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
+                self.max_cycle_bytes = self.max_cycle_bytes.max(*bytes);
+                let ticket = self.recorder.append_artefacts(files, self.now(), cycle);
+                self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
             }
             // A failure to write the loop's own final files is only shown, because the run is over.
-            Err(why) if self.ending.is_some() => self.notify(Notice::RecordFailed { message: message_of(&why) }),
-            Err(why) => Box::pin(self.record_failed(why)).await,
+            Err(why) if self.ending.is_some() => self.notify(Notice::RecordFailed { message: failure_message(&why) }),
+            Err(why) => Box::pin(self.report_record_failure(why)).await,
         }
     }
 
     /// Records an event, lets the cell handle it, and starts the execution of the commands. Returns the reason of a
     /// refusal, if there was one, and a ticket for the record.
-    async fn take(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, Ticket) {
+    async fn handle_event(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, RecordReceipt) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
         let before = self.cell.state();
         let commands = self.cell.handle(now, event.clone());
-        self.states += u64::from(self.cell.state() != before);
-        for command in commands.iter().filter(|command| waits_for_nothing(command)) {
+        self.state_changes += u64::from(self.cell.state() != before);
+        for command in commands.iter().filter(|command| is_immediate(command)) {
             self.execute(command.clone()).await;
         }
         let refusal = commands.iter().find_map(|command| match command {
@@ -808,13 +808,13 @@ impl Drive {
             self.show_event(now, &event);
         }
         for command in commands {
-            self.line_up(command);
+            self.queue_command(command);
         }
         self.status.send_replace(self.snapshot());
         (refusal, ticket)
     }
 
-    fn record_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> Ticket {
+    fn record_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> RecordReceipt {
         let mut payload = serde_json::to_value(event).unwrap_or(Value::Null);
         if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
             map.insert("detail".into(), detail);
@@ -822,72 +822,72 @@ impl Drive {
         let ticket = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload));
         // Record the outcome of each command that the event answers.
         let (answered, open): (Vec<_>, Vec<_>) =
-            std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
-        self.open = open;
+            std::mem::take(&mut self.open_commands).into_iter().partition(|(_, c)| outcome::answers(event, c));
+        self.open_commands = open;
         for (intent, _) in answered {
             let payload = json!({ "event": event.name() });
             let record = entry(Kind::Outcome, now, self.cell.cycle(), event.origin(), payload);
-            let ticket = self.recorder.outcome(intent, record);
-            self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
+            let ticket = self.recorder.append_outcome(intent, record);
+            self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
         }
         ticket
     }
 
-    fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
+    fn record_note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
         let ticket = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload));
-        self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
+        self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
     }
 
     /// Writes a small document of the loop itself into the run folder and records it.
-    async fn leave(&mut self, name: String, cycle: u32, document: &impl Serialize) {
+    async fn write_document(&mut self, name: String, cycle: u32, document: &impl Serialize) {
         let path = self.folder.join(&name);
-        let made = made(path.parent().unwrap_or(&self.folder));
+        let made = create_folder(path.parent().unwrap_or(&self.folder));
         match made.and_then(|()| write_json_atomic(path, document)) {
-            Ok(()) => self.adopt(cycle, record::describe(&self.folder, &[name])).await,
+            Ok(()) => self.record_files(cycle, recorder::sync_and_hash(&self.folder, &[name])).await,
             Err(error) => self.notify(Notice::RecordFailed { message: error.to_string() }),
         }
     }
 
     /// Records a command. After that the command is executed, if it was not executed already.
-    fn line_up(&mut self, command: Command) {
+    fn queue_command(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
             map.insert("intent".into(), self.armed[*device as usize].clone().unwrap_or(Value::Null));
         }
-        let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
-        let ticket = if outcome::is_answered(&command) {
-            let (intent, ticket) = self.recorder.intend(record);
-            self.open.push((intent, command.clone()));
+        let record = Entry::new(Kind::Intent, recorder::nanoseconds(self.now()), self.cell.cycle(), payload);
+        let ticket = if outcome::expects_answer(&command) {
+            let (intent, ticket) = self.recorder.append_intent(record);
+            self.open_commands.push((intent, command.clone()));
             ticket
         } else {
             self.recorder.append(Entry { kind: Kind::Note, ..record })
         };
-        let then = if waits_for_nothing(&command) { Then::Nothing } else { Then::Execute(Box::new(command)) };
-        self.backlog.push_back(Waiting { ticket, then });
+        let then = if is_immediate(&command) { RecordAction::Nothing } else { RecordAction::Execute(Box::new(command)) };
+        self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
     }
 
     /// Shows and stores everything recorded so far, after the run is over. No machine gets a command any more.
     async fn finish_backlog(&mut self) {
-        let by = Instant::now() + record::PATIENCE;
+        let by = Instant::now() + recorder::CLOSE_TIMEOUT;
         while !self.backlog.is_empty() {
             let recorded = tokio::select! {
                 biased;
-                recorded = on_record(&mut self.backlog) => recorded,
-                why = self.recorder.failure() => {
-                    self.failing = Some(message_of(&why));
-                    self.answer_without_record();
+                recorded = wait_for_first_record(&mut self.backlog) => recorded,
+                why = self.recorder.next_failure() => {
+                    self.record_failure_reason = Some(failure_message(&why));
+                    self.answer_unrecorded_orders();
                     continue;
                 }
                 () = tokio::time::sleep_until(by) => {
-                    self.failing.get_or_insert_with(|| "the disk does not answer".to_owned());
-                    return self.answer_without_record();
+                    self.record_failure_reason.get_or_insert_with(|| "the disk does not answer".to_owned());
+                    return self.answer_unrecorded_orders();
                 }
             };
-            match self.backlog.front().map(|next| &next.then) {
-                Some(Then::Execute(command)) if matches!(**command, Command::Announce(_)) => {
-                    self.recorded(recorded).await
+            match self.backlog.front().map(|next| &next.action) {
+                Some(RecordAction::Execute(command)) if matches!(**command, Command::Announce(_)) => {
+                    self.handle_recorded(recorded).await
                 }
-                Some(Then::Answer { .. }) => self.recorded(recorded).await,
+                Some(RecordAction::Answer { .. }) => self.handle_recorded(recorded).await,
                 _ => drop(self.backlog.pop_front()),
             }
         }
@@ -895,29 +895,29 @@ impl Drive {
 
     async fn execute(&mut self, command: Command) {
         match command {
-            Command::Connect { device } => self.ask(device, Ask::Connect).await,
+            Command::Connect { device } => self.send_request(device, StationRequest::Connect).await,
             Command::AskToLoad => self.ask_to_load().await,
             Command::LoadPass { cycle } => self.load_pass(cycle).await,
             Command::LoadPlan { cycle } => self.load_plan(cycle).await,
-            Command::VerifyClear { device } => self.ask(device, Ask::VerifyClear).await,
+            Command::VerifyClear { device } => self.send_request(device, StationRequest::VerifyClear).await,
             Command::AskWhetherClear { device } => self.notify(Notice::AskWhetherClear { device }),
             Command::Prepare { device, cycle } => {
                 let batch = if device == Device::Cmm { self.cycles.batch(cycle) } else { 0 };
-                self.ask(device, Ask::Prepare { number: BatchId { cycle, batch } }).await;
+                self.send_request(device, StationRequest::Prepare { number: BatchId { cycle, batch } }).await;
             }
-            Command::StartMachine { device, cycle } => self.ask(device, Ask::Start { cycle }).await,
-            Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
-            Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
-            Command::StopMachine { device } => self.ask_at_once(device, Ask::Stop).await,
+            Command::StartMachine { device, cycle } => self.send_request(device, StationRequest::Start { cycle }).await,
+            Command::HoldMachine { device } => self.send_urgent_request(device, StationRequest::Hold).await,
+            Command::ResumeMachine { device } => self.send_request(device, StationRequest::Resume).await,
+            Command::StopMachine { device } => self.send_urgent_request(device, StationRequest::Stop).await,
             Command::AbortMachine { device } => {
-                self.aborts[device as usize].send_modify(|ordered| *ordered += 1);
-                self.ask_at_once(device, Ask::Abort).await;
+                self.abort_counts[device as usize].send_modify(|ordered| *ordered += 1);
+                self.send_urgent_request(device, StationRequest::Abort).await;
             }
-            Command::ClearMachine { device } => self.ask(device, Ask::Clear).await,
-            Command::Reconcile { device, cycle } => self.ask(device, Ask::Reconcile { cycle }).await,
-            Command::Collect { cycle } => self.ask(Device::Cmm, Ask::Collect { cycle }).await,
+            Command::ClearMachine { device } => self.send_request(device, StationRequest::Clear).await,
+            Command::Reconcile { device, cycle } => self.send_request(device, StationRequest::Reconcile { cycle }).await,
+            Command::Collect { cycle } => self.send_request(Device::Cmm, StationRequest::Collect { cycle }).await,
             Command::Qualify { cycle } => self.qualify(cycle),
-            Command::Acknowledge { device } => self.ask(device, Ask::Acknowledge).await,
+            Command::Acknowledge { device } => self.send_request(device, StationRequest::Acknowledge).await,
             Command::Register { cycle } => self.register(cycle),
             Command::Compensate { cycle } => self.compensate(cycle),
             Command::Announce(judgement) => self.announce(judgement).await,
@@ -932,12 +932,12 @@ impl Drive {
 
     /// Shows the judgement of a cycle and stores it with the measurement.
     async fn announce(&mut self, judgement: Judgement) {
-        let which = self.cycles.judged(judgement.cycle);
-        self.leave_judgement(which, &judgement).await;
+        let which = self.cycles.count_judgement(judgement.cycle);
+        self.write_judgement(which, &judgement).await;
         self.notify(Notice::Judged(judgement));
     }
 
-    async fn leave_judgement(&mut self, which: u32, judgement: &Judgement) {
+    async fn write_judgement(&mut self, which: u32, judgement: &Judgement) {
         let number = judgement.cycle;
         let cycle = self.cycles.get(number);
         let judged = cycle.and_then(|c| c.figures.as_ref()).map(|figures| self.cell.plan().tolerance.compare(figures));
@@ -947,42 +947,42 @@ impl Drive {
             "verdict": judgement.verdict,
             "reason": judgement.reason,
             "figures": cycle.and_then(|c| c.figures.as_ref()),
-            "judged": judged.map(|judged| judged.map(|of| judged_of(&of))),
+            "judged": judged.map(|judged| judged.map(|of| judged_figure(&of))),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
-        if self.task.parameters.is_some() {
-            result["parameters"] = json!(cycle.map(|cycle| work::parameters_told(&self.task, cycle)));
+        if self.task.parameter_compensation.is_some() {
+            result["parameters"] = json!(cycle.map(|cycle| pipeline::recorded_parameters(&self.task, cycle)));
         }
-        self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
+        self.write_document(format!("{}/result.json", cycle_folder(number, which)), number, &result).await;
     }
 
     /// Stores the initial state for the next part of this kind, if the run reached its end.
-    async fn keep_what_was_learned(&mut self, ending: &Ending) {
+    async fn save_learned(&mut self, ending: &Ending) {
         if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
             return;
         }
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let last = self.cycles.last_known().cloned();
-        let fields = self.cycles.taught(&self.task);
-        let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, (&cycle, fields))) else { return };
-        self.leave(LEARNED.into(), self.cell.cycle(), &learned).await;
+        let last = self.cycles.last_with_learning().cloned();
+        let fields = self.cycles.part_priors(&self.task);
+        let Some(learned) = last.and_then(|cycle| pipeline::learned_state(&self.task, run, (&cycle, fields))) else { return };
+        self.write_document(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
 
-    async fn ask(&mut self, device: Device, ask: Ask) {
+    async fn send_request(&mut self, device: Device, ask: StationRequest) {
         // A station lives as long as the drive; its channel is large enough for the work of one cell.
-        let _ = self.asks[device as usize].send(ask).await;
+        let _ = self.requests[device as usize].send(send_request).await;
     }
 
-    async fn ask_at_once(&mut self, device: Device, ask: Ask) {
+    async fn send_urgent_request(&mut self, device: Device, ask: StationRequest) {
         self.interrupts[device as usize].raise();
-        self.ask(device, ask).await;
+        self.send_request(device, send_request).await;
     }
 
     async fn ask_to_load(&mut self) {
-        if self.loaded {
+        if self.load_confirmed {
             let simulation = || Actor { name: "simulation".into(), station: "regrind".into() };
             let actor = if self.task.simulation { simulation() } else { self.actor.clone() };
-            self.answer(0, Event::LoadConfirmed { actor });
+            self.queue_event(0, Event::LoadConfirmed { actor });
         } else {
             self.notify(Notice::LoadPart);
         }
@@ -990,89 +990,89 @@ impl Drive {
 
     /// Checks that the disk has room for the files of this cycle. If it has not, the cell is held before anything
     /// moves; the machine may get its payload meanwhile.
-    fn check_space(&mut self, cycle: u32) {
-        let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.largest_cycle_bytes));
-        self.beside.compute(&mut self.computations, move || {
-            let short = short_of_space(&folder, needed).err();
+    fn check_disk_space(&mut self, cycle: u32) {
+        let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
+        self.executor.spawn_computation(&mut self.computations, move || {
+            let short = require_free_space(&folder, needed).err();
             let event = short.map(|why| Event::RecordFailed { why });
-            Computed { cycle, event, product: Product::Nothing, files: Ok(Vec::new()) }
+            ComputationResult { cycle, event, product: ComputationProduct::Nothing, files: Ok(Vec::new()) }
         });
     }
 
     async fn load_pass(&mut self, number: u32) {
-        self.check_space(number);
-        let (map, pass) = self.cycles.pass(&self.task, number);
-        let load = Load::Pass(Arc::new(map), Box::new(pass));
-        self.ask(Device::Grinder, Ask::Load { cycle: number, load }).await;
+        self.check_disk_space(number);
+        let (map, pass) = self.cycles.pass_payloads(&self.task, number);
+        let load = MachinePayload::Pass(Arc::new(map), Box::new(pass));
+        self.send_request(Device::Grinder, StationRequest::Load { cycle: number, payload: load }).await;
     }
 
     async fn load_plan(&mut self, number: u32) {
-        self.check_space(number);
-        let load = Load::Plan(self.cycles.plan(&self.task, number));
-        self.ask(Device::Cmm, Ask::Load { cycle: number, load }).await;
+        self.check_disk_space(number);
+        let load = MachinePayload::Plan(self.cycles.create_plan(&self.task, number));
+        self.send_request(Device::Cmm, StationRequest::Load { cycle: number, payload: load }).await;
     }
 
     /// Checks the points of a measurement and writes them.
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = BatchId::decode(measurement.cycle).cycle;
         let cycle = self.cycles.get(number).cloned();
-        let earlier = self.cycles.measured_before(number);
-        self.compute(Computation::Gate, number, move |task, files| {
-            work::gate_cycle(task, files, number, cycle.as_ref(), (earlier.as_ref(), &measurement))
+        let earlier = self.cycles.previous_points(number);
+        self.start_computation(Computation::Gate, number, move |task, files| {
+            pipeline::gate_cycle(task, files, number, cycle.as_ref(), (earlier.as_ref(), &measurement))
         });
     }
 
     fn qualify(&mut self, number: u32) {
         let stated = self.task.probing.probe_radius_mm;
-        let found = self.cycles.get(number).and_then(|c| c.points.as_ref()?.radius_mm);
+        let found = self.cycles.get(number).and_then(|c| c.points.as_ref()?.probe_radius_mm);
         let radius_error_mm = found.map_or(0.0, |radius| radius - stated);
-        self.answer(number, Event::Qualified { cycle: number, radius_error_mm });
+        self.queue_event(number, Event::Qualified { cycle: number, radius_error_mm });
     }
 
     fn register(&mut self, number: u32) {
         let Some(cycle) = self.cycles.get(number).cloned() else { return };
-        let before = self.cycles.before(number).cloned();
-        self.compute(Computation::Registration, number, move |task, files| {
-            work::register_cycle(task, files, number, &cycle, before.as_ref())
+        let before = self.cycles.previous_judged(number).cloned();
+        self.start_computation(Computation::Registration, number, move |task, files| {
+            pipeline::register_cycle(task, files, number, &cycle, before.as_ref())
         });
     }
 
     fn compensate(&mut self, number: u32) {
         let Some(cycle) = self.cycles.get(number).cloned() else { return };
-        self.compute(Computation::Compensation, number, move |task, files| {
-            work::compensate_cycle(task, files, number, &cycle)
+        self.start_computation(Computation::Compensation, number, move |task, files| {
+            pipeline::compensate_cycle(task, files, number, &cycle)
         });
     }
 
     /// Computes off the asynchronous threads. The files are written to the disk and read back there too: those of a
     /// fine measurement are large, and neither the loop nor the journal waits for them.
-    fn compute(
+    fn start_computation(
         &mut self,
         kind: Computation,
         cycle: u32,
-        work: impl FnOnce(&Task, &mut Files) -> (Event, Product) + Send + 'static,
+        work: impl FnOnce(&Task, &mut OutputFiles) -> (Event, ComputationProduct) + Send + 'static,
     ) {
         let (task, folder) = (Arc::clone(&self.task), self.folder.clone());
         let attempt = self.attempts.entry((cycle, kind)).or_insert(0);
         *attempt += 1;
         let which = *attempt;
-        let mut files = Files::new(folder.clone(), folder_of(cycle, which));
+        let mut files = OutputFiles::new(folder.clone(), cycle_folder(cycle, which));
         if task.adaptive.is_some() && kind != Computation::Compensation {
-            let settled = self.attempts.get(&(cycle, Computation::Settled)).map_or(1, |before| before + 1);
-            files = Files::new(folder.clone(), batch_folder(cycle, which)).then(folder_of(cycle, settled));
+            let settled = self.attempts.get(&(cycle, Computation::FinalRegistration)).map_or(1, |before| before + 1);
+            files = OutputFiles::new(folder.clone(), batch_folder(cycle, which)).with_final_subfolder(cycle_folder(cycle, settled));
         }
-        let computing = self.beside.compute(&mut self.computations, move || {
+        let computing = self.executor.spawn_computation(&mut self.computations, move || {
             // A failure to create the folder shows as the error of the first file in it.
-            let _ = made(&files.folder());
+            let _ = create_folder(&files.folder());
             let (event, product) = work(&task, &mut files);
-            Computed { cycle, event: Some(event), product, files: record::describe(&folder, &files.made()) }
+            ComputationResult { cycle, event: Some(event), product, files: recorder::sync_and_hash(&folder, &files.into_existing()) }
         });
-        self.computing.insert(computing.id(), (cycle, kind));
+        self.running_computations.insert(computing.id(), (cycle, kind));
     }
 
     /// Sends an event to the cell through the queue of computations, like every other event.
-    fn answer(&mut self, cycle: u32, event: Event) {
-        let computed = Computed { cycle, event: Some(event), product: Product::Nothing, files: Ok(Vec::new()) };
+    fn queue_event(&mut self, cycle: u32, event: Event) {
+        let computed = ComputationResult { cycle, event: Some(event), product: ComputationProduct::Nothing, files: Ok(Vec::new()) };
         self.computations.spawn(std::future::ready(computed));
     }
 
@@ -1081,57 +1081,57 @@ impl Drive {
         let _ = self.notices.send(notice);
     }
 
-    fn state_after(&self, event: &Event) -> Notice {
-        let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.pace.progress().is_some());
+    fn state_notice(&self, event: &Event) -> Notice {
+        let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.progress_estimator.progress().is_some());
         Notice::State { state, cycle, event: event.name().to_owned(), at_job }
     }
 
     /// Shows an event that the cell has handled.
     fn show_event(&mut self, now: Duration, event: &Event) {
-        self.pace.follow(self.cell.state());
-        if self.pace.progress().is_none_or(|progress| progress.device != Device::Cmm) {
-            self.touching.forget();
+        self.progress_estimator.update_state(self.cell.state());
+        if self.progress_estimator.progress().is_none_or(|progress| progress.device != Device::Cmm) {
+            self.preview_statistics.reset();
         }
         let notice = match event {
             Event::Progressed { device, done, total } => {
                 let cycle = self.cell.cycle();
-                self.pace.take(now, (*device, cycle), *done, *total);
-                self.pace.follow(self.cell.state());
-                let left_s = self.pace.progress().and_then(|progress| progress.left_s);
+                self.progress_estimator.record_progress(now, (*device, cycle), *done, *total);
+                self.progress_estimator.update_state(self.cell.state());
+                let left_s = self.progress_estimator.progress().and_then(|progress| progress.left_s);
                 Notice::Progress { device: *device, cycle, done: *done, total: *total, left_s }
             }
             Event::Registered { cycle, figures } => {
                 self.notify(Notice::Figures { cycle: *cycle, figures: figures.clone() });
                 // No other notice of the state may follow: the result of a computation may hold the cell.
-                self.state_after(event)
+                self.state_notice(event)
             }
             Event::Compensated { cycle, summary } => {
                 self.notify(Notice::Compensated { cycle: *cycle, summary: summary.clone() });
-                self.state_after(event)
+                self.state_notice(event)
             }
-            event => self.state_after(event),
+            event => self.state_notice(event),
         };
         self.notify(notice);
     }
 }
 
-fn spawn<D: StationDriver>(
+fn spawn_station<D: StationDriver>(
     driver: D,
     job: u32,
-    (interrupt, aborts, pulse): (&Interrupt, &watch::Sender<u64>, &Pulse),
+    (interrupt, aborts, pulse): (&Interrupt, &watch::Sender<u64>, &LoopWatchdog),
     reports: &mpsc::Sender<StationReport>,
     (armed, may_be_at_work): (Option<(u32, Armed)>, bool),
     poll: Duration,
-) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
+) -> (mpsc::Sender<StationRequest>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
     let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
-    let station = if may_be_at_work { station.may_be_at_work() } else { station };
-    (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()), pulse.clone())))
+    let station = if may_be_at_work { station.restore_preparation() } else { station };
+    (asks, tokio::spawn(station.serve(asked, poll, AbortCounter::new(aborts.subscribe()), pulse.clone())))
 }
 
 /// Returns true for a command that waits neither for the disk nor for earlier records: it brings machines to rest, only
 /// reads a status, informs people, or ends the run.
-fn waits_for_nothing(command: &Command) -> bool {
+fn is_immediate(command: &Command) -> bool {
     matches!(
         command,
         Command::HoldMachine { .. }
@@ -1146,7 +1146,7 @@ fn waits_for_nothing(command: &Command) -> bool {
 }
 
 /// Returns an error if the disk of a folder has less free space than needed.
-fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
+fn require_free_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     // If the free space is unknown, try to write.
     let free = journal::free_bytes(folder).unwrap_or(u64::MAX);
     if free >= needed {
@@ -1158,35 +1158,35 @@ fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
 }
 
 /// Returns the message of a task that panicked.
-fn words_of(error: JoinError) -> String {
+fn panic_message(error: JoinError) -> String {
     let Ok(panic) = error.try_into_panic() else { return "the task was cancelled".into() };
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
     text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no further information".into())
 }
 
 /// Waits until the first entry in the queue is recorded.
-async fn on_record(backlog: &mut VecDeque<Waiting>) -> Result<(), RecordFailure> {
+async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<(), RecordFailure> {
     match backlog.front_mut() {
-        Some(next) => (&mut next.ticket)
+        Some(next) => (&mut next.receipt)
             .await
             .unwrap_or_else(|_| Err(RecordFailure::Unwritable("the thread of the journal has ended".into()))),
         None => std::future::pending().await,
     }
 }
 
-fn message_of(failure: &RecordFailure) -> String {
+fn failure_message(failure: &RecordFailure) -> String {
     match failure {
         RecordFailure::DiskFull(message) | RecordFailure::Unwritable(message) => message.clone(),
     }
 }
 
 /// Returns a figure with its limit, as the result of a cycle contains it.
-fn judged_of(of: &Compared) -> Value {
+fn judged_figure(of: &ComparedFigure) -> Value {
     json!({
         "name": of.name,
-        "found_mm": of.found_mm,
+        "found_mm": of.median_mm,
         "expanded_mm": of.expanded_mm,
         "limit_mm": Some(of.limit_mm).filter(|limit| limit.is_finite()),
-        "probability_within": of.within,
+        "probability_within": of.probability_within,
     })
 }

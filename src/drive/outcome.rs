@@ -1,9 +1,9 @@
 //! Mapping of events to the commands that they answer, so that the journal shows the outcome of each command.
 
-use crate::cell::{Asked, Command, Device, Event, Reconciliation};
+use crate::cell::{MachineRequest, Command, Device, Event, Reconciliation};
 
 /// Returns true if an event answers a command. All other commands are complete when they are sent.
-pub(super) fn is_answered(command: &Command) -> bool {
+pub(super) fn expects_answer(command: &Command) -> bool {
     !matches!(
         command,
         Command::Announce(_)
@@ -51,27 +51,27 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::Compensate { cycle }, E::Compensated { cycle: c, .. } | E::CompensationRefused { cycle: c, .. }) => {
             cycle == c
         }
-        (C::Acknowledge { device }, E::Refused { device: d, what: Asked::Discard, .. }) => device == d,
+        (C::Acknowledge { device }, E::Refused { device: d, what: MachineRequest::Discard, .. }) => device == d,
         (command, E::NotOnRecord { command: name }) => command.name() == *name,
-        (command, E::Refused { device, what, .. }) => asked(command) == Some((*device, *what)),
+        (command, E::Refused { device, what, .. }) => machine_request(command) == Some((*device, *what)),
         _ => false,
     }
 }
 
 /// Returns the request and the machine of a command, as a refusal names them.
-fn asked(command: &Command) -> Option<(Device, Asked)> {
+fn machine_request(command: &Command) -> Option<(Device, MachineRequest)> {
     Some(match command {
-        Command::LoadPass { .. } => (Device::Grinder, Asked::Load),
-        Command::LoadPlan { .. } => (Device::Cmm, Asked::Load),
-        Command::Prepare { device, .. } => (*device, Asked::Prepare),
-        Command::StartMachine { device, .. } => (*device, Asked::Start),
-        Command::HoldMachine { device } => (*device, Asked::Hold),
-        Command::ResumeMachine { device } => (*device, Asked::Resume),
-        Command::StopMachine { device } => (*device, Asked::Stop),
-        Command::AbortMachine { device } => (*device, Asked::Abort),
-        Command::ClearMachine { device } => (*device, Asked::Clear),
-        Command::Collect { .. } => (Device::Cmm, Asked::Collect),
-        Command::Acknowledge { device } => (*device, Asked::Acknowledge),
+        Command::LoadPass { .. } => (Device::Grinder, MachineRequest::Load),
+        Command::LoadPlan { .. } => (Device::Cmm, MachineRequest::Load),
+        Command::Prepare { device, .. } => (*device, MachineRequest::Prepare),
+        Command::StartMachine { device, .. } => (*device, MachineRequest::Start),
+        Command::HoldMachine { device } => (*device, MachineRequest::Hold),
+        Command::ResumeMachine { device } => (*device, MachineRequest::Resume),
+        Command::StopMachine { device } => (*device, MachineRequest::Stop),
+        Command::AbortMachine { device } => (*device, MachineRequest::Abort),
+        Command::ClearMachine { device } => (*device, MachineRequest::Clear),
+        Command::Collect { .. } => (Device::Cmm, MachineRequest::Collect),
+        Command::Acknowledge { device } => (*device, MachineRequest::Acknowledge),
         _ => return None,
     })
 }
@@ -89,6 +89,6 @@ mod tests {
         assert!(!by(Event::Started { device: Device::Cmm, cycle: 2 }));
         assert!(!by(Event::StartUnknown { device: Device::Grinder, cycle: 2, why: String::new() }));
         let refused = |what| Event::Refused { device: Device::Grinder, what, why: String::new() };
-        assert!(by(refused(Asked::Start)) && !by(refused(Asked::Prepare)));
+        assert!(by(refused(MachineRequest::Start)) && !by(refused(MachineRequest::Prepare)));
     }
 }

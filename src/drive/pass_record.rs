@@ -8,22 +8,22 @@ use crate::geometry::Aperture;
 
 /// Maximum relative difference of the wheel radius from the recipe. A larger one means another wheel; wear and dressing
 /// stay below it.
-const WHEEL_SHARE: f64 = 0.01;
+const MAX_WHEEL_RADIUS_DIFFERENCE: f64 = 0.01;
 /// Minimum share of the tracks over the part that a pass travels. If the part has no outline, the tracks over its
 /// rectangle count, of which corners and holes may be left out.
-const LEAST_PATH_SHARE: f64 = 0.5;
-const LEAST_SHARE_OF_RECTANGLE: f64 = 0.25;
+const MIN_PATH_SHARE: f64 = 0.5;
+const MIN_RECTANGLE_PATH_SHARE: f64 = 0.25;
 /// Maximum path as a multiple of the tracks, for each time that the pass goes over the part: includes moves in the air
 /// and over the edges.
-const MOST_PATH_SHARE: f64 = 20.0;
+const MAX_PATH_FACTOR: f64 = 20.0;
 /// Maximum ratio of a surface that the wheel can follow to its rectangle.
-const STEEPNESS: f64 = 2.0;
+const MAX_SURFACE_FACTOR: f64 = 2.0;
 /// Maximum removal beyond the planned one: allows for noise and for rounding of the measurement.
-const DEPTH_SHARE: f64 = 1.05;
-const DEPTH_SLACK_MM: f64 = 0.01;
+const MAX_DEPTH_FACTOR: f64 = 1.05;
+const DEPTH_MARGIN_MM: f64 = 0.01;
 
 /// Commanded pass.
-pub(super) struct Told<'t> {
+pub(super) struct CommandedPass<'t> {
     pub(super) job: Job,
     pub(super) pass: &'t Pass,
     pub(super) map_identity: [u8; 32],
@@ -34,8 +34,8 @@ pub(super) struct Told<'t> {
 }
 
 /// Returns the first implausible figure of a record, with its limit. A figure that was not reported is not checked.
-pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
-    let Told { job, pass, map_identity, max_depth_mm, outline } = told;
+pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> Option<String> {
+    let CommandedPass { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
         return Some(format!(
@@ -57,29 +57,29 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let range = |value: Option<f64>, what: &str, least: f64, most: f64, unit: &str| {
         let value = value.filter(|value| !(least..=most).contains(value))?;
         let limits = match (least.is_finite(), most.is_finite()) {
-            (true, true) => format!("limits {} to {} {unit}", figure(least), figure(most)),
-            (true, false) => format!("minimum {} {unit}", figure(least)),
-            _ => format!("maximum {} {unit}", figure(most)),
+            (true, true) => format!("limits {} to {} {unit}", format_figure(least), format_figure(most)),
+            (true, false) => format!("minimum {} {unit}", format_figure(least)),
+            _ => format!("maximum {} {unit}", format_figure(most)),
         };
-        Some(format!("{what} is {} {unit}, {limits}", figure(value)))
+        Some(format!("{what} is {} {unit}, {limits}", format_figure(value)))
     };
     let [width, height] = [pass.x_mm, pass.y_mm].map(|[low, high]| high - low);
     let tracks_mm = width * height / pass.track_spacing_mm;
     let least_path_mm = match outline {
-        Some(outline) => LEAST_PATH_SHARE * outline.area_mm2().min(width * height) / pass.track_spacing_mm,
-        None => LEAST_SHARE_OF_RECTANGLE * tracks_mm,
+        Some(outline) => MIN_PATH_SHARE * outline.area_mm2().min(width * height) / pass.track_spacing_mm,
+        None => MIN_RECTANGLE_PATH_SHARE * tracks_mm,
     };
     // The pass crosses the part once for each cut of the removal, once to finish, and then to spark out.
     let times = (max_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
-    let most_path_mm = MOST_PATH_SHARE * tracks_mm * times;
+    let most_path_mm = MAX_PATH_FACTOR * tracks_mm * times;
     // Roughing and moves in the air may be faster than the feed. The last tracks need at least this time.
     let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
     // Manual reports of start and end are no measure of the duration. A machine that reports a path has a clock.
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
-    let wheel = [1.0 - WHEEL_SHARE, 1.0 + WHEEL_SHARE].map(|share| share * pass.wheel_radius_mm);
+    let wheel = [1.0 - MAX_WHEEL_RADIUS_DIFFERENCE, 1.0 + MAX_WHEEL_RADIUS_DIFFERENCE].map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
-    let most_mm = DEPTH_SHARE * max_depth_mm + DEPTH_SLACK_MM;
-    let most_mm3 = STEEPNESS * width * height * most_mm;
+    let most_mm = MAX_DEPTH_FACTOR * max_depth_mm + DEPTH_MARGIN_MM;
+    let most_mm3 = MAX_SURFACE_FACTOR * width * height * most_mm;
     range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
         .or_else(|| range(record.path_mm, "the path travelled", -any, most_path_mm, "mm"))
         .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
@@ -97,12 +97,12 @@ fn contradiction(record: &PassRecord) -> Option<String> {
 }
 
 /// Formats a figure for a message. An absurd value is not written with hundreds of digits.
-fn figure(value: f64) -> String {
+fn format_figure(value: f64) -> String {
     if value.abs() < 1e9 { format!("{value:.3}") } else { format!("{value:e}") }
 }
 
 /// Returns a pass record as the journal stores it.
-pub(super) fn document(record: &PassRecord) -> Value {
+pub(super) fn pass_record_document(record: &PassRecord) -> Value {
     json!({
         "path_mm": record.path_mm,
         "removed_mm3": record.removed_mm3,
@@ -151,13 +151,13 @@ mod tests {
         }
     }
 
-    fn judged(record: &PassRecord) -> Option<String> {
-        judged_of(Some(&Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 }), record)
+    fn checked(record: &PassRecord) -> Option<String> {
+        checked_with_outline(Some(&Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 }), record)
     }
 
-    fn judged_of(outline: Option<&Aperture>, record: &PassRecord) -> Option<String> {
+    fn checked_with_outline(outline: Option<&Aperture>, record: &PassRecord) -> Option<String> {
         let job = Job { job: 41, cycle: 2, digest: 0 };
-        flaw(&Told { job, pass: &pass(), map_identity: [3; 32], max_depth_mm: 0.5, outline }, record)
+        implausible_figure(&CommandedPass { job, pass: &pass(), map_identity: [3; 32], max_depth_mm: 0.5, outline }, record)
     }
 
     #[test]
@@ -165,15 +165,15 @@ mod tests {
         let ring = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 27.0, outer_radius_mm: 31.0 };
         let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
         // 728.8 mm2 with tracks every 0.5 mm.
-        assert_eq!(judged_of(Some(&ring), &of_path(740.0)), None);
-        assert!(judged_of(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("minimum 728.849 mm")));
-        assert_eq!(judged_of(None, &of_path(3200.0)), None);
-        assert!(judged_of(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("minimum 3162.000 mm")));
+        assert_eq!(checked_with_outline(Some(&ring), &of_path(740.0)), None);
+        assert!(checked_with_outline(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("minimum 728.849 mm")));
+        assert_eq!(checked_with_outline(None, &of_path(3200.0)), None);
+        assert!(checked_with_outline(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("minimum 3162.000 mm")));
     }
 
     #[test]
     fn a_figure_that_cannot_be_is_named_with_its_limit() {
-        assert_eq!(judged(&record()), None);
+        assert_eq!(checked(&record()), None);
         let cases = [
             (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, but map 03030303 was sent"),
             (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; the pass is of job 41, cycle 2"),
@@ -195,7 +195,7 @@ mod tests {
             (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the removed volume is -2.000 mm³"),
         ];
         for (record, words) in cases {
-            let flaw = judged(&record).unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));
+            let flaw = checked(&record).unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));
             assert!(flaw.contains(words), "{flaw:?} without {words:?}");
         }
     }
@@ -211,7 +211,7 @@ mod tests {
             duration_s: None,
             ..record()
         };
-        assert_eq!(judged(&untold), None);
-        assert!(judged(&PassRecord { max_depth_mm: Some(f64::NAN), ..record() }).is_some());
+        assert_eq!(checked(&untold), None);
+        assert!(checked(&PassRecord { max_depth_mm: Some(f64::NAN), ..record() }).is_some());
     }
 }

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use crate::compensation::path::{
-    ArcSummary, Field, Lean, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing,
-    Wanted, Wheel, axis_offsets, height_of,
+    ArcSummary, HeightField, TiltMode, MachineLimits, PathError, PathMode, PathOptions, TrackPattern, PathSummary, ToolPath, TrackSpacing,
+    TargetSurface, Wheel, axis_offsets, nominal_height_field,
 };
 use crate::compensation::{Correction, ParameterKind};
 use crate::formats::gcode::{
@@ -18,14 +18,14 @@ use crate::formats::write_atomic;
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
-use super::record::Files;
+use super::recorder::OutputFiles;
 
 /// Name of the program file without its extension, which the dialect gives. A table file for controllers that
 /// compensate by a table is written too.
 pub(super) const PROGRAM_FILE: &str = "toolpath";
 const TABLE_FILE: &str = "toolpath_z.csv";
 /// Maximum number of points of a program that a run writes with each correction.
-const MOST_POINTS: u64 = 3_000_000;
+const MAX_PROGRAM_POINTS: u64 = 3_000_000;
 
 /// Common properties of the programs of a part.
 #[derive(Debug)]
@@ -35,11 +35,11 @@ pub struct Programs {
     /// SHA-256 of the source of the nominal surface.
     pub part_identity: [u8; 32],
     /// Nominal surface as a height over x and y, and outline of the part.
-    pub ground: (Field, Aperture),
+    pub surface_and_outline: (HeightField, Aperture),
     /// Options of the paths.
     pub options: PathOptions,
     /// Limits of the grinder.
-    pub limits: Limits,
+    pub limits: MachineLimits,
     /// Exactness with which the controller follows a program.
     pub mode: PathMode,
     /// Maximum rounding of corners with [`PathMode::Blend`], in mm.
@@ -73,7 +73,7 @@ pub enum ProgramError {
     )]
     TooLong { points: u64 },
     #[error("{path} differs from the program that was written; check the program folder (grinder.program.folder)")]
-    NotThere { path: PathBuf },
+    CopyDiffers { path: PathBuf },
 }
 
 impl Programs {
@@ -81,8 +81,8 @@ impl Programs {
     ///
     /// # Errors
     /// A surface that is not a height over x and y.
-    pub fn ground(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
-        height_of(nominal)
+    pub fn surface_and_outline(nominal: &Nominal) -> Result<(HeightField, Aperture), PathError> {
+        nominal_height_field(nominal)
     }
 
     /// Returns the name of a pass's program in the folder of a cycle.
@@ -95,7 +95,7 @@ impl Programs {
     /// # Errors
     /// A requirement that the dialect cannot express.
     pub fn check_dialect(&self) -> Result<(), DialectError> {
-        if let Some(rotary) = self.options.leaning() {
+        if let Some(rotary) = self.options.tilting_axis() {
             self.dialect.turning(rotary)?;
             if self.arcs_within_mm.is_some() {
                 return Err(DialectError::ArcsTilted);
@@ -118,10 +118,10 @@ impl Programs {
     ///
     /// # Errors
     /// A wheel that does not fit the corrected surface, or a path beyond the limits of the grinder.
-    pub fn path(&self, correction: &Correction) -> Result<(ToolPath, Summary), PathError> {
-        let (nominal, outline) = (self.nominal(correction), &self.ground.1);
+    pub fn path(&self, correction: &Correction) -> Result<(ToolPath, PathSummary), PathError> {
+        let (nominal, outline) = (self.nominal(correction), &self.surface_and_outline.1);
         let wheel = self.wheel(correction);
-        let wanted = Wanted::new(nominal, &handed(correction), wheel.reach_mm())?;
+        let wanted = TargetSurface::new(nominal, &path_correction(correction), wheel.reach_mm())?;
         let path = ToolPath::new(wanted, outline.clone(), PathOptions { wheel, ..self.options })?;
         let summary = path.summary()?;
         summary.check(&self.limits)?;
@@ -132,25 +132,25 @@ impl Programs {
     ///
     /// # Errors
     /// A requirement that the dialect cannot express.
-    pub fn arcs(&self, path: &ToolPath) -> Result<Option<ArcSummary>, DialectError> {
+    pub fn arc_summary(&self, path: &ToolPath) -> Result<Option<ArcSummary>, DialectError> {
         let post = self.dialect.post(&self.exactness())?;
         Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
     /// Returns the wheel with the radius error that measurements have estimated.
     fn wheel(&self, correction: &Correction) -> Wheel {
-        self.options.wheel.larger_by(self.off_mm(correction))
+        self.options.wheel.with_larger_radius(self.wheel_radius_error_mm(correction))
     }
 
     /// Returns the nominal surface relative to the zero of the machine. The zero was touched off with the lowest point
     /// of the wheel, for the radius of the recipe. So the centre of a wheel that is larger by dR is already higher by
     /// dR.
-    fn nominal(&self, correction: &Correction) -> Field {
-        self.ground.0.clone().lowered(self.off_mm(correction))
+    fn nominal(&self, correction: &Correction) -> HeightField {
+        self.surface_and_outline.0.clone().lowered(self.wheel_radius_error_mm(correction))
     }
 
     /// Returns the difference of the wheel radius from that of the recipe.
-    fn off_mm(&self, correction: &Correction) -> f64 {
+    fn wheel_radius_error_mm(&self, correction: &Correction) -> f64 {
         correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
@@ -158,7 +158,7 @@ impl Programs {
     ///
     /// # Errors
     /// Those of [`Programs::path`], and a file that cannot be written.
-    pub fn write(&self, file: &Path, correction: &Correction, map_identity: [u8; 32]) -> Result<Summary, ProgramError> {
+    pub fn write(&self, file: &Path, correction: &Correction, map_identity: [u8; 32]) -> Result<PathSummary, ProgramError> {
         let (path, summary) = self.path(correction)?;
         self.write_program(file, correction, map_identity, &path, &summary)?;
         Ok(summary)
@@ -167,24 +167,24 @@ impl Programs {
     /// Writes the program and `toolpath_z.csv` of a pass into a folder. The program is also copied into the folder
     /// where the controller looks for programs. Returns the reason if one of the files is missing: the program is too
     /// long to be kept, or the table reaches where the wheel cannot.
-    pub(super) fn keep(
+    pub(super) fn save(
         &self,
-        files: &mut Files,
+        files: &mut OutputFiles,
         correction: &Correction,
         map_identity: [u8; 32],
     ) -> Result<Option<String>, ProgramError> {
         let (path, summary) = self.path(correction)?;
-        if summary.points > MOST_POINTS {
+        if summary.points > MAX_PROGRAM_POINTS {
             let error = ProgramError::TooLong { points: summary.points };
             if self.folder.is_some() {
                 return Err(error);
             }
             return Ok(Some(format!("{} was not written: {error}", self.file_name())));
         }
-        let file = files.place(&self.file_name());
+        let file = files.add_file(&self.file_name());
         self.write_program(&file, correction, map_identity, &path, &summary)?;
-        self.hand_over(&file, correction.cycle)?;
-        match self.keep_table(&files.place(TABLE_FILE), correction, map_identity, &path) {
+        self.copy_to_controller(&file, correction.cycle)?;
+        match self.save_table(&files.add_file(TABLE_FILE), correction, map_identity, &path) {
             Ok(()) => Ok(None),
             Err(ProgramError::Path(error)) => Ok(Some(format!("{TABLE_FILE} was not written: {error}"))),
             Err(error) => Err(error),
@@ -192,7 +192,7 @@ impl Programs {
     }
 
     /// Copies a program into the folder where the controller looks for it, under its own name, and reads it back.
-    fn hand_over(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
+    fn copy_to_controller(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let bytes = read_bytes(program).map_err(GcodeError::from)?;
         let extension = &self.dialect.dialect.extension;
@@ -200,12 +200,12 @@ impl Programs {
         write_atomic(&path, &bytes).map_err(GcodeError::from)?;
         match read_bytes(&path).is_ok_and(|there| there == bytes) {
             true => Ok(()),
-            false => Err(ProgramError::NotThere { path }),
+            false => Err(ProgramError::CopyDiffers { path }),
         }
     }
 
     /// Writes the correction as an offset of Z over the axes, for controllers that compensate by a table.
-    fn keep_table(
+    fn save_table(
         &self,
         file: &Path,
         correction: &Correction,
@@ -216,8 +216,8 @@ impl Programs {
             return Err(PathError::TableOfTilted.into());
         }
         let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
-        let before = Wanted::new(self.nominal(correction), &none, 1.0)?;
-        let mut offsets = axis_offsets(&before, path.wanted(), &path.options().wheel, &correction.grid)?;
+        let before = TargetSurface::new(self.nominal(correction), &none, 1.0)?;
+        let mut offsets = axis_offsets(&before, path.target(), &path.options().wheel, &correction.grid)?;
         if self.options.from_below {
             offsets.iter_mut().for_each(|offset| *offset = -*offset);
         }
@@ -231,7 +231,7 @@ impl Programs {
         correction: &Correction,
         map_identity: [u8; 32],
         path: &ToolPath,
-        summary: &Summary,
+        summary: &PathSummary,
     ) -> Result<(), ProgramError> {
         let header = ProgramHeader {
             part: self.part.clone(),
@@ -243,10 +243,10 @@ impl Programs {
             wheel: if self.options.from_below { self.wheel(correction).mirrored() } else { self.wheel(correction) }
                 .description(),
             from_below: self.options.from_below,
-            rotary: self.options.leaning().copied(),
-            lean: lean_in_words(self.options.tilt),
-            parameters: set_in_words(correction, self.options.wheel.reach_mm()),
-            tracks: tracks_in_words(path),
+            rotary: self.options.tilting_axis().copied(),
+            lean: describe_tilt(self.options.tilt),
+            parameters: describe_parameter_corrections(correction, self.options.wheel.reach_mm()),
+            tracks: describe_tracks(path),
             spark_out_passes: self.spark_out_passes,
             simulation: self.simulation,
             exactness: self.exactness(),
@@ -257,7 +257,7 @@ impl Programs {
 
 /// Returns the correction in the form that a path needs: the residual for the map, plus the compensation of setting and
 /// tilt.
-fn handed(correction: &Correction) -> Cow<'_, Correction> {
+fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     match &correction.set {
         None => Cow::Borrowed(correction),
         Some(_) => Cow::Owned(Correction { values_mm: correction.map_mm().into_owned(), ..correction.clone() }),
@@ -265,7 +265,7 @@ fn handed(correction: &Correction) -> Cow<'_, Correction> {
 }
 
 /// Returns the parameters that a correction compensates, one line each. Returns no line if it compensates none.
-pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
+pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
     let Some(set) = &correction.set else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);
     let line = |(kind, value): (ParameterKind, f64)| {
@@ -284,20 +284,20 @@ pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec
     taken.map(line).collect()
 }
 
-fn lean_in_words(lean: Option<Lean>) -> String {
+fn describe_tilt(lean: Option<TiltMode>) -> String {
     match lean {
         None => String::new(),
-        Some(Lean::Constant { angle_rad }) => format!("constant by {:.4} degrees", angle_rad.to_degrees()),
-        Some(Lean::Following { lead_rad }) => format!("{:.4} degrees from the normal", lead_rad.to_degrees()),
+        Some(TiltMode::Constant { angle_rad }) => format!("constant by {:.4} degrees", angle_rad.to_degrees()),
+        Some(TiltMode::Following { lead_rad }) => format!("{:.4} degrees from the normal", lead_rad.to_degrees()),
     }
 }
 
-fn tracks_in_words(path: &ToolPath) -> String {
+fn describe_tracks(path: &ToolPath) -> String {
     let options = path.options();
     let pattern = match (options.pattern, options.one_way) {
-        (Pattern::Raster, true) => "raster along +x",
-        (Pattern::Raster, false) => "raster along x, to and fro",
-        (Pattern::Spiral, _) => "spiral inwards",
+        (TrackPattern::Raster, true) => "raster along +x",
+        (TrackPattern::Raster, false) => "raster along x, to and fro",
+        (TrackPattern::Spiral, _) => "spiral inwards",
     };
     let scallop = match options.spacing {
         TrackSpacing::Scallop { max_height_mm: height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),
@@ -305,7 +305,7 @@ fn tracks_in_words(path: &ToolPath) -> String {
     };
     format!(
         "{} pieces, {:.6} mm apart, {pattern}{scallop}, chords within {:.4} um, overrun {} mm",
-        path.tracks(),
+        path.track_count(),
         path.track_mm(),
         1e3 * options.chord_error_mm,
         options.overrun_mm

@@ -24,12 +24,12 @@ use thiserror::Error;
 
 use super::cycles::Cycles;
 use super::outcome;
-use super::record::Files;
-use super::station::Intent;
-use super::task::Product;
-use super::work;
-use super::{Computation, Task, batch_folder, folder_of, made};
-use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
+use super::recorder::OutputFiles;
+use super::station::StartIntent;
+use super::task::ComputationProduct;
+use super::pipeline;
+use super::{Computation, Task, batch_folder, cycle_folder, create_folder};
+use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
@@ -38,24 +38,24 @@ use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 const SCRATCH: &str = "replay";
 
 /// Interrupted run, as its record describes it.
-pub struct Interrupted {
+pub struct InterruptedRun {
     pub(super) cell: Cell,
     pub(super) cycles: Cycles,
     /// Last preparation of each machine: CMM, grinder.
     pub(super) armed: [Option<Value>; 2],
     /// Number of attempts of each computation, so that no file is overwritten.
     pub(super) attempts: BTreeMap<(u32, Computation), u32>,
-    pub(super) states: u64,
+    pub(super) state_changes: u64,
     /// Time since the run began.
-    pub(super) before: Duration,
+    pub(super) elapsed: Duration,
     /// Commands without an outcome, by their numbers.
-    pub(super) open: BTreeMap<u32, Command>,
+    pub(super) open_commands: BTreeMap<u32, Command>,
     /// Ending, if only the last record is missing.
     pub(super) ending: Option<Ending>,
     /// Judgement whose file is not recorded, and its number within its cycle.
-    pub(super) unannounced: Option<(u32, Judgement)>,
+    pub(super) unannounced_judgement: Option<(u32, Judgement)>,
     /// Files of a computation that ended before it recorded them.
-    pub(super) left: Vec<String>,
+    pub(super) unrecorded_files: Vec<String>,
 }
 
 /// Reason why a run cannot be continued.
@@ -81,7 +81,7 @@ pub enum ReplayError {
     Differs { run: PathBuf, seq: u64, what: String },
 }
 
-impl Interrupted {
+impl InterruptedRun {
     /// Reads the record of a run and replays it, for the plan and the task with which the run began.
     ///
     /// # Errors
@@ -90,88 +90,88 @@ impl Interrupted {
         let reader = Reader::open(run)?;
         let mut replay = Replay::new(run, plan, task)?;
         for record in reader.records(0) {
-            replay.take(&record?)?;
+            replay.apply_record(&record?)?;
         }
-        replay.end()
+        replay.finish()
     }
 
     /// Returns a run in which nothing has happened yet.
-    pub(super) fn none(plan: CellPlan) -> Self {
+    pub(super) fn new(plan: CellPlan) -> Self {
         Self {
             cell: Cell::new(plan),
             cycles: Cycles::default(),
             armed: [None, None],
             attempts: BTreeMap::new(),
-            states: 0,
-            before: Duration::ZERO,
-            open: BTreeMap::new(),
+            state_changes: 0,
+            elapsed: Duration::ZERO,
+            open_commands: BTreeMap::new(),
             ending: None,
-            unannounced: None,
-            left: Vec::new(),
+            unannounced_judgement: None,
+            unrecorded_files: Vec::new(),
         }
     }
 
     /// Returns the last preparation of a machine with its cycle, and whether the machine may still be at that job.
-    pub(super) fn left_at(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
+    pub(super) fn last_preparation(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
         let intent = self.armed[device as usize].clone();
-        let Some(intent) = intent.and_then(|value| serde_json::from_value::<Intent>(value).ok()) else {
+        let Some(intent) = intent.and_then(|value| serde_json::from_value::<StartIntent>(value).ok()) else {
             return (None, false);
         };
         let cycle = BatchId::decode(intent.cycle).cycle;
         let state = self.cell.state();
-        let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving() == Some(device));
-        (Some((cycle, intent.armed())), at_work && cycle == self.cell.cycle())
+        let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving_device() == Some(device));
+        (Some((cycle, intent.to_armed())), at_work && cycle == self.cell.cycle())
     }
 
     /// Returns the state in which the run was interrupted, in words.
-    pub fn state(&self) -> String {
+    pub fn describe_state(&self) -> String {
         format!("{}, cycle {}", self.cell.state(), self.cell.cycle())
     }
 }
 
 struct Replay<'t> {
-    run: &'t Path,
+    run_folder: &'t Path,
     task: &'t Task,
-    found: Interrupted,
+    replayed: InterruptedRun,
     /// Commands that followed from the last event and are not yet seen in the record.
-    due: VecDeque<Command>,
+    due_commands: VecDeque<Command>,
     /// Newest file of each name in the folder of a cycle.
     files: BTreeMap<(u32, String), Artefact>,
     /// All recorded names.
-    names: BTreeSet<String>,
+    recorded_names: BTreeSet<String>,
     /// Coordinates that the last measurement reported.
     coordinates: Option<Coordinates>,
-    last: u64,
+    last_sequence: u64,
 }
 
 impl<'t> Replay<'t> {
     fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
-        let found = Interrupted::none(plan);
+        let found = InterruptedRun::new(plan);
         let (due, files, names) = (VecDeque::new(), BTreeMap::new(), BTreeSet::new());
-        Ok(Self { run, task, found, due, files, names, coordinates: None, last: 0 })
+        Ok(Self { run_folder: run, task, replayed: found, due_commands: due, files, recorded_names: names, coordinates: None, last_sequence: 0 })
     }
 
-    fn take(&mut self, record: &Record) -> Result<(), ReplayError> {
-        self.last = record.seq;
-        self.found.before = self.found.before.max(Duration::from_nanos(record.mono_ns));
+    fn apply_record(&mut self, record: &Record) -> Result<(), ReplayError> {
+        self.last_sequence = record.seq;
+        self.replayed.elapsed = self.replayed.elapsed.max(Duration::from_nanos(record.mono_ns));
         let payload = record.value();
         match record.kind {
             Kind::Begin | Kind::End | Kind::Seal => Ok(()),
             // Decisions that the program had not recorded when it ended were not executed.
             Kind::Reopen => {
-                self.due.clear();
+                self.due_commands.clear();
                 Ok(())
             }
             Kind::Artefact => {
-                self.file(serde_json::from_value(payload).map_err(|error| self.unreadable(&error))?);
+                self.add_recorded_file(serde_json::from_value(payload).map_err(|error| self.unreadable(&error))?);
                 Ok(())
             }
             Kind::Outcome => {
-                self.found.open.retain(|id, _| Some(*id) != record.command_id);
+                self.replayed.open_commands.retain(|id, _| Some(*id) != record.command_id);
                 Ok(())
             }
-            Kind::Event => self.event(Duration::from_nanos(record.mono_ns), payload),
-            Kind::Intent | Kind::Note if payload["command"].is_string() => self.command(record.command_id, payload),
+            Kind::Event => self.apply_event(Duration::from_nanos(record.mono_ns), payload),
+            Kind::Intent | Kind::Note if payload["command"].is_string() => self.compare_command(record.command_id, payload),
             Kind::Intent | Kind::Note => {
                 let told = &payload["transfer"]["coordinates"];
                 if !told.is_null() {
@@ -183,53 +183,53 @@ impl<'t> Replay<'t> {
         }
     }
 
-    fn file(&mut self, file: Artefact) {
-        self.names.insert(file.name.clone());
+    fn add_recorded_file(&mut self, file: Artefact) {
+        self.recorded_names.insert(file.name.clone());
         let path = Path::new(&file.name);
         let cycle = file.name.split('/').next().and_then(|folder| folder.strip_prefix("cycle-")?.parse().ok());
         let (Some(cycle), Some(name)) = (cycle, path.file_name().and_then(|name| name.to_str())) else { return };
-        if name == "result.json" && self.found.unannounced.as_ref().is_some_and(|(_, of)| of.cycle == cycle) {
-            self.found.unannounced = None;
+        if name == "result.json" && self.replayed.unannounced_judgement.as_ref().is_some_and(|(_, of)| of.cycle == cycle) {
+            self.replayed.unannounced_judgement = None;
         }
         self.files.insert((cycle, name.to_owned()), file);
     }
 
-    fn event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
-        if let Some(missing) = self.due.front() {
+    fn apply_event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
+        if let Some(missing) = self.due_commands.front() {
             return Err(self.differs(format!("it commands {}, but the record has another event", missing.name())));
         }
         let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
         if let Event::Prepared { device, .. } = &event {
-            self.found.armed[*device as usize] = payload.get("detail").cloned();
+            self.replayed.armed[*device as usize] = payload.get("detail").cloned();
         }
-        self.compute(&event)?;
-        let before = self.found.cell.state();
-        self.due = self.found.cell.handle(now, event).into();
-        self.found.states += u64::from(self.found.cell.state() != before);
-        let commands: Vec<Command> = self.due.iter().cloned().collect();
-        commands.iter().for_each(|command| self.follow(command));
+        self.repeat_computation(&event)?;
+        let before = self.replayed.cell.state();
+        self.due_commands = self.replayed.cell.handle(now, event).into();
+        self.replayed.state_changes += u64::from(self.replayed.cell.state() != before);
+        let commands: Vec<Command> = self.due_commands.iter().cloned().collect();
+        commands.iter().for_each(|command| self.apply_command(command));
         Ok(())
     }
 
     /// Applies the effect of a command within this program.
-    fn follow(&mut self, command: &Command) {
-        let (cycles, task) = (&mut self.found.cycles, self.task);
+    fn apply_command(&mut self, command: &Command) {
+        let (cycles, task) = (&mut self.replayed.cycles, self.task);
         match command {
-            Command::LoadPass { cycle } => drop(cycles.pass(task, *cycle)),
-            Command::LoadPlan { cycle } => drop(cycles.plan(task, *cycle)),
+            Command::LoadPass { cycle } => drop(cycles.pass_payloads(task, *cycle)),
+            Command::LoadPlan { cycle } => drop(cycles.create_plan(task, *cycle)),
             Command::Announce(judgement) => {
-                let which = cycles.judged(judgement.cycle);
-                self.found.unannounced = Some((which, judgement.clone()));
+                let which = cycles.count_judgement(judgement.cycle);
+                self.replayed.unannounced_judgement = Some((which, judgement.clone()));
             }
-            Command::Finish(ending) => self.found.ending = Some(ending.clone()),
+            Command::Finish(ending) => self.replayed.ending = Some(ending.clone()),
             _ => {}
         }
     }
 
     /// Compares a recorded command with the command that is due.
-    fn command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
+    fn compare_command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
-        let Some(command) = self.due.pop_front() else {
+        let Some(command) = self.due_commands.pop_front() else {
             return Err(self.differs(format!("no command is due, but the record has {name}")));
         };
         if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
@@ -240,38 +240,38 @@ impl<'t> Replay<'t> {
             let due = serde_json::to_value(&command).unwrap_or_default();
             return Err(self.differs(format!("it commands {due}, but the record has {recorded}")));
         }
-        if let Some(id) = id.filter(|_| outcome::is_answered(&command)) {
-            self.found.open.insert(id, command);
+        if let Some(id) = id.filter(|_| outcome::expects_answer(&command)) {
+            self.replayed.open_commands.insert(id, command);
         }
         Ok(())
     }
 
     /// Repeats a computation from recorded data.
-    fn compute(&mut self, event: &Event) -> Result<(), ReplayError> {
+    fn repeat_computation(&mut self, event: &Event) -> Result<(), ReplayError> {
         let (number, kind) = match event {
-            Event::Collected { cycle, gate: Gate::Passed, .. } => (*cycle, Computation::Gate),
+            Event::Collected { cycle, gate: GateResult::Passed, .. } => (*cycle, Computation::Gate),
             Event::Registered { cycle, .. } => (*cycle, Computation::Registration),
             Event::Compensated { cycle, .. } => (*cycle, Computation::Compensation),
             _ => return Ok(()),
         };
-        let Some(cycle) = self.found.cycles.get(number).cloned() else { return Ok(()) };
+        let Some(cycle) = self.replayed.cycles.get(number).cloned() else { return Ok(()) };
         if kind == Computation::Gate {
-            let points = self.points(number)?;
-            self.found.cycles.take(number, Product::Points(points));
+            let points = self.read_points(number)?;
+            self.replayed.cycles.store(number, ComputationProduct::Points(points));
             return Ok(());
         }
-        let scratch = ScratchFolder::at(self.run.join(SCRATCH))?;
-        let mut files = Files::new(scratch.path().to_owned(), folder_of(number, 1));
-        made(&files.folder())?;
+        let scratch = ScratchFolder::at(self.run_folder.join(SCRATCH))?;
+        let mut files = OutputFiles::new(scratch.path().to_owned(), cycle_folder(number, 1));
+        create_folder(&files.folder())?;
         let (again, product) = match kind {
             Computation::Registration => {
-                work::register_cycle(self.task, &mut files, number, &cycle, self.found.cycles.before(number))
+                pipeline::register_cycle(self.task, &mut files, number, &cycle, self.replayed.cycles.previous_judged(number))
             }
-            _ => work::compensate_cycle(self.task, &mut files, number, &cycle),
+            _ => pipeline::compensate_cycle(self.task, &mut files, number, &cycle),
         };
         if let Event::NotSaved { why, .. } = again {
-            let what = super::message_of(&why);
-            return Err(ReplayError::NotSaved { run: self.run.to_owned(), what });
+            let what = super::failure_message(&why);
+            return Err(ReplayError::NotSaved { run: self.run_folder.to_owned(), what });
         }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());
         if recorded != again {
@@ -279,44 +279,44 @@ impl<'t> Replay<'t> {
                 "the repeated computation of cycle {number} gives {again}, but the record has {recorded}"
             )));
         }
-        self.compare(number, scratch.path(), &files)?;
-        self.found.cycles.take(number, product);
+        self.compare_files(number, scratch.path(), &files)?;
+        self.replayed.cycles.store(number, product);
         Ok(())
     }
 
     /// Returns the points of a measurement as they were written.
-    fn points(&self, number: u32) -> Result<super::task::Points, ReplayError> {
+    fn read_points(&self, number: u32) -> Result<super::task::UsablePoints, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
             Some(file) => {
-                let bytes = file.read(self.run)?;
-                formats::parse_points(self.run.join(&file.name), &bytes[..]).map_err(ReplayError::from)
+                let bytes = file.read(self.run_folder)?;
+                formats::parse_points(self.run_folder.join(&file.name), &bytes[..]).map_err(ReplayError::from)
             }
             None => Ok(Vec::new()),
         };
         let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
         let coordinates = self.coordinates.unwrap_or(Coordinates::Centres);
-        let conditions = self.read_json::<work::Conditions>(number, work::CONDITIONS_FILE)?;
+        let conditions = self.read_json::<pipeline::MeasurementConditions>(number, pipeline::CONDITIONS_FILE)?;
         let temperature_c = conditions.map(|told| told.temperature_c);
-        let touches = self.read_json::<work::Touches>(number, work::TOUCHES_FILE)?;
+        let touches = self.read_json::<pipeline::TouchRecord>(number, pipeline::TOUCHES_FILE)?;
         let rounds =
-            self.read_json::<work::TouchedAgain>(number, work::TOUCHED_AGAIN_FILE)?.map_or(0, |told| told.rounds);
+            self.read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?.map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
-        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches)
+        pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches)
             .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))
     }
 
     /// Returns the newest recorded document of a name in a cycle.
     fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
         let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
-        let bytes = file.read(self.run)?;
+        let bytes = file.read(self.run_folder)?;
         serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
     }
 
     /// Compares the files of a repeated computation with the recorded ones.
-    fn compare(&self, number: u32, scratch: &Path, files: &Files) -> Result<(), ReplayError> {
+    fn compare_files(&self, number: u32, scratch: &Path, files: &OutputFiles) -> Result<(), ReplayError> {
         // A file of this format contains the time of its writing.
         let dated = |name: &str| name.ends_with(".x3p");
-        for name in files.names().iter().filter(|name| !dated(name)) {
+        for name in files.file_names().iter().filter(|name| !dated(name)) {
             let path = scratch.join(name);
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };
@@ -334,58 +334,58 @@ impl<'t> Replay<'t> {
     }
 
     /// Checks that the last preparation of each machine agrees with its cycle, and counts the files in the run folder.
-    fn end(mut self) -> Result<Interrupted, ReplayError> {
+    fn finish(mut self) -> Result<InterruptedRun, ReplayError> {
         for device in Device::BOTH {
-            self.check_armed(device)?;
+            self.check_preparation(device)?;
         }
-        formats::finished_files(self.run);
-        for number in 1..=self.found.cell.cycle() + 1 {
+        formats::finished_files(self.run_folder);
+        for number in 1..=self.replayed.cell.cycle() + 1 {
             for attempt in 1.. {
-                let folder = folder_of(number, attempt);
-                let Some(names) = formats::finished_files(&self.run.join(&folder)) else { break };
-                names.iter().for_each(|name| self.lies_there(&folder, number, attempt, name));
+                let folder = cycle_folder(number, attempt);
+                let Some(names) = formats::finished_files(&self.run_folder.join(&folder)) else { break };
+                names.iter().for_each(|name| self.add_existing_file(&folder, number, attempt, name));
             }
             for batch in 1.. {
                 let folder = batch_folder(number, batch);
-                let Some(names) = formats::finished_files(&self.run.join(&folder)) else { break };
-                names.iter().for_each(|name| self.lies_there(&folder, number, batch, name));
+                let Some(names) = formats::finished_files(&self.run_folder.join(&folder)) else { break };
+                names.iter().for_each(|name| self.add_existing_file(&folder, number, batch, name));
             }
         }
-        Ok(self.found)
+        Ok(self.replayed)
     }
 
     /// Registers a file that exists in the folder of an attempt: it is not overwritten, and is recorded if it is not on
     /// record.
-    fn lies_there(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
+    fn add_existing_file(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
         if name == "result.json" || name.starts_with('.') {
             return;
         }
-        let kind = Computation::of(name).and_then(|kind| match kind {
+        let kind = Computation::from_file_name(name).and_then(|kind| match kind {
             // If touches are chosen, the settled results are in the folders of the cycle, and their inputs in those of
             // its batches.
             Computation::Gate | Computation::Registration if self.task.adaptive.is_some() => {
                 if folder.contains("/batch-") {
                     return Some(kind);
                 }
-                (kind == Computation::Registration).then_some(Computation::Settled)
+                (kind == Computation::Registration).then_some(Computation::FinalRegistration)
             }
             kind => Some(kind),
         });
         if let Some(kind) = kind {
-            let attempts = self.found.attempts.entry((number, kind)).or_default();
+            let attempts = self.replayed.attempts.entry((number, kind)).or_default();
             *attempts = attempt.max(*attempts);
         }
         let path = format!("{folder}/{name}");
-        if !self.names.contains(&path) {
-            self.found.left.push(path);
+        if !self.recorded_names.contains(&path) {
+            self.replayed.unrecorded_files.push(path);
         }
     }
 
-    fn check_armed(&mut self, device: Device) -> Result<(), ReplayError> {
-        let Some(value) = self.found.armed[device as usize].clone() else { return Ok(()) };
-        let intent: Intent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
+    fn check_preparation(&mut self, device: Device) -> Result<(), ReplayError> {
+        let Some(value) = self.replayed.armed[device as usize].clone() else { return Ok(()) };
+        let intent: StartIntent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
         let BatchId { cycle: number, batch } = BatchId::decode(intent.cycle);
-        let Some(cycle) = self.found.cycles.get(number) else { return Ok(()) };
+        let Some(cycle) = self.replayed.cycles.get(number) else { return Ok(()) };
         // A preparation from before the plan of the next batch is over.
         if device == Device::Cmm && cycle.batch != batch {
             return Ok(());
@@ -408,10 +408,10 @@ impl<'t> Replay<'t> {
     }
 
     fn unreadable(&self, what: &dyn std::fmt::Display) -> ReplayError {
-        ReplayError::Unreadable { run: self.run.to_owned(), seq: self.last, what: what.to_string() }
+        ReplayError::Unreadable { run: self.run_folder.to_owned(), seq: self.last_sequence, what: what.to_string() }
     }
 
     fn differs(&self, what: String) -> ReplayError {
-        ReplayError::Differs { run: self.run.to_owned(), seq: self.last, what }
+        ReplayError::Differs { run: self.run_folder.to_owned(), seq: self.last_sequence, what }
     }
 }

@@ -1,6 +1,6 @@
 //! Snapshot of the cell: its state, what it waits for, and the next action of a person.
 
-use regrind_control::{Next, PartVerdict, Snapshot};
+use regrind_control::{NextStep, PartVerdict, Snapshot};
 
 use super::Drive;
 use crate::cell::{Cell, Phase, State};
@@ -13,7 +13,7 @@ impl Drive {
             Some((device, _)) => self.notes[device as usize].clone(),
             None => Vec::new(),
         };
-        let next_step = next(&self.cell, &waits_for);
+        let next_step = next_step(&self.cell, &waits_for);
         Snapshot {
             simulation: self.task.simulation,
             part: self.task.part.clone(),
@@ -22,13 +22,13 @@ impl Drive {
             phase: state.phase(),
             unconfirmed: self.cell.unconfirmed(),
             message: self.cell.in_words(),
-            verdict: PartVerdict::at(state.name()),
-            number: self.states,
+            verdict: PartVerdict::from_state(state.name()),
+            number: self.state_changes,
             cycle: self.cell.cycle(),
             max_cycles: self.cell.plan().max_cycles,
             seconds: self.now().as_secs_f64(),
-            progress: self.pace.progress(),
-            so_far: self.touching.so_far(),
+            progress: self.progress_estimator.progress(),
+            so_far: self.preview_statistics.statistics(),
             tolerance: Some(self.cell.plan().tolerance),
             cycles: self.cycles.rows(&self.cell.plan().tolerance),
             alarms: self.cell.alarms().cloned().collect(),
@@ -40,21 +40,21 @@ impl Drive {
 }
 
 /// Returns the next action of a person.
-fn next(cell: &Cell, waits_for: &[String]) -> Next {
-    if let (State::Execute(_), Some(device)) = (cell.state(), cell.asks_whether_clear_of()) {
-        return Next::SeeClear { device };
+fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
+    if let (State::Execute(_), Some(device)) = (cell.state(), cell.clear_confirmation_device()) {
+        return NextStep::SeeClear { device };
     }
     let alarms = cell.alarms().next().is_some();
     match (cell.state(), &cell.unconfirmed()[..], waits_for) {
-        (State::Execute(Phase::Load), ..) => Next::Load,
-        (State::Aborted, [_, ..], _) => Next::EmergencyCircuit,
-        (State::Held(_), [device, ..], _) => Next::SeeWhetherItStands { device: *device },
-        (State::Held(_), ..) if alarms => Next::ClearAlarm,
-        (State::Held(_), ..) => Next::ResumeOrStop,
-        (State::Suspended(_), ..) => Next::SeeToAlarm,
-        (State::Aborting, ..) => Next::KeepAway,
-        (State::Stopped | State::Aborted | State::Complete, ..) => Next::ReadReport,
-        (_, _, [first, ..]) => Next::Bring { what: first.clone() },
-        _ => Next::Nothing,
+        (State::Execute(Phase::Load), ..) => NextStep::Load,
+        (State::Aborted, [_, ..], _) => NextStep::EmergencyCircuit,
+        (State::Held(_), [device, ..], _) => NextStep::SeeWhetherItStands { device: *device },
+        (State::Held(_), ..) if alarms => NextStep::ClearAlarm,
+        (State::Held(_), ..) => NextStep::ResumeOrStop,
+        (State::Suspended(_), ..) => NextStep::SeeToAlarm,
+        (State::Aborting, ..) => NextStep::KeepAway,
+        (State::Stopped | State::Aborted | State::Complete, ..) => NextStep::ReadReport,
+        (_, _, [first, ..]) => NextStep::Bring { what: first.clone() },
+        _ => NextStep::Nothing,
     }
 }

@@ -3,25 +3,25 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::cell::{Figures, PvOf, Tolerance};
-use crate::compensation::path::{PathError, Scallops, Summary, ToolPath};
+use crate::cell::{Figures, PvPoints, Tolerance};
+use crate::compensation::path::{PathError, Scallops, PathSummary, ToolPath};
 use crate::compensation::{
-    Alike, Contact, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError,
-    ParameterKind, ParameterOptions, Parameters, Set, WheelTerm,
+    MachineSimilarity, SurfacePoint, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError,
+    ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, WheelTerm,
 };
 use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
-use crate::geometry::{Grid, Point, Pose, Sample, Vector};
-use crate::measuring::{self, Expansion, sphere_targets};
+use crate::geometry::{Grid, Point, Pose, DeviationSample, Vector};
+use crate::measuring::{self, ThermalExpansion, sphere_targets};
 use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
 use crate::surface::Nominal;
 
-use super::program::{ProgramError, Programs, set_in_words};
-use super::record::Files;
+use super::program::{ProgramError, Programs, describe_parameter_corrections};
+use super::recorder::OutputFiles;
 
 /// Free space that is reserved for the journal and the program of a pass.
 const RESERVE_BYTES: u64 = 16 << 20;
@@ -37,7 +37,7 @@ pub struct Task {
     /// Nominal surface.
     pub nominal: Arc<Nominal>,
     /// Source file of the nominal surface, for the record.
-    pub nominal_file: PathBuf,
+    pub nominal_path: PathBuf,
     /// SHA-256 of the source: identity of the part.
     pub part_identity: [u8; 32],
     /// Targets for the probe. Empty if the machine has no plan of this program.
@@ -45,19 +45,19 @@ pub struct Task {
     /// Parameters of the probing.
     pub probing: Probing,
     /// Sphere on which the probe is checked.
-    pub sphere: Option<Sphere>,
+    pub reference_sphere: Option<ReferenceSphere>,
     /// Pose of the part in the fixture.
     pub fixture_cmm_from_model: Pose,
     /// Options of the registration. The start and the level are set for each cycle.
-    pub registration: Options,
+    pub registration_options: Options,
     /// True if a registration starts from the fixture pose.
     pub start_at_fixture: bool,
     /// Expected kind of coordinates; `None` if each result states it.
-    pub coordinates: Option<Coordinates>,
+    pub expected_coordinates: Option<Coordinates>,
     /// Options of the map.
-    pub map: MapOptions,
+    pub map_options: MapOptions,
     /// Rule for the gain.
-    pub gain: GainRule,
+    pub gain_rule: GainRule,
     /// Error (rms) that a pass adds by itself, if the recipe states it.
     pub repeatability_mm: Option<f64>,
     /// Systematic error that an earlier run of this part found in every pass.
@@ -67,34 +67,34 @@ pub struct Task {
     /// Setting without the cell: shared with a run of another cell to learn from it.
     pub kind: String,
     /// Limits of a correction.
-    pub limits: CorrectionLimits,
+    pub correction_limits: CorrectionLimits,
     /// Parameters of the machine that are compensated; `None` if everything is left to the map.
-    pub parameters: Option<TakenBack>,
+    pub parameter_compensation: Option<ParameterCompensation>,
     /// Standard uncertainty of the datum: of the position in mm and of the orientation in rad. `None` if the recipe
     /// does not state it.
-    pub datum: Option<[f64; 2]>,
+    pub locked_sigmas: Option<[f64; 2]>,
     /// Tolerated uncertainty of the place of a correction on the part.
-    pub place: MapLimits,
+    pub map_limits: MapLimits,
     /// Parameters of a pass. Level and identity are set for each cycle.
     pub pass: Pass,
     /// Half of the largest accepted PV: values within it about zero are drawn as in tolerance.
-    pub tolerance_mm: Option<f64>,
+    pub plot_tolerance_mm: Option<f64>,
     /// Programs, or the reason why there are none.
     pub programs: Result<Programs, PathError>,
     /// Scallops between the tracks of a pass; `None` if no path can be computed.
     pub scallops: Option<Scallops>,
     /// Minimum share of the targets that must be touched.
-    pub least_found: f64,
+    pub min_found_share: f64,
     /// Minimum and maximum temperature of a usable measurement, in °C, if the recipe has a window.
-    pub temperature_c: Option<[f64; 2]>,
+    pub temperature_range_c: Option<[f64; 2]>,
     /// Thermal expansion of part and scales, if the recipe states it for the part.
-    pub expansion: Option<Expansion>,
+    pub expansion: Option<ThermalExpansion>,
     /// Common error of the measuring machine for all points, as its cell file states it.
-    pub machine: MachineUncertainty,
+    pub machine_uncertainty: MachineUncertainty,
     /// Accepted tolerance, as in the plan of the cell.
     pub tolerance: Tolerance,
     /// Options of adaptive touches; `None` if all targets are touched.
-    pub adaptive: Option<Adaptive>,
+    pub adaptive: Option<AdaptiveOptions>,
     /// True if the cell is simulated; all stored data are marked.
     pub simulation: bool,
     /// True if people only play the machines: the plan itself may be returned as the measurement.
@@ -103,18 +103,18 @@ pub struct Task {
 
 /// Parameters of the machine that are compensated.
 #[derive(Clone, Debug, PartialEq)]
-pub struct TakenBack {
+pub struct ParameterCompensation {
     /// Tolerance of each compensated parameter, in its unit, in the order of [`ParameterKind::ALL`].
     pub tolerances: [Option<f64>; ParameterKind::COUNT],
     /// Effect of another wheel radius on this grinder.
     pub wheel_term: WheelTerm,
     /// Surface under the nodes of a correction.
-    pub nodes: Vec<Contact>,
+    pub node_points: Vec<SurfacePoint>,
 }
 
 /// Options of a measurement with adaptive touches.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Adaptive {
+pub struct AdaptiveOptions {
     /// Accepted tolerance, as in the plan of the cell.
     pub tolerance: Tolerance,
     /// Probability with which a part that is out of tolerance may be accepted.
@@ -123,31 +123,31 @@ pub struct Adaptive {
     pub max_cycles: u32,
 }
 
-impl Adaptive {
+impl AdaptiveOptions {
     /// Share of the first touches that remains if one of them finds nothing.
-    pub const ONE_MAY_MISS: f64 = 1.0 - 1.0 / FIRST_BATCH as f64;
+    pub const FIRST_BATCH_MIN_SHARE: f64 = 1.0 - 1.0 / FIRST_BATCH as f64;
     /// Maximum number of evaluations of a measurement. Each may err with its share of the accepted risk.
-    const LOOKS: f64 = 5.0;
+    const MAX_DECISIONS: f64 = 5.0;
     /// Maximum uncertainty of the form, as a share of the rms tolerance, for a correction. It is negligible compared
     /// with what a pass adds.
-    const KNOWN: f64 = 0.17;
+    const MAX_FORM_UNCERTAINTY_SHARE: f64 = 0.17;
     /// Value of the rms that is as hard to achieve as a peak to valley of 1.
-    const RMS_OF_PV: f64 = 0.2;
+    const RMS_TO_PV_RATIO: f64 = 0.2;
 
     /// Returns the probability with which one evaluation may err: a share of the accepted risk. It is at most that of
     /// the final judgement, so that a part that an evaluation finds in tolerance is accepted.
-    pub fn look_risk(&self) -> f64 {
-        (self.accepted_risk / Self::LOOKS).min(1.0 - self.tolerance.probability)
+    pub fn decision_risk(&self) -> f64 {
+        (self.accepted_risk / Self::MAX_DECISIONS).min(1.0 - self.tolerance.probability)
     }
 
     /// Returns the criteria for a measurement after a pass.
-    pub fn purpose(&self, may_grind: bool) -> StoppingCriteria {
+    pub fn stopping_criteria(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
-            PvOf::All => (pv_mm, f64::INFINITY),
-            PvOf::MostPoints => (f64::INFINITY, pv_mm),
+            PvPoints::All => (pv_mm, f64::INFINITY),
+            PvPoints::MostPoints => (f64::INFINITY, pv_mm),
         };
-        let correction_mm = Self::KNOWN * rms_mm.min(Self::RMS_OF_PV * pv_mm.min(pv_most_points_mm));
+        let correction_mm = Self::MAX_FORM_UNCERTAINTY_SHARE * rms_mm.min(Self::RMS_TO_PV_RATIO * pv_mm.min(pv_most_points_mm));
         StoppingCriteria { pv_mm, pv_998_mm: pv_most_points_mm, rms_mm, correction_sigma_mm: correction_mm, may_grind }
     }
 }
@@ -166,7 +166,7 @@ pub struct Probing {
 /// Reference sphere, in the CMM frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[allow(missing_docs)]
-pub struct Sphere {
+pub struct ReferenceSphere {
     pub centre: Point,
     pub radius_mm: f64,
     pub points: usize,
@@ -174,117 +174,117 @@ pub struct Sphere {
 
 /// Knowledge about one cycle.
 #[derive(Clone, Debug)]
-pub(super) struct Cycle {
+pub(super) struct CycleState {
     pub(super) correction: Arc<Correction>,
     pub(super) plan: Option<Arc<Plan>>,
     /// Batch of touches of the plan, and its targets, if touches are chosen.
     pub(super) batch: u32,
-    pub(super) asked: Arc<Vec<usize>>,
+    pub(super) batch_targets: Arc<Vec<usize>>,
     /// Targets of the next batch.
-    pub(super) next: Option<Arc<Vec<usize>>>,
+    pub(super) next_targets: Option<Arc<Vec<usize>>>,
     /// Touches to repeat, if all targets are touched at once.
-    pub(super) again: Option<Arc<Again>>,
-    pub(super) points: Option<Arc<Points>>,
+    pub(super) repeated_touches: Option<Arc<RepeatedTouches>>,
+    pub(super) points: Option<Arc<UsablePoints>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
     /// Hyperparameters of the field of its error from its points alone. `None` if they show no field.
-    pub(super) field: Option<Hyperparameters>,
-    pub(super) error: Option<Arc<ErrorMap>>,
+    pub(super) field_hyperparameters: Option<Hyperparameters>,
+    pub(super) error_map: Option<Arc<ErrorMap>>,
     /// State of the learning with this cycle included.
-    pub(super) known: Option<Arc<LearningState>>,
+    pub(super) learning: Option<Arc<LearningState>>,
     /// Parameters of the machine that explain the error.
-    pub(super) parameters: Option<Arc<Parameters>>,
+    pub(super) parameters: Option<Arc<ParameterEstimation>>,
     /// Parameter corrections for the next pass.
-    pub(super) set: Option<Arc<Set>>,
+    pub(super) parameter_corrections: Option<Arc<ParameterCorrections>>,
     pub(super) figures: Option<Figures>,
     /// Number of judgements. 0 for a measurement that a gate refused, which carries no information about the grinder.
-    pub(super) judgements: u32,
+    pub(super) judgement_count: u32,
 }
 
-impl Cycle {
+impl CycleState {
     /// Returns a cycle in which only the correction of its pass is known.
     pub(super) fn new(correction: Correction) -> Self {
         Self {
             correction: Arc::new(correction),
             plan: None,
             batch: 0,
-            asked: Arc::default(),
-            next: None,
-            again: None,
+            batch_targets: Arc::default(),
+            next_targets: None,
+            repeated_touches: None,
             points: None,
             registration: None,
             form: None,
-            field: None,
-            error: None,
-            known: None,
+            field_hyperparameters: None,
+            error_map: None,
+            learning: None,
             parameters: None,
-            set: None,
+            parameter_corrections: None,
             figures: None,
-            judgements: 0,
+            judgement_count: 0,
         }
     }
 
     pub(super) fn is_judged(&self) -> bool {
-        self.judgements > 0
+        self.judgement_count > 0
     }
 
     /// Stores the result of a computation.
-    pub(super) fn take(&mut self, product: Product) {
+    pub(super) fn store(&mut self, product: ComputationProduct) {
         match product {
-            Product::Points(points) => self.points = Some(Arc::new(points)),
-            Product::Registered(found) => {
-                let Registered { registration, form, field, error, known, parameters, set, figures, next, again } =
+            ComputationProduct::Points(points) => self.points = Some(Arc::new(points)),
+            ComputationProduct::Registered(found) => {
+                let RegistrationProduct { registration, form, field_hyperparameters: field, error_map: error, learning: known, parameters, parameter_corrections: set, figures, next_targets: next, repeated_touches: again } =
                     *found;
-                self.next = next.map(Arc::new);
-                self.again = again.map(Arc::new);
+                self.next_targets = next.map(Arc::new);
+                self.repeated_touches = again.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
                 self.form = form.map(Arc::new);
-                self.field = field;
-                self.error = error.map(Arc::new);
-                self.known = known.map(Arc::new);
+                self.field_hyperparameters = field;
+                self.error_map = error.map(Arc::new);
+                self.learning = known.map(Arc::new);
                 self.parameters = parameters.map(Arc::new);
-                self.set = set.map(Arc::new);
+                self.parameter_corrections = set.map(Arc::new);
                 self.figures = Some(figures);
             }
-            Product::Correction(_) | Product::Nothing => {}
+            ComputationProduct::Correction(_) | ComputationProduct::Nothing => {}
         }
     }
 }
 
 /// Result of a computation for the following ones, in addition to its event and its files.
-pub(super) enum Product {
+pub(super) enum ComputationProduct {
     Nothing,
-    Points(Points),
-    Registered(Box<Registered>),
+    Points(UsablePoints),
+    Registered(Box<RegistrationProduct>),
     /// Correction of the next cycle.
     Correction(Correction),
 }
 
 /// Result of a registration, in addition to its event.
-pub(super) struct Registered {
+pub(super) struct RegistrationProduct {
     pub(super) registration: Registration,
     /// Form from the model of the error; `None` if the model fails.
     pub(super) form: Option<Form>,
     /// Hyperparameters of the error field from the points alone.
-    pub(super) field: Option<Hyperparameters>,
-    pub(super) error: Option<ErrorMap>,
-    pub(super) known: Option<LearningState>,
-    pub(super) parameters: Option<Parameters>,
-    pub(super) set: Option<Set>,
+    pub(super) field_hyperparameters: Option<Hyperparameters>,
+    pub(super) error_map: Option<ErrorMap>,
+    pub(super) learning: Option<LearningState>,
+    pub(super) parameters: Option<ParameterEstimation>,
+    pub(super) parameter_corrections: Option<ParameterCorrections>,
     pub(super) figures: Figures,
     /// Next targets to touch; `None` if enough is known.
-    pub(super) next: Option<Vec<usize>>,
+    pub(super) next_targets: Option<Vec<usize>>,
     /// Touches that can be repeated.
-    pub(super) again: Option<Again>,
+    pub(super) repeated_touches: Option<RepeatedTouches>,
 }
 
 /// Outliers to be touched again, with a few targets around each and control points elsewhere.
 #[derive(Clone, Debug)]
-pub(super) struct Again {
+pub(super) struct RepeatedTouches {
     /// Numbers of the points to touch again.
-    pub(super) points: Vec<usize>,
+    pub(super) outlier_points: Vec<usize>,
     /// Control points, which show whether part, frame and temperature are those of the first touches.
-    pub(super) controls: Vec<ControlPoint>,
+    pub(super) control_points: Vec<ControlPoint>,
     /// Largest change of a control point that the noise of two touches explains.
     pub(super) max_control_change_mm: f64,
     /// Targets: one for each outlier, one for each control point, then those around the outliers.
@@ -295,32 +295,32 @@ pub(super) struct Again {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ControlPoint {
     /// Number of the point.
-    pub(super) point: usize,
+    pub(super) point_index: usize,
     /// Normal of the nominal surface at the point, in the CMM frame.
     pub(super) normal: Vector,
 }
 
 /// Usable points of a measurement.
 #[derive(Clone, Debug)]
-pub(super) struct Points {
+pub(super) struct UsablePoints {
     pub(super) part: Vec<Point>,
     pub(super) sphere: Vec<Point>,
     /// True radius of the probe, if a sphere was touched.
-    pub(super) radius_mm: Option<f64>,
+    pub(super) probe_radius_mm: Option<f64>,
     /// Kind of coordinates: centres of the probe, or contact points.
     pub(super) coordinates: Coordinates,
     /// Standard uncertainty of the radius; 0 if it is the radius of the recipe, which states none.
-    pub(super) radius_sigma_mm: f64,
+    pub(super) probe_radius_sigma_mm: f64,
     /// Standard deviation of the probe's noise from the sphere, and the relative uncertainty of that. 0 if no sphere
     /// was touched.
-    pub(super) probe_scatter_mm: [f64; 2],
+    pub(super) probe_noise_mm: [f64; 2],
     /// Temperature of the part in °C, if the machine reported it.
     pub(super) temperature_c: Option<f64>,
     /// Targets tried, batch by batch, and the target of each point of the part. Empty if all are touched at once.
-    pub(super) tried: Vec<Vec<usize>>,
-    pub(super) of: Vec<usize>,
+    pub(super) tried_targets: Vec<Vec<usize>>,
+    pub(super) point_targets: Vec<usize>,
     /// Number of rounds in which outliers were touched again.
-    pub(super) rounds: u32,
+    pub(super) repeat_rounds: u32,
 }
 
 impl Task {
@@ -328,9 +328,9 @@ impl Task {
     ///
     /// # Errors
     /// A first correction beyond the limits of this run; the task is unchanged.
-    pub fn begin_with(&mut self, learned: Learned) -> Result<(), NextPassError> {
+    pub fn start_from_learned(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
-        let within = self.first_correction().removed_mm(&self.limits).map_err(|error| match error {
+        let within = self.first_correction().removed_mm(&self.correction_limits).map_err(|error| match error {
             NextPassError::BudgetSpent { removed_mm, budget_mm } => {
                 NextPassError::BudgetAtOnce { removed_mm, budget_mm }
             }
@@ -344,41 +344,41 @@ impl Task {
 
     /// Builds the initial state of this task from the results of other cells, as far as the machines are alike. Returns
     /// `None` if they contribute nothing.
-    pub fn from_others(&self, others: &[(CellRun, Learned)], alike: &Alike) -> Option<Learned> {
+    pub fn learned_from_others(&self, others: &[(CellRun, Learned)], alike: &MachineSimilarity) -> Option<Learned> {
         let of_this = (self.simulation, self.setting.clone());
-        Learned::from_others(others, alike, of_this, (&self.fresh(), self.uncorrected()))
+        Learned::from_others(others, alike, of_this, (&self.new_learning(), self.zero_correction()))
     }
 
     /// Writes correction and program of a first pass that starts from a learned state; returns the names of the files.
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
-    pub fn save_first(&self, folder: &Path) -> Result<Vec<String>, ProgramError> {
+    pub fn save_first_pass(&self, folder: &Path) -> Result<Vec<String>, ProgramError> {
         ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
-        let (first, none) = (self.first_correction(), self.uncorrected());
-        let mut files = Files::new(folder.to_owned(), String::new());
+        let (first, none) = (self.first_correction(), self.zero_correction());
+        let mut files = OutputFiles::new(folder.to_owned(), String::new());
         self.save_correction(&mut files, &first, &none).map_err(GcodeError::from)?;
         self.save_program(&mut files, &first)?;
-        Ok(files.made())
+        Ok(files.into_existing())
     }
 
     /// Returns the correction of the first pass: none, or that of an earlier part.
     pub fn first_correction(&self) -> Correction {
-        let none = self.uncorrected();
+        let none = self.zero_correction();
         match &self.learned {
             Some(learned) => learned.first_correction(none),
             None => none,
         }
     }
 
-    fn uncorrected(&self) -> Correction {
-        let grid = correction_grid([self.pass.x_mm, self.pass.y_mm], self.map.spacing_mm);
-        Correction::zero(grid, self.limits.allowance_mm)
+    fn zero_correction(&self) -> Correction {
+        let grid = correction_grid([self.pass.x_mm, self.pass.y_mm], self.map_options.spacing_mm);
+        Correction::zero(grid, self.correction_limits.allowance_mm)
     }
 
     /// Returns the estimated disk space of a cycle, including the journal.
     pub fn cycle_bytes(&self) -> u64 {
-        let (points, nodes) = (self.targets.len() as u64, self.uncorrected().grid.len() as u64);
+        let (points, nodes) = (self.targets.len() as u64, self.zero_correction().grid.len() as u64);
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
@@ -387,10 +387,10 @@ impl Task {
     ///
     /// # Errors
     /// A surface that the wheel cannot grind, and limits of the grinder that the path exceeds.
-    pub fn first_path(&self) -> Result<Option<(ToolPath, Summary)>, PathError> {
+    pub fn first_path(&self) -> Result<Option<(ToolPath, PathSummary)>, PathError> {
         match &self.programs {
             Ok(programs) => programs.path(&self.first_correction()).map(Some),
-            Err(error) if error.is_ours() => Ok(None),
+            Err(error) if error.is_planning_failure() => Ok(None),
             Err(error) => Err(error.clone()),
         }
     }
@@ -401,14 +401,14 @@ impl Task {
     }
 
     /// Returns the state of the learning before the first pass.
-    pub(super) fn beginning(&self) -> LearningState {
-        self.learned.as_ref().map_or_else(|| self.fresh(), |learned| learned.known.for_next_part())
+    pub(super) fn initial_learning(&self) -> LearningState {
+        self.learned.as_ref().map_or_else(|| self.new_learning(), |learned| learned.known.for_next_part())
     }
 
-    fn fresh(&self) -> LearningState {
+    fn new_learning(&self) -> LearningState {
         let Pass { x_mm, y_mm, .. } = self.pass;
         let size_mm = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]];
-        LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm)
+        LearningState::new(self.gain_rule, &self.map_options, size_mm, self.repeatability_mm)
     }
 
     /// Registers points to the surface offset by a radius. Returns the registration and the options used.
@@ -423,14 +423,14 @@ impl Task {
         points: &[Point],
         probe_radius_mm: f64,
     ) -> Result<(Registration, Options), RegistrationError> {
-        self.register_from(points, probe_radius_mm, self.start_at_fixture)
+        self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
     /// Registers in the same way, and starts from the fixture pose if `start_at_fixture` is true.
     ///
     /// # Errors
     /// Those of [`register`].
-    pub fn register_from(
+    pub fn register_with_start(
         &self,
         points: &[Point],
         probe_radius_mm: f64,
@@ -439,8 +439,8 @@ impl Task {
         let at_fixture = Start::Pose(self.fixture_cmm_from_model);
         let start = if start_at_fixture { at_fixture } else { Start::Search };
         // Contact points, or a level below the nominal surface: there is no offset, so the points lie on the surface.
-        let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
-        let options = Options { probe_radius_mm, method, start, ..self.registration };
+        let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration_options.method };
+        let options = Options { probe_radius_mm, method, start, ..self.registration_options };
         let found = register(&self.nominal, points, &options)?;
         if start_at_fixture || !found.quality.weak_directions.iter().any(|weak| weak.held) {
             return Ok((found, options));
@@ -451,26 +451,26 @@ impl Task {
 
     /// Returns the standard uncertainties of the pose in the fixture, if it locks any direction; 0 for a direction
     /// whose uncertainty is not stated. Order: x, y, z in mm, rx, ry, rz in rad.
-    pub fn held(&self) -> Option<[f64; 6]> {
-        let [shift_mm, turn_rad] = self.datum.unwrap_or_default();
+    pub fn locked_direction_sigmas(&self) -> Option<[f64; 6]> {
+        let [shift_mm, turn_rad] = self.locked_sigmas.unwrap_or_default();
         let of = |k: usize| if k < 3 { shift_mm } else { turn_rad };
-        let locked = self.registration.locked;
+        let locked = self.registration_options.locked;
         locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
     }
 
     /// Returns the options for the separation of parameters, for a pass with these parameter corrections.
-    pub fn parameter_options(&self, told: Option<&Set>) -> ParameterOptions {
+    pub fn parameter_options(&self, told: Option<&ParameterCorrections>) -> ParameterOptions {
         ParameterOptions {
-            free_motions: self.registration.locked.map(|locked| !locked),
-            locked_sigmas: self.datum,
-            tolerances: self.parameters.as_ref().map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
-            wheel_term: self.parameters.as_ref().map_or(WheelTerm::default(), |taken| taken.wheel_term),
+            free_motions: self.registration_options.locked.map(|locked| !locked),
+            locked_sigmas: self.locked_sigmas,
+            tolerances: self.parameter_compensation.as_ref().map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
+            wheel_term: self.parameter_compensation.as_ref().map_or(WheelTerm::default(), |taken| taken.wheel_term),
             ..ParameterOptions::new(self.wheel_radius_mm(told))
         }
     }
 
     /// Returns the radius of the wheel for a pass: that of the recipe, or corrected by measurements.
-    pub fn wheel_radius_mm(&self, told: Option<&Set>) -> f64 {
+    pub fn wheel_radius_mm(&self, told: Option<&ParameterCorrections>) -> f64 {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
@@ -497,19 +497,19 @@ impl Task {
     /// If the part may have been clamped again, a few targets that are as far apart as possible come first, at low
     /// speed. They reveal a part in another place than expected.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
-        let first = if seated_anew { farthest_points(&self.places(), CAREFUL_TARGETS) } else { Vec::new() };
+        let first = if seated_anew { farthest_points(&self.target_places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
-        self.plan_of(level_mm, cmm_from_model, (first, rest), true)
+        self.plan_by_index(level_mm, cmm_from_model, (first, rest), true)
     }
 
     /// Returns the targets in the form that the model of the error needs.
-    pub(super) fn places(&self) -> Vec<(Point, Vector)> {
+    pub(super) fn target_places(&self) -> Vec<(Point, Vector)> {
         self.targets.iter().map(|target| (target.point, target.normal)).collect()
     }
 
     /// Creates a plan of some targets, the first group at low speed. The reference sphere, if wanted, comes between the
     /// groups.
-    pub(super) fn plan_of(
+    pub(super) fn plan_by_index(
         &self,
         level_mm: f64,
         cmm_from_model: &Pose,
@@ -517,18 +517,18 @@ impl Task {
         with_sphere: bool,
     ) -> Plan {
         let [first, rest] = [first, rest].map(|of| of.iter().map(|k| &self.targets[*k]).collect());
-        self.plan_at(level_mm, cmm_from_model, (first, rest), with_sphere)
+        self.plan_targets(level_mm, cmm_from_model, (first, rest), with_sphere)
     }
 
     /// Creates a plan in the same way for targets at any place.
-    pub(super) fn plan_at(
+    pub(super) fn plan_targets(
         &self,
         level_mm: f64,
         cmm_from_model: &Pose,
         (first, rest): (Vec<&measuring::Target>, Vec<&measuring::Target>),
         with_sphere: bool,
     ) -> Plan {
-        let sphere = self.sphere.iter().filter(|_| with_sphere);
+        let sphere = self.reference_sphere.iter().filter(|_| with_sphere);
         let sphere = sphere.flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
         let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
         let on_part = |t: &measuring::Target| {
@@ -545,7 +545,7 @@ impl Task {
         });
         let Probing { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } = self.probing;
         let targets: Vec<_> = targets.collect();
-        let slowly = CarefulStart { target_count: first.len() as u32, speed_mm_s: CAREFUL_SHARE * speed_mm_s };
+        let slowly = CarefulStart { target_count: first.len() as u32, speed_mm_s: CAREFUL_SPEED_SHARE * speed_mm_s };
         let careful = (!first.is_empty()).then_some(slowly);
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
@@ -553,14 +553,14 @@ impl Task {
     /// Writes the correction of a pass, with the identity of the one that it replaces.
     pub(super) fn save_correction(
         &self,
-        files: &mut Files,
+        files: &mut OutputFiles,
         correction: &Correction,
         base: &Correction,
     ) -> Result<(), FormatError> {
         let [identity, replaces] = [correction, base].map(|correction| self.map_identity(correction));
         let identities = CorrectionIdentities { part: self.part_identity, map: identity, replaces };
-        let set = set_in_words(correction, self.pass.wheel_radius_mm);
-        write_correction(&files.place("correction.csv"), correction, (&identities, &set), self.simulation)
+        let set = describe_parameter_corrections(correction, self.pass.wheel_radius_mm);
+        write_correction(&files.add_file("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
     /// Writes the program of the next pass, if there is one. Returns the reason if a part of it is missing. A pass can
@@ -571,12 +571,12 @@ impl Task {
     /// written.
     pub(super) fn save_program(
         &self,
-        files: &mut Files,
+        files: &mut OutputFiles,
         correction: &Correction,
     ) -> Result<Option<String>, ProgramError> {
         match &self.programs {
-            Ok(programs) => programs.keep(files, correction, self.map_identity(correction)),
-            Err(error) if error.is_ours() => Ok(Some(format!("no program was written: {error}"))),
+            Ok(programs) => programs.save(files, correction, self.map_identity(correction)),
+            Err(error) if error.is_planning_failure() => Ok(Some(format!("no program was written: {error}"))),
             Err(error) => Err(error.clone().into()),
         }
     }
@@ -596,14 +596,14 @@ pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> G
 /// Number of targets with which a plan begins if the part may have been clamped again.
 const CAREFUL_TARGETS: usize = 9;
 /// Share of the recipe's speed for these targets.
-const CAREFUL_SHARE: f64 = 0.2;
+const CAREFUL_SPEED_SHARE: f64 = 0.2;
 
 /// Returns the points used in a registration.
-pub(super) fn used(found: &Registration) -> impl Iterator<Item = &Deviation> {
+pub(super) fn used_deviations(found: &Registration) -> impl Iterator<Item = &Deviation> {
     found.deviations.iter().filter(|d| d.status == PointStatus::Inlier)
 }
 
 /// Returns their deviations at x and y of the model frame.
-pub(super) fn readings(found: &Registration) -> Vec<Sample> {
-    used(found).map(|d| Sample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+pub(super) fn deviation_samples(found: &Registration) -> Vec<DeviationSample> {
+    used_deviations(found).map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
 }

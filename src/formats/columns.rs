@@ -357,14 +357,14 @@ pub(super) struct Axes {
 /// Words in the name of an axis that show that the column is not a coordinate: deviations, directions, tolerances,
 /// uncertainties.
 #[rustfmt::skip]
-const BESIDE_AXES: [&str; 41] = [
+const NON_COORDINATE_WORDS: [&str; 41] = [
     "d", "dev", "devs", "deviation", "delta", "diff", "difference", "err", "error", "off", "offset", "abw", "abweichung", "ecart", "écart", "n", "norm", "normal", "normale", "normalvector", "dir", "direction",
     "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
 ];
 
 /// Returns the axis that a name in lower case contains, and the rest of the name; in a name of one word, the axis is a
 /// letter at either end.
-fn axis_beside(name: &str) -> Option<(usize, String)> {
+fn axis_in_name(name: &str) -> Option<(usize, String)> {
     let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
     let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
     match words[..] {
@@ -384,15 +384,15 @@ fn axis_beside(name: &str) -> Option<(usize, String)> {
 }
 
 impl Axes {
-    pub(super) fn of(names: &[String]) -> Self {
+    pub(super) fn from_names(names: &[String]) -> Self {
         let mut axes = Self::default();
         let mut beside: BTreeMap<String, [bool; 3]> = BTreeMap::new();
         for (column, name) in names.iter().enumerate() {
             let name = split_unit(name).0;
             if let Some((axis, group)) = axis_of(name) {
                 axes.groups[group as usize][axis].push(column);
-            } else if let Some((axis, rest)) = axis_beside(name)
-                && !rest.split(' ').any(|word| BESIDE_AXES.contains(&word))
+            } else if let Some((axis, rest)) = axis_in_name(name)
+                && !rest.split(' ').any(|word| NON_COORDINATE_WORDS.contains(&word))
             {
                 beside.entry(rest).or_default()[axis] = true;
             }
@@ -553,7 +553,7 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         }
     }
     let word = |k: usize| words.get(k).map_or("", |word| &text[word.clone()]);
-    let is_other = |word: &str| OTHER.contains(&word) || (BESIDE_AXES.contains(&word) && word.chars().count() > 1);
+    let is_other = |word: &str| OTHER.contains(&word) || (NON_COORDINATE_WORDS.contains(&word) && word.chars().count() > 1);
     let unit_behind = |height: usize| {
         let mut at = height + 1;
         // "heights are in um"; a lone "in" at the end is the inch.
@@ -677,7 +677,7 @@ mod tests {
 
     fn axes(header: &str) -> Axes {
         let names: Vec<String> = header.split(',').map(str::to_lowercase).collect();
-        Axes::of(&names)
+        Axes::from_names(&names)
     }
 
     #[test]

@@ -83,7 +83,7 @@ fn read(path: &Path, text: &[u8]) -> Result<Reading, FormatError> {
     }
     let mut reading = Reading::default();
     for statement in statements(&String::from_utf8_lossy(text)) {
-        reading.take(path, &statement)?;
+        reading.read_statement(path, &statement)?;
     }
     if !reading.is_ended {
         let place = format!("line {}", text.split(|b| *b == b'\n').count());
@@ -115,7 +115,7 @@ fn statements(text: &str) -> Vec<Statement> {
 }
 
 impl Reading {
-    fn take(&mut self, path: &Path, statement: &Statement) -> Result<(), FormatError> {
+    fn read_statement(&mut self, path: &Path, statement: &Statement) -> Result<(), FormatError> {
         let text = statement.text.as_str();
         let (before, after) = text.split_once('/').unwrap_or((text, ""));
         let keyword = before.trim().to_ascii_uppercase();
@@ -163,7 +163,7 @@ impl Reading {
 
     fn say(&mut self, path: &Path, statement: &Statement, key: &str, value: &str) -> Result<(), FormatError> {
         let before = self.statements.coordinates;
-        self.statements.take(path, statement.line, key, value)?;
+        self.statements.read_statement(path, statement.line, key, value)?;
         if before.is_some() && before != self.statements.coordinates {
             return Err(unexpected(path, statement, "one kind of coordinates in a file, centres or contacts", value));
         }

@@ -11,7 +11,7 @@ use regrind_core::geometry::Pose;
 use regrind_core::registration::{
     Deviation, Iteration, Loss, Method, Options, PointStatus, Registration, WeakDirection,
 };
-use regrind_core::surface::{Distance, Side};
+use regrind_core::surface::{DistanceModel, Side};
 
 /// Content of `registration.json`. The names are a contract; lengths are in millimetres, angles in radians.
 #[derive(Serialize)]
@@ -24,7 +24,7 @@ pub struct RegistrationDocument<'a> {
     pub nominal: NominalInput<'a>,
     pub measured: MeasuredInput<'a>,
     pub method: Method,
-    pub distance: Distance,
+    pub distance: DistanceModel,
     pub loss: Loss,
     pub probe_radius_mm: Option<f64>,
     pub locked: Vec<&'static str>,

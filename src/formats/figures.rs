@@ -6,10 +6,10 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::write_json_atomic;
-use super::told_figures::{Told, notation, told};
+use super::form_figures::{FormFigureRow, notation, form_figure_rows};
 use regrind_core::form::{
-    Basis, DIRECTION, EVERY_POINT, Figures, Fit, FormError, FormOptions, Iso10110, Labelled, Slope, TakenOut, labelled,
-    labelled_slope,
+    PolynomialBasis, DIRECTION, NO_CUT_OFF, DeviationFigures, PolynomialFit, FormError, FormOptions, Iso10110, LabelledFigure, Slope, RemovedParts, label_figures,
+    label_slope,
 };
 use regrind_core::model::Form;
 
@@ -21,11 +21,11 @@ struct FiguresDocument<'a> {
     /// Number of points that took part.
     points: Option<usize>,
     /// Form of the part: each figure with its credible interval, and the raw figure.
-    form: Vec<Told>,
+    form: Vec<FormFigureRow>,
     /// ISO 10110-5 indication that the form meets in each of its values with a probability of 97.5 %.
     form_iso_10110_5: Option<String>,
     /// Figures of the measured deviations, which include the noise of the probe.
-    figures: Vec<Labelled>,
+    figures: Vec<LabelledFigure>,
     iso_10110_5: Option<OfPoints<&'a Iso10110>>,
     zernike: Option<OfPoints<SeriesDocument>>,
     legendre: Option<OfPoints<SeriesDocument>>,
@@ -68,7 +68,7 @@ struct TermDocument {
 
 /// Results of a cycle: the figures of the points, the slopes of the map, and the form; `None` if there is no map or no
 /// form.
-pub type Found<'a> = (Result<&'a Figures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
+pub type CycleFigures<'a> = (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
 /// Writes `figures.json`: the figures of the form, those of the points and the slopes of the map, all with the terms
 /// that were removed before.
@@ -79,17 +79,17 @@ pub type Found<'a> = (Result<&'a Figures, &'a FormError>, Option<Result<&'a Slop
 /// A file that cannot be written.
 pub fn write_figures(
     path: &Path,
-    (figures, slope, form): Found<'_>,
-    taken_out: &TakenOut,
+    (figures, slope, form): CycleFigures<'_>,
+    taken_out: &RemovedParts,
     simulation: bool,
 ) -> Result<(), FormatError> {
     let (mut rows, mut missing) = (Vec::new(), Vec::new());
     match figures {
-        Ok(figures) => rows.extend(labelled(figures, taken_out)),
+        Ok(figures) => rows.extend(label_figures(figures, taken_out)),
         Err(why) => missing.push(format!("figures of the points: {why}")),
     }
     match slope {
-        Some(Ok(slope)) => rows.extend(labelled_slope(slope, taken_out)),
+        Some(Ok(slope)) => rows.extend(label_slope(slope, taken_out)),
         Some(Err(why)) => missing.push(format!("slopes: {why}")),
         None => missing.push("slopes: there is no map".to_owned()),
     }
@@ -105,7 +105,7 @@ pub fn write_figures(
         simulation,
         frame: "model",
         points: found.map(|f| f.points),
-        form: form.map(|form| told(form, found, slope.and_then(Result::ok), taken_out)).unwrap_or_default(),
+        form: form.map(|form| form_figure_rows(form, found, slope.and_then(Result::ok), taken_out)).unwrap_or_default(),
         form_iso_10110_5: form.and_then(|form| form.iso).map(|iso| notation(&iso, wavelength_nm)),
         figures: rows,
         iso_10110_5: found.map(|f| of_points(&removed, &f.iso_10110)),
@@ -117,13 +117,13 @@ pub fn write_figures(
 }
 
 fn of_points<T>(removed: &str, what: T) -> OfPoints<T> {
-    OfPoints { removed: removed.to_owned(), direction: DIRECTION, cut_off: EVERY_POINT, what }
+    OfPoints { removed: removed.to_owned(), direction: DIRECTION, cut_off: NO_CUT_OFF, what }
 }
 
-fn series(fit: &Fit) -> SeriesDocument {
+fn series(fit: &PolynomialFit) -> SeriesDocument {
     let (normalisation, centre_mm, half_size_mm) = match fit.basis {
-        Basis::Zernike { centre_mm, radius_mm, .. } => ("mean square 1 over the full disc", centre_mm, [radius_mm; 2]),
-        Basis::Legendre { centre_mm, half_mm } => ("mean square 1 over the full rectangle", centre_mm, half_mm),
+        PolynomialBasis::Zernike { centre_mm, radius_mm, .. } => ("mean square 1 over the full disc", centre_mm, [radius_mm; 2]),
+        PolynomialBasis::Legendre { centre_mm, half_mm } => ("mean square 1 over the full rectangle", centre_mm, half_mm),
     };
     let pairs = fit.coefficients_mm.iter().zip(&fit.orthogonal_mm).enumerate();
     let term = |(k, (coefficient, orthogonal)): (usize, (&f64, &f64))| TermDocument {

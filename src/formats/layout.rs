@@ -64,7 +64,7 @@ pub(super) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    pub(super) fn of(line: &'a [u8], separator: Separator) -> Self {
+    pub(super) fn new(line: &'a [u8], separator: Separator) -> Self {
         let rest = if separator == Separator::Blank { line.trim_ascii() } else { line };
         Self { rest: Some(rest), separator }
     }
@@ -111,7 +111,7 @@ impl Layout {
     pub(super) fn pick<'a>(&self, line: &'a [u8]) -> ([&'a [u8]; 3], usize) {
         let mut picked = [&line[..0]; 3];
         let mut count = 0;
-        for field in Fields::of(line, self.separator) {
+        for field in Fields::new(line, self.separator) {
             if let Some(axis) = self.columns.iter().position(|&column| column == count) {
                 picked[axis] = field;
             }
@@ -185,7 +185,7 @@ impl<'p> Preamble<'p> {
     }
 
     /// Reads the next line and returns the layout if it is the first line with data.
-    pub(super) fn take(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
+    pub(super) fn read_line(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
         let content = line.trim_ascii();
         if content.is_empty() || (number == 1 && is_separator_line(content)) {
             return Ok(None);
@@ -200,7 +200,7 @@ impl<'p> Preamble<'p> {
         if let Some(title) = self.title.take() {
             return Err(title);
         }
-        let count = Fields::of(line, separator).count();
+        let count = Fields::new(line, separator).count();
         let columns = self.columns(separator, (line, count), number)?;
         self.check_unit_line(columns, count)?;
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
@@ -209,7 +209,7 @@ impl<'p> Preamble<'p> {
     /// Reads a line without a point: the header, a title, a line of units, or an error.
     fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
-        let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
+        let fields: Vec<&[u8]> = Fields::new(line, likely).collect();
         let has_header = self.header.as_ref().is_some_and(|(_, header)| self.is_understood(header));
         if has_header && self.take_units(&fields, number) {
             return Ok(());
@@ -236,7 +236,7 @@ impl<'p> Preamble<'p> {
     /// Returns the error for a line that is not a point.
     fn no_point(&self, line: &[u8], number: u64) -> FormatError {
         let path = self.path.to_owned();
-        let fields: Vec<&[u8]> = Fields::of(line, likely_separator(line)).collect();
+        let fields: Vec<&[u8]> = Fields::new(line, likely_separator(line)).collect();
         let wrong = fields.iter().position(|field| !looks_numeric(field)).unwrap_or(0);
         match fields.len() < 3 {
             true => FormatError::TooFewColumns { path, line: number, columns: fields.len(), found: excerpt(line) },
@@ -261,7 +261,7 @@ impl<'p> Preamble<'p> {
         match &self.table.columns {
             Some(columns) if columns.are_numbers() => names.len() > 2,
             Some(columns) => columns.are_in(&names),
-            None => Axes::of(&names).are_named(),
+            None => Axes::from_names(&names).are_named(),
         }
     }
 
@@ -374,7 +374,7 @@ impl<'p> Preamble<'p> {
         };
         let columns = match &self.table.columns {
             Some(columns) => columns.places(&names, count),
-            None => Axes::of(&names).chosen(self.of_nominal),
+            None => Axes::from_names(&names).chosen(self.of_nominal),
         };
         if names.len() != count && !names.is_empty() {
             // A comment can be a sentence that names the three columns of a table in their order.
@@ -400,7 +400,7 @@ impl<'p> Preamble<'p> {
 /// Returns true if the last three of six columns are a direction.
 fn has_normal(line: &[u8], separator: Separator) -> bool {
     const OFF: f64 = 1e-3;
-    let last = Fields::of(line, separator).skip(3);
+    let last = Fields::new(line, separator).skip(3);
     let squares: Option<Vec<f64>> =
         last.map(|field| std::str::from_utf8(field).ok()?.parse().ok().map(|value: f64| value * value)).collect();
     squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
@@ -410,7 +410,7 @@ fn has_normal(line: &[u8], separator: Separator) -> bool {
 /// anywhere.
 fn data_separator(line: &[u8]) -> Option<Separator> {
     let numbers = |separator: Separator, first: usize| {
-        let fields = Fields::of(line, separator).take(first);
+        let fields = Fields::new(line, separator).take(first);
         fields.filter(|field| looks_numeric(&separator.ungrouped(field))).count()
     };
     let first_three = Separator::ALL.into_iter().find(|&separator| numbers(separator, 3) == 3);
@@ -426,7 +426,7 @@ fn likely_separator(line: &[u8]) -> Separator {
 /// Returns the names of the columns in lower case; a unit separated by a blank belongs to the name before it.
 fn names(header: &[u8], separator: Separator) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
-    for field in Fields::of(header, separator) {
+    for field in Fields::new(header, separator) {
         let name = text_of(field).to_lowercase();
         match names.last_mut() {
             Some(last) if separator == Separator::Blank && name.starts_with(['[', '(']) => *last += &name,
@@ -452,7 +452,7 @@ mod tests {
     use super::*;
 
     fn fields(line: &str, separator: Separator) -> Vec<String> {
-        Fields::of(line.as_bytes(), separator).map(|f| String::from_utf8_lossy(f).into_owned()).collect()
+        Fields::new(line.as_bytes(), separator).map(|f| String::from_utf8_lossy(f).into_owned()).collect()
     }
 
     #[test]

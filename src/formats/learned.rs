@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use super::FormatError;
 use super::whole::read_whole;
-use regrind_core::compensation::{Alike, Correction, LearningState, Set, Shared};
+use regrind_core::compensation::{MachineSimilarity, Correction, LearningState, ParameterCorrections, TransferredState};
 use regrind_core::model::PartPriors;
 
 /// Name of the file in a run folder.
@@ -40,12 +40,12 @@ pub struct Learned {
     pub kind: Option<String>,
     /// Cells that the knowledge comes from, if it is from other cells and not from a run of this one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub taught_by: Option<TaughtBy>,
+    pub taught_by: Option<KnowledgeOrigin>,
 }
 
 /// Origin of the knowledge that a first part begins with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct TaughtBy {
+pub struct KnowledgeOrigin {
     /// Cells, and the run of each.
     pub runs: Vec<CellRun>,
     /// For each band of wavelengths that was taken over: its shortest wavelength, in millimetres, and the rms share of
@@ -99,17 +99,17 @@ impl Learned {
     /// part of the map here.
     pub fn from_others(
         others: &[(CellRun, Self)],
-        alike: &Alike,
+        alike: &MachineSimilarity,
         (simulation, setting): (bool, String),
         (fresh, none): (&LearningState, Correction),
     ) -> Option<Self> {
         let known: Vec<&LearningState> = others.iter().map(|(_, other)| &other.known).collect();
-        let Shared { state: known, own_shares: differ } = fresh.begun_with(&known, alike, none.grid)?;
+        let TransferredState { state: known, own_shares: differ } = fresh.seeded_from(&known, alike, none.grid)?;
         let runs: Vec<CellRun> = others.iter().map(|(from, _)| from.clone()).collect();
         let fields: Vec<PartPriors> = others.iter().map(|(_, other)| other.fields).collect();
         let named: Vec<String> = runs.iter().map(|CellRun { cell, run }| format!("{run} of {cell}")).collect();
         let correction = none.compensating(&known, None);
-        let taught_by = Some(TaughtBy { runs, differ, comparisons: alike.comparisons() });
+        let taught_by = Some(KnowledgeOrigin { runs, differ, comparisons: alike.comparisons() });
         let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
@@ -149,7 +149,7 @@ impl Learned {
         if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting {
             return Ok(None);
         }
-        Self::of(&path, &text).map(|learned| Some((learned, text)))
+        Self::from_saved(&path, &text).map(|learned| Some((learned, text)))
     }
 
     /// Reads the knowledge of another cell's run, of this kind and simulation; `from` names its origin.
@@ -157,13 +157,13 @@ impl Learned {
     /// # Errors
     /// A text that is not one of Regrind's, that is of another kind, or that has impossible numbers.
     pub fn of_another(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
-        let learned = Self::of(from, text)?;
+        let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
             && learned.kind.as_deref() == Some(kind)
             && learned.simulation == simulation
             && learned.taught_by.is_none();
         let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
-        match learned.known.unfit_to_teach() {
+        match learned.known.transfer_obstacle() {
             _ if !is_meant => broken("it is of another kind of parts than requested".into()),
             Some(why) => broken(why),
             None => Ok(learned),
@@ -174,7 +174,7 @@ impl Learned {
     ///
     /// # Errors
     /// A text that is not one of Regrind's, or that has impossible numbers.
-    pub fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
+    pub fn from_saved(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
         let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
         let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
         match learned.flaw() {
@@ -212,7 +212,7 @@ impl Learned {
     /// the grid of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
-        let set = self.correction.set.as_ref().map(|set| Set {
+        let set = self.correction.set.as_ref().map(|set| ParameterCorrections {
             displaced_mm: on_grid(&set.displaced_mm),
             setting_mm: on_grid(&set.setting_mm),
             seen_mm: on_grid(&set.seen_mm),
@@ -226,7 +226,7 @@ impl Learned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use regrind_core::compensation::{ErrorMap, GainRule, MapOptions, Seen};
+    use regrind_core::compensation::{ErrorMap, GainRule, MapOptions, PassObservation};
     use regrind_core::geometry::Grid;
     use regrind_core::model::{Field, Hyperparameters};
 
@@ -237,7 +237,7 @@ mod tests {
         let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
         let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
         let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-        let known = begin.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+        let known = begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
         Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
     }
 
@@ -268,8 +268,8 @@ mod tests {
 
     #[test]
     fn what_others_found_is_begun_with_and_says_where_it_came_from() {
-        let mut alike = Alike::default();
-        alike.state(0.1);
+        let mut alike = MachineSimilarity::default();
+        alike.add_statement(0.1);
         let of = |cell: &str| {
             let from = CellRun { cell: cell.into(), run: format!("run-{cell}") };
             let text = serde_json::to_vec(&learned().of_kind("such parts".into())).unwrap();
@@ -286,7 +286,7 @@ mod tests {
         assert_eq!((told.runs.len(), told.comparisons), (2, 1));
         // The saved copy can be read back, and is not mistaken for the result of a run.
         let text = serde_json::to_vec(&begun).unwrap();
-        let back = Learned::of(Path::new("kept"), &text).unwrap();
+        let back = Learned::from_saved(Path::new("kept"), &text).unwrap();
         assert_eq!((&back.correction, &back.taught_by), (&begun.correction, &begun.taught_by));
         let kind = serde_json::to_vec(&begun.of_kind("such parts".into())).unwrap();
         assert!(Learned::of_another(Path::new("there"), &kind, "such parts", true).is_err());

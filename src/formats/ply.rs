@@ -137,7 +137,7 @@ impl Element {
     }
 
     /// Returns the minimum number of bytes of one item.
-    fn least_size(&self, encoding: Encoding) -> usize {
+    fn min_size(&self, encoding: Encoding) -> usize {
         let size = |p: &Property| if encoding == Encoding::Ascii { 2 } else { p.list.unwrap_or(p.scalar).size() };
         self.properties.iter().map(size).sum::<usize>().max(1)
     }
@@ -271,7 +271,7 @@ impl Header {
         let vertices = self.elements.iter().find(|e| e.name == "vertex").map_or(0, |e| e.count);
         // An element without properties has no bytes, so nothing bounds its count.
         for element in self.elements.iter().filter(|e| !e.properties.is_empty()) {
-            let reading = Reading { path, element, room: source.remaining() / element.least_size(self.encoding) };
+            let reading = Reading { path, element, room: source.remaining() / element.min_size(self.encoding) };
             match element.name.as_str() {
                 "vertex" => reading.vertices(source, &mut file)?,
                 "face" if indices_of(element).is_some() => reading.faces(source, &mut file.triangles, vertices)?,
@@ -472,7 +472,7 @@ impl<'a, const BIG: bool> Bytes<'a, BIG> {
         Self { data, at: 0, last: 0, start }
     }
 
-    fn take<const N: usize>(&mut self) -> Result<[u8; N], Fault> {
+    fn read_bytes<const N: usize>(&mut self) -> Result<[u8; N], Fault> {
         let Some(bytes) = self.data[self.at..].first_chunk::<N>() else {
             return Err(Fault { place: format!("byte {}", self.start + self.data.len()), found: None });
         };
@@ -494,14 +494,14 @@ impl<const BIG: bool> Source for Bytes<'_, BIG> {
     #[inline]
     fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault> {
         Ok(match scalar {
-            Scalar::I8 => i8::from_le_bytes(self.take()?).into(),
-            Scalar::U8 => u8::from_le_bytes(self.take()?).into(),
-            Scalar::I16 => i16::from_le_bytes(self.take()?).into(),
-            Scalar::U16 => u16::from_le_bytes(self.take()?).into(),
-            Scalar::I32 => i32::from_le_bytes(self.take()?).into(),
-            Scalar::U32 => u32::from_le_bytes(self.take()?).into(),
-            Scalar::F32 => f32::from_le_bytes(self.take()?).into(),
-            Scalar::F64 => f64::from_le_bytes(self.take()?),
+            Scalar::I8 => i8::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::U8 => u8::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::I16 => i16::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::U16 => u16::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::I32 => i32::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::U32 => u32::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::F32 => f32::from_le_bytes(self.read_bytes()?).into(),
+            Scalar::F64 => f64::from_le_bytes(self.read_bytes()?),
         })
     }
 

@@ -195,14 +195,14 @@ impl<'p> Cloud<'p> {
             // One thread reads ahead while the others parse.
             let lines = self.whole_lines(&batch)?;
             let (text, tail) = batch.bytes[batch.begin..].split_at(lines);
-            let (taken, read) = rayon::join(|| self.take(text, total), || next.read(tail, &mut reader));
+            let (taken, read) = rayon::join(|| self.parse_lines(text, total), || next.read(tail, &mut reader));
             taken?;
             total += read.map_err(unreadable)? as u64;
             self.check_size(total)?;
             std::mem::swap(&mut batch, &mut next);
         }
         let text = &batch.bytes[batch.begin..batch.end];
-        self.take(text, total)?;
+        self.parse_lines(text, total)?;
         let notes = self.notes(text);
         Ok(NotedPoints { notes, points: self.finish()? })
     }
@@ -228,7 +228,7 @@ impl<'p> Cloud<'p> {
         let mut lines = text.rsplit(|&b| b == b'\n');
         let last =
             lines.next().filter(|line| line.last().is_some_and(|b| !b.is_ascii_whitespace()) && !is_comment(line))?;
-        let number = |line| Fields::of(line, layout.separator).last().unwrap_or_default();
+        let number = |line| Fields::new(line, layout.separator).last().unwrap_or_default();
         let data = lines.filter(|line| !line.trim_ascii().is_empty() && !is_comment(line)).take(ABOVE);
         let above: Vec<[usize; 2]> =
             data.filter(|line| looks_numeric(number(line))).map(|line| digits_after(number(line))).collect();
@@ -248,13 +248,13 @@ impl<'p> Cloud<'p> {
             return Ok(lines);
         }
         // The lines before it can contain an earlier error, and are needed to count its line number.
-        self.take(&text[..lines], BATCH as u64)?;
+        self.parse_lines(&text[..lines], BATCH as u64)?;
         let line = self.lines + 1;
         Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
     }
 
     /// Parses whole lines; only the very last line of the file can lack its line end.
-    fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
+    fn parse_lines(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
         let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
         if let Some(line) = self.empty_from {
@@ -300,7 +300,7 @@ impl<'p> Cloud<'p> {
             let (line, used, _) = first_line(rest);
             let number = self.lines + 1;
             check_line(self.path, number, line)?;
-            if let Some(mut layout) = self.preamble.take(line, number)? {
+            if let Some(mut layout) = self.preamble.read_line(line, number)? {
                 match self.decimal {
                     Some(decimal) => layout.decimal = decimal,
                     None => layout.settle_decimal(self.path, rest)?,

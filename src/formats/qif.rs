@@ -80,7 +80,7 @@ struct Qif<'p, 'a, 'i> {
 
 /// Points and their meaning.
 #[derive(Default)]
-struct Found {
+struct QifPoints {
     points: Vec<Point>,
     names: Option<Vec<String>>,
     coordinates: Option<Coordinates>,
@@ -94,7 +94,7 @@ impl Qif<'_, '_, '_> {
             let name = node.attribute("name").map(|name| name.replace(['_', '-'], " ").to_lowercase());
             let ours = name.as_deref().and_then(|name| name.strip_prefix(OURS));
             if let (Some(key), Some(value)) = (ours, node.attribute("value")) {
-                says.take(self.path, line(node), key, value.trim())?;
+                says.read_statement(self.path, line(node), key, value.trim())?;
             }
         }
         Ok(says)
@@ -161,8 +161,8 @@ impl Qif<'_, '_, '_> {
         }
     }
 
-    fn sets(&self, sets: &[Node<'_, '_>], unit_mm: f64) -> Result<Found, FormatError> {
-        let mut found = Found::default();
+    fn sets(&self, sets: &[Node<'_, '_>], unit_mm: f64) -> Result<QifPoints, FormatError> {
+        let mut found = QifPoints::default();
         for set in sets {
             if child(*set, "CoordinateSystemId").or(child(*set, "TranformId")).is_some() {
                 let expected = "points in the frame of the document, which is the machine's";
@@ -204,7 +204,7 @@ impl Qif<'_, '_, '_> {
     }
 
     /// Stores if points are compensated, and the radius of the probe; all sets must agree.
-    fn what_they_are(&self, set: Node<'_, '_>, unit_mm: f64, found: &mut Found) -> Result<(), FormatError> {
+    fn what_they_are(&self, set: Node<'_, '_>, unit_mm: f64, found: &mut QifPoints) -> Result<(), FormatError> {
         if let Some(compensated) = child(set, "Compensated") {
             let says = match compensated.text().unwrap_or_default().trim() {
                 "true" | "1" => Coordinates::Contacts,
@@ -231,12 +231,12 @@ impl Qif<'_, '_, '_> {
     }
 
     /// Reads measured point features, each with the name of its item.
-    fn features(&self, unit_mm: f64) -> Result<Found, FormatError> {
+    fn features(&self, unit_mm: f64) -> Result<QifPoints, FormatError> {
         let name = |node: Node<'_, '_>| child(node, "FeatureName").and_then(|name| name.text()).map(str::to_owned);
         let items = self.named("PointFeatureItem");
         let items: HashMap<_, _> =
             items.filter_map(|item| Some((item.attribute("id")?.to_owned(), name(item)?))).collect();
-        let (mut found, mut names) = (Found::default(), Vec::new());
+        let (mut found, mut names) = (QifPoints::default(), Vec::new());
         for feature in self.named("PointFeatureMeasurement") {
             let Some(location) = child(feature, "Location") else { continue };
             let there = found.points.len();
@@ -247,7 +247,7 @@ impl Qif<'_, '_, '_> {
             let item = child(feature, "FeatureItemId").and_then(|item| item.text()).unwrap_or_default().trim();
             names.push(items.get(item).cloned().unwrap_or_default());
         }
-        Ok(Found { names: Some(names), ..found })
+        Ok(QifPoints { names: Some(names), ..found })
     }
 }
 

@@ -176,7 +176,7 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
             _ => continue,
         };
         if let Some((key, value)) = comment.split_once([':', '=']) {
-            found.take(path, number, key, value.trim())?;
+            found.read_statement(path, number, key, value.trim())?;
         }
     }
     Ok(found)
@@ -184,7 +184,7 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
 
 impl Statements {
     /// Reads one statement; any other comment is ignored.
-    pub(super) fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
+    pub(super) fn read_statement(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
         let wrong = |key, expected| FormatError::Statement {
             path: path.to_owned(),
             line,
@@ -339,7 +339,7 @@ struct OtherColumns {
 
 /// Returns the indices of the other columns that the header names: index, name, enabled, radius and diameter of the
 /// probe.
-fn beside(names: &[String]) -> [Option<usize>; 5] {
+fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
     let wanted: [&[&str]; 5] = [
         &["index", "target"],
         &["name", "point", "feature"],
@@ -364,11 +364,11 @@ impl OtherColumns {
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
         let (first, mut layout) = loop {
             let Some((line, number)) = lines.next() else { return Ok(Self::default()) };
-            if let Some(layout) = preamble.take(line, number)? {
+            if let Some(layout) = preamble.read_line(line, number)? {
                 break ((line, number), layout);
             }
         };
-        let columns = beside(&preamble.names(layout.separator));
+        let columns = other_column_indices(&preamble.names(layout.separator));
         if columns.iter().all(Option::is_none) {
             return Ok(Self::default());
         }
@@ -390,7 +390,7 @@ impl OtherColumns {
             if line.trim_ascii().is_empty() || is_comment(line) {
                 continue;
             }
-            let field = |column: usize| Fields::of(line, layout.separator).nth(column).unwrap_or_default();
+            let field = |column: usize| Fields::new(line, layout.separator).nth(column).unwrap_or_default();
             found.enabled.push(enabled.is_none_or(|c| is_on(field(c))));
             if let (Some(column), Some(indices)) = (index, &mut found.indices) {
                 indices.push(whole_number(path, number, field(column))?);

@@ -30,7 +30,7 @@ impl Artefact {
     ///
     /// # Errors
     /// The name is not a plain relative path, the file cannot be read, or the disk fails.
-    pub fn of(folder: &Path, name: &str) -> Result<Self, JournalError> {
+    pub fn from_file(folder: &Path, name: &str) -> Result<Self, JournalError> {
         let path = path_within(folder, name)?;
         sync_file(&path)?;
         describe(&path, name)

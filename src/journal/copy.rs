@@ -15,7 +15,7 @@ impl Record {
     /// Parses a record from its hashed text, its own hash and the hash of the record before it. Returns `None` if the
     /// text is not byte for byte a text that the journal writes. Does not check that the hash matches the text:
     /// `verify` does.
-    pub fn of_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
+    pub fn from_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
         let value: Value = serde_json::from_str(text).ok()?;
         let word = |key: &str| value[key].as_str().map(str::to_owned);
         let number = |key: &str| value[key].as_u64();
@@ -82,7 +82,7 @@ pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), Jou
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Against, AuditKey, Entry, Header, Journal, Kind, Reader, verify_against};
+    use super::super::{ExternalEvidence, AuditKey, Entry, Header, Journal, Kind, Reader, verify_against};
     use super::*;
     use serde_json::json;
 
@@ -112,10 +112,10 @@ mod tests {
         let anchor = journal.close(400, 1, json!("accepted")).unwrap();
         let records: Vec<Record> = Reader::open(&from).unwrap().records(1).map(Result::unwrap).collect();
         assert_eq!(Reader::open(&from).unwrap().last().unwrap().as_ref(), records.last());
-        let told = records.iter().map(|r| Record::of_text(&r.text(), &r.prev_hash, &r.hash).unwrap());
+        let told = records.iter().map(|r| Record::from_text(&r.text(), &r.prev_hash, &r.hash).unwrap());
         restore(&to, told, Some(&anchor)).unwrap();
         restore_file(&to, "cycle-1/points.csv", b"1,2\n").unwrap();
-        let against = Against { anchor: Some(anchor), keys: vec![key.public()] };
+        let against = ExternalEvidence { anchor: Some(anchor), keys: vec![key.public()] };
         let mut there = verify_against(&from, &against).unwrap();
         there.under_way = false;
         assert_eq!(verify_against(&to, &against).unwrap(), there);
@@ -129,7 +129,7 @@ mod tests {
         drop(Journal::create(home.path().join("run"), header("run")).unwrap());
         let record = Reader::open(home.path().join("run")).unwrap().records(1).next().unwrap().unwrap();
         let text = record.text();
-        let of = |text: &str| Record::of_text(text, &record.prev_hash, &record.hash);
+        let of = |text: &str| Record::from_text(text, &record.prev_hash, &record.hash);
         assert_eq!(of(&text).as_ref(), Some(&record));
         for other in [
             text.replace("\"seq\":1", "\"seq\": 1"),

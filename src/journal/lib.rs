@@ -28,7 +28,7 @@ mod canonical;
 mod clock;
 mod copy;
 mod error;
-mod held;
+mod locked_file;
 mod key;
 mod lost;
 mod machine;
@@ -50,7 +50,7 @@ pub use machine::MachineLock;
 pub use open::{free_bytes, is_open_to_all};
 pub use record::{Entry, Kind, Record, Records};
 pub use seal::SEALED_EVERY;
-pub use verify::{Against, Anchor, Verified, anchor_of, is_driven, verify, verify_against};
+pub use verify::{ExternalEvidence, Anchor, Verified, anchor_of, is_driven, verify, verify_against};
 pub use write::{Header, Journal, RunLock};
 
 use std::path::Path;

@@ -19,7 +19,7 @@ const MAGIC: [u32; 2] = [0x377f_0682, 0x377f_0683];
 const LOG_VERSION: u32 = 3_007_000;
 const PAGES: std::ops::RangeInclusive<usize> = 512..=65_536;
 /// Maximum number of bytes of the log that are examined.
-const MOST_OF_LOG: u64 = 256 << 20;
+const MAX_LOG_BYTES: u64 = 256 << 20;
 
 /// Returns why acknowledged records of an unfinished run could be lost, or `None` if there is no sign of a loss. The
 /// program that wrote these records had seen that they were on the disk. Call this only while no process drives the
@@ -39,7 +39,7 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
         )));
     }
     let mut bytes = Vec::new();
-    let read = File::open(&log).and_then(|file| file.take(MOST_OF_LOG).read_to_end(&mut bytes));
+    let read = File::open(&log).and_then(|file| file.take(MAX_LOG_BYTES).read_to_end(&mut bytes));
     read.map_err(JournalError::file(&log, "reading it"))?;
     Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }

@@ -9,7 +9,7 @@ use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
 use super::error::JournalError;
-use super::held::HeldFile;
+use super::locked_file::LockedFile;
 use super::system::{LockFile, LockFolder};
 use super::{sha256_hex, system};
 
@@ -20,14 +20,14 @@ use super::{sha256_hex, system};
 #[derive(Debug)]
 pub struct MachineLock {
     /// Both locked files. They are held, not read.
-    held: Vec<HeldFile>,
+    held: Vec<LockedFile>,
     /// The files that store the holder and the epoch.
-    told: Vec<File>,
+    holder_files: Vec<File>,
     holder: String,
     last_epoch: u32,
     notes: Vec<String>,
     /// Path of the control socket next to the lock file of this user.
-    door: PathBuf,
+    control_socket: PathBuf,
 }
 
 const FOLDER: &str = "regrind-machines";
@@ -37,7 +37,7 @@ const EPOCH: &str = "epoch ";
 /// computer.
 const EPOCH_BITS: u32 = 31;
 /// Maximum number of bytes that are read of the holder and the epoch.
-const MOST_TOLD: u64 = 4096;
+const MAX_HOLDER_BYTES: u64 = 4096;
 /// Number of file names of this user that are tried if others occupied some of them.
 const OWN_FILES: usize = 16;
 /// Number of attempts to open a file again if it was removed while it was being locked.
@@ -55,9 +55,9 @@ impl MachineLock {
     ///
     /// # Errors
     /// Another run has the machine (the error names it), or no folder for locks can be used.
-    pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
+    pub fn acquire(address: &str, run: &Path) -> Result<Self, JournalError> {
         // If there is no place that all users share, the user's own place is better than no lock.
-        Self::take_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
+        Self::acquire_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
     /// Returns an epoch for the client of these machines: higher than every epoch that a client of this computer used
@@ -71,13 +71,13 @@ impl MachineLock {
 
     /// Returns the path of the control socket next to the lock. There the cell that has this machine can be reached
     /// even if its run folder is gone.
-    pub fn door(&self) -> &Path {
-        &self.door
+    pub fn control_socket(&self) -> &Path {
+        &self.control_socket
     }
 
     /// Returns the cells of this user that have machines on this computer: the folder of the run, and the path of the
     /// control socket next to its lock. The list can contain a killed cell, whose socket has no listener.
-    pub fn doors() -> Vec<(PathBuf, PathBuf)> {
+    pub fn control_sockets() -> Vec<(PathBuf, PathBuf)> {
         system::place_of_locks(FOLDER).map_or_else(Vec::new, |place| Self::doors_in(&place.join(FOLDER)))
     }
 
@@ -101,7 +101,7 @@ impl MachineLock {
         &self.notes
     }
 
-    fn take_in(place: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
+    fn acquire_in(place: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
         let path = place.join(FOLDER);
         let folder = LockFolder::open(place, FOLDER).map_err(|bad| JournalError::LockFolder {
             path: path.clone(),
@@ -111,15 +111,15 @@ impl MachineLock {
         let machine = &sha256_hex(address.as_bytes())[..16];
         let mut lock = Self {
             held: Vec::new(),
-            told: Vec::new(),
+            holder_files: Vec::new(),
             holder: format!("{}{PROCESS}{}", run.display(), std::process::id()),
             last_epoch: 0,
             notes: Vec::new(),
-            door: PathBuf::new(),
+            control_socket: PathBuf::new(),
         };
         let (shared, own): (Opens, Opens) = (LockFolder::shared, LockFolder::own);
         let name = format!("{machine}.lock");
-        if let Err(what) = lock.hold(&folder, (&name, shared), (&path, address))? {
+        if let Err(what) = lock.lock_file(&folder, (&name, shared), (&path, address))? {
             lock.note(&path.join(&name), &what);
         }
         let own_name = |k: usize| match k {
@@ -127,9 +127,9 @@ impl MachineLock {
             k => format!("{machine}.{}-{k}.lock", LockFolder::own_mark()),
         };
         for name in (0..OWN_FILES).map(own_name) {
-            match lock.hold(&folder, (&name, own), (&path, address))? {
+            match lock.lock_file(&folder, (&name, own), (&path, address))? {
                 Ok(()) => {
-                    lock.door = path.join(&name).with_extension(DOOR);
+                    lock.control_socket = path.join(&name).with_extension(DOOR);
                     lock.write(lock.last_epoch);
                     return Ok(lock);
                 }
@@ -142,7 +142,7 @@ impl MachineLock {
 
     /// Locks a file and reads the epoch that it stores. Returns the reason in the inner `Err` if something else is in
     /// its place.
-    fn hold(
+    fn lock_file(
         &mut self,
         folder: &LockFolder,
         (name, open): (&str, Opens),
@@ -155,7 +155,7 @@ impl MachineLock {
                 Err(what) => return Ok(Err(what)),
             };
             let told = file.told.as_ref().unwrap_or(&file.lock);
-            let held = match HeldFile::take(again(&file.lock, &path)?) {
+            let held = match LockedFile::lock(again(&file.lock, &path)?) {
                 Ok(held) => held,
                 Err(TryLockError::WouldBlock) => {
                     let who = text_of(told).lines().next().unwrap_or_default().trim().to_owned();
@@ -176,7 +176,7 @@ impl MachineLock {
                 self.believe(&text_of(told), &path);
             }
             self.held.push(held);
-            self.told.extend(file.told);
+            self.holder_files.extend(file.told);
             return Ok(Ok(()));
         }
         Ok(Err("it is removed repeatedly".to_owned()))
@@ -200,7 +200,7 @@ impl MachineLock {
     /// also reports its last epoch, and the lock is valid without them.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
-        for mut file in &self.told {
+        for mut file in &self.holder_files {
             // The file is never empty in between: a process that is killed here does not lose the stored epoch.
             let _ = file
                 .rewind()
@@ -217,7 +217,7 @@ fn again(file: &File, path: &Path) -> Result<File, JournalError> {
 
 fn text_of(mut file: &File) -> String {
     let mut bytes = Vec::new();
-    let _ = file.rewind().and_then(|()| file.take(MOST_TOLD).read_to_end(&mut bytes));
+    let _ = file.rewind().and_then(|()| file.take(MAX_HOLDER_BYTES).read_to_end(&mut bytes));
     String::from_utf8_lossy(&bytes).into_owned()
 }
 
@@ -228,7 +228,7 @@ mod tests {
     #[test]
     fn a_machine_is_taken_once_and_who_has_it_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        let take = |address, run| MachineLock::take_in(folder.path(), address, Path::new(run));
+        let take = |address, run| MachineLock::acquire_in(folder.path(), address, Path::new(run));
         let first = take("grinder at 10.0.0.6:502, unit 1", "runs/a").unwrap();
         assert_eq!(first.notes(), [""; 0]);
         take("grinder at 10.0.0.7:502, unit 1", "runs/b").unwrap();
@@ -243,20 +243,20 @@ mod tests {
     fn a_cell_is_found_by_its_lock_where_a_door_lies_beside_it() {
         let place = tempfile::tempdir().unwrap();
         let run = Path::new("/home/anna/runs, old/a, process 7");
-        let lock = MachineLock::take_in(place.path(), "grinder at 10.0.0.6:502, unit 1", run).unwrap();
+        let lock = MachineLock::acquire_in(place.path(), "grinder at 10.0.0.6:502, unit 1", run).unwrap();
         let folder = place.path().join(FOLDER);
         assert_eq!(MachineLock::doors_in(&folder), []);
-        std::fs::write(lock.door(), "").unwrap();
+        std::fs::write(lock.control_socket(), "").unwrap();
         // Another socket, without a lock file next to it.
         std::fs::write(folder.join("other.sock"), "").unwrap();
-        assert_eq!(MachineLock::doors_in(&folder), [(run.to_owned(), lock.door().to_owned())]);
+        assert_eq!(MachineLock::doors_in(&folder), [(run.to_owned(), lock.control_socket().to_owned())]);
         assert_eq!(MachineLock::doors_in(&place.path().join("absent")), []);
     }
 
     #[test]
     fn an_epoch_rises_for_each_machine_whatever_the_clock_does() {
         let folder = tempfile::tempdir().unwrap();
-        let take = |address: &str| MachineLock::take_in(folder.path(), address, Path::new("runs/a")).unwrap();
+        let take = |address: &str| MachineLock::acquire_in(folder.path(), address, Path::new("runs/a")).unwrap();
         let epoch = |addresses: &[&str], clock| {
             let machines: Vec<_> = addresses.iter().map(|address| take(address)).collect();
             MachineLock::epoch(&machines, clock)
@@ -303,7 +303,7 @@ mod strangers {
     /// Takes the machine, and checks that a second run of this user cannot take it, and that the owner's file is
     /// unchanged.
     fn taken(place: &Path, precious: &Path) -> MachineLock {
-        let take = || MachineLock::take_in(place, ADDRESS, Path::new("runs/a"));
+        let take = || MachineLock::acquire_in(place, ADDRESS, Path::new("runs/a"));
         let lock = take().unwrap();
         assert!(matches!(take(), Err(JournalError::MachineTaken { .. })));
         assert_eq!(MachineLock::epoch([&lock], 1000), 1000);
@@ -342,7 +342,7 @@ mod strangers {
         let refused = |lay: &dyn Fn(&Path, &Path)| {
             let (place, folder, precious) = place();
             lay(&folder, place.path());
-            let refused = MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err();
+            let refused = MachineLock::acquire_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err();
             assert!(refused.to_string().contains("chown -h root:root"), "{refused}");
             assert_eq!(fs::read_to_string(precious).unwrap(), "precious");
             refused.to_string()
@@ -371,10 +371,10 @@ mod strangers {
     fn what_was_there_keeps_its_mode_and_what_is_made_is_for_all() {
         let (place, folder, _) = place();
         fs::set_permissions(&folder, fs::Permissions::from_mode(0o700)).unwrap();
-        drop(MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap());
+        drop(MachineLock::acquire_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap());
         assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o7777, 0o700);
         let fresh = tempfile::tempdir().unwrap();
-        drop(MachineLock::take_in(fresh.path(), ADDRESS, Path::new("runs/a")).unwrap());
+        drop(MachineLock::acquire_in(fresh.path(), ADDRESS, Path::new("runs/a")).unwrap());
         let folder = fresh.path().join(FOLDER);
         assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o7777, 0o1777);
         assert_eq!(fs::metadata(folder.join(name())).unwrap().mode() & 0o777, 0o666);
@@ -420,7 +420,7 @@ mod strangers {
         let mut said = String::new();
         BufReader::new(holder.stdout.take().unwrap()).read_line(&mut said).unwrap();
         assert_eq!(said, "held\n");
-        let refused = MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err().to_string();
+        let refused = MachineLock::acquire_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err().to_string();
         assert!(refused.contains("number 65534"), "{refused}");
         drop(holder.stdin.take());
         holder.wait().unwrap();
@@ -452,7 +452,7 @@ mod strangers {
                 .success()
         );
         assert!(matches!(
-            MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/b")),
+            MachineLock::acquire_in(place.path(), ADDRESS, Path::new("runs/b")),
             Err(JournalError::MachineTaken { .. })
         ));
         drop(lock);
@@ -468,6 +468,6 @@ mod strangers {
     }
 
     fn taken_again(place: &Path) -> MachineLock {
-        MachineLock::take_in(place, ADDRESS, Path::new("runs/b")).unwrap()
+        MachineLock::acquire_in(place, ADDRESS, Path::new("runs/b")).unwrap()
     }
 }

@@ -71,7 +71,7 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     let connection = Connection::open_with_flags(&path, flags).map_err(&failed)?;
     configure(&connection, &path)?;
     check_schema(&connection, &path)?;
-    bring_in_the_log(&connection).map_err(&failed)?;
+    checkpoint_log(&connection).map_err(&failed)?;
     keep_the_log(&connection, true).map_err(&failed)?;
     if layout < LAYOUT {
         // An earlier version may not know the records that are written from here on.
@@ -83,7 +83,7 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
 /// Writes the whole log into the database, and restarts the log. After a failed sync the operating system can drop a
 /// part of the log that is not yet on the disk, and still show it to readers. Records written after that part cannot be
 /// read after a power failure. While another process reads, the log stays as it is.
-fn bring_in_the_log(connection: &Connection) -> rusqlite::Result<()> {
+fn checkpoint_log(connection: &Connection) -> rusqlite::Result<()> {
     // RESTART keeps the length of the log file. A missing or empty log of an interrupted run therefore shows that
     // somebody removed it.
     run(connection, "PRAGMA wal_checkpoint(RESTART)")

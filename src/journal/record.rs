@@ -206,7 +206,7 @@ impl Record {
     }
 
     /// Computes the hash that this record must have.
-    pub(super) fn hash_due(&self) -> String {
+    pub(super) fn expected_hash(&self) -> String {
         chain(&self.prev_hash, &self.text())
     }
 
@@ -242,13 +242,13 @@ impl Record {
 
     /// Returns the fault of this record as the successor of `records` records, of which the last has the hash `head`;
     /// `None` if it has no fault.
-    pub(super) fn flaw_behind(&self, records: u64, head: &str) -> Option<String> {
+    pub(super) fn successor_flaw(&self, records: u64, head: &str) -> Option<String> {
         let due = records + 1;
         if self.seq != due {
             Some(format!("it is missing: record {} follows {records}", self.seq))
         } else if self.prev_hash != head {
             Some("it does not follow the record before it: one of them was changed, moved, inserted or removed".into())
-        } else if self.hash != self.hash_due() {
+        } else if self.hash != self.expected_hash() {
             Some("its content was changed".into())
         } else {
             None
@@ -303,7 +303,7 @@ fn record_of(row: &Row<'_>) -> rusqlite::Result<Record> {
 }
 
 /// Maximum number of records that are read at once.
-const LARGEST_PAGE: u32 = 512;
+const MAX_PAGE_RECORDS: u32 = 512;
 
 /// Iterator over the records of a journal, in order. It reads one page at a time and keeps no transaction open between
 /// two pages. So it never blocks a writer, and it finds the records that a writer adds in the meantime.
@@ -332,7 +332,7 @@ impl<'j> Records<'j> {
             self.over = true;
         }
         self.over |= self.page.is_empty();
-        self.size = (2 * self.size).min(LARGEST_PAGE);
+        self.size = (2 * self.size).min(MAX_PAGE_RECORDS);
     }
 
     fn read(&mut self) -> Result<(), JournalError> {

@@ -54,7 +54,7 @@ impl Anchor {
 
 /// External evidence to verify a journal against, in addition to the journal itself and the anchor in its folder.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Against {
+pub struct ExternalEvidence {
     /// Anchor that was kept elsewhere.
     pub anchor: Option<Anchor>,
     /// Keys that are trusted to sign. If empty, every key that the journal names is accepted.
@@ -101,7 +101,7 @@ impl Verified {
 /// # Errors
 /// [`JournalError::Broken`] with the first record that fails; the journal cannot be read.
 pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
-    verify_against(folder, &Against::default())
+    verify_against(folder, &ExternalEvidence::default())
 }
 
 /// Verifies a journal as [`verify`] does, and also against external evidence.
@@ -109,7 +109,7 @@ pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
 /// # Errors
 /// Those of [`verify`]; [`JournalError::NoAuthor`] if the journal is intact, but not signed with one of the trusted
 /// keys.
-pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Verified, JournalError> {
+pub fn verify_against(folder: impl AsRef<Path>, against: &ExternalEvidence) -> Result<Verified, JournalError> {
     let folder = folder.as_ref();
     let beside = read_anchor(folder)?;
     let anchors: Vec<&Anchor> = beside.iter().chain(&against.anchor).collect();
@@ -137,7 +137,7 @@ pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError>
 }
 
 /// Maximum length of an anchor file, in bytes.
-const MOST_OF_ANCHOR: u64 = 4096;
+const MAX_ANCHOR_BYTES: u64 = 4096;
 
 /// Reads at most [`MOST_OF_ANCHOR`] bytes of a file. Rejects a path that is not a regular file, which could have no
 /// end.
@@ -146,7 +146,7 @@ fn read_few(path: &Path) -> io::Result<Vec<u8>> {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"));
     }
     let mut bytes = Vec::new();
-    fs::File::open(path)?.take(MOST_OF_ANCHOR).read_to_end(&mut bytes)?;
+    fs::File::open(path)?.take(MAX_ANCHOR_BYTES).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 
@@ -156,7 +156,7 @@ fn broken(folder: &Path, seq: u64, what: impl Into<String>) -> JournalError {
 
 /// State of the verification after the records read so far.
 #[derive(Clone)]
-struct Seen<'a> {
+struct VerifierState<'a> {
     folder: &'a Path,
     /// Keys that are trusted to sign. If empty, every key that the journal names is accepted.
     trusted: &'a [PublicKey],
@@ -183,12 +183,12 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     let reader = Reader::open(folder)?;
     // Checked before anything is read: a run that no process drives does not change any more.
     let under_way = is_driven(folder);
-    let mut seen = Seen::nothing(folder, trusted);
+    let mut seen = VerifierState::new(folder, trusted);
     let mut anchored = 0;
     for record in reader.records(1) {
-        seen.take(&record?)?;
+        seen.check_record(&record?)?;
         for anchor in anchors.iter().filter(|anchor| anchor.records == seen.records) {
-            seen.take_anchor(anchor)?;
+            seen.check_anchor(anchor)?;
             anchored = seen.records;
         }
     }
@@ -206,7 +206,7 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     if let Some(what) = seen.no_author {
         return Err(JournalError::NoAuthor { path: folder.to_owned(), what });
     }
-    let Seen { records, head, ended, artefacts, names, open, keys, seals, signed, .. } = seen;
+    let VerifierState { records, head, ended, artefacts, names, open, keys, seals, signed, .. } = seen;
     Ok(Verified {
         records,
         head,
@@ -262,8 +262,8 @@ fn is_own(name: &str) -> bool {
     name.starts_with(DATABASE) || [ANCHOR, LOCK, &temporary_name(ANCHOR)].contains(&name)
 }
 
-impl<'a> Seen<'a> {
-    fn nothing(folder: &'a Path, trusted: &'a [PublicKey]) -> Self {
+impl<'a> VerifierState<'a> {
+    fn new(folder: &'a Path, trusted: &'a [PublicKey]) -> Self {
         Self {
             folder,
             trusted,
@@ -284,10 +284,10 @@ impl<'a> Seen<'a> {
         }
     }
 
-    fn take(&mut self, record: &Record) -> Result<(), JournalError> {
+    fn check_record(&mut self, record: &Record) -> Result<(), JournalError> {
         let due = self.records + 1;
         let wrong = |what: &str| Err(broken(self.folder, due, what));
-        if let Some(flaw) = record.flaw_behind(self.records, &self.head) {
+        if let Some(flaw) = record.successor_flaw(self.records, &self.head) {
             return wrong(&flaw);
         }
         if (record.kind == Kind::Begin) != (due == 1) {
@@ -301,10 +301,10 @@ impl<'a> Seen<'a> {
             return wrong("its payload is not JSON");
         }
         match record.kind {
-            Kind::Begin | Kind::Reopen => self.take_key(record)?,
-            Kind::Intent | Kind::Outcome => self.take_command(record)?,
-            Kind::Artefact => self.take_artefact(record)?,
-            Kind::Seal => self.take_seal(record)?,
+            Kind::Begin | Kind::Reopen => self.check_key(record)?,
+            Kind::Intent | Kind::Outcome => self.check_command(record)?,
+            Kind::Artefact => self.check_artefact(record)?,
+            Kind::Seal => self.check_seal(record)?,
             Kind::Event | Kind::Note | Kind::End => {}
         }
         self.records = due;
@@ -315,7 +315,7 @@ impl<'a> Seen<'a> {
         Ok(())
     }
 
-    fn take_key(&mut self, record: &Record) -> Result<(), JournalError> {
+    fn check_key(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
         let value = record.value();
         if record.kind == Kind::Begin {
@@ -340,7 +340,7 @@ impl<'a> Seen<'a> {
         Ok(())
     }
 
-    fn take_seal(&mut self, record: &Record) -> Result<(), JournalError> {
+    fn check_seal(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
         let Ok(seal) = serde_json::from_str::<Seal>(&record.payload) else { return wrong("it is not a valid seal") };
         let Some(key) = self.key.filter(|key| key.to_string() == seal.key) else {
@@ -358,7 +358,7 @@ impl<'a> Seen<'a> {
     }
 
     /// Checks the state so far against an anchor with the same number of records.
-    fn take_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
+    fn check_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, self.records, what));
         if anchor.run.as_ref().is_some_and(|run| *run != self.run) {
             return wrong("the anchor is of another run");
@@ -378,7 +378,7 @@ impl<'a> Seen<'a> {
         }
     }
 
-    fn take_command(&mut self, record: &Record) -> Result<(), JournalError> {
+    fn check_command(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
         match (record.kind, record.command_id) {
             (Kind::Intent, None) => return wrong("a command has no number"),
@@ -397,7 +397,7 @@ impl<'a> Seen<'a> {
         Ok(())
     }
 
-    fn take_artefact(&mut self, record: &Record) -> Result<(), JournalError> {
+    fn check_artefact(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
         let Ok(known) = serde_json::from_str::<Artefact>(&record.payload) else {
             return wrong("it names no file".to_owned());
@@ -470,10 +470,10 @@ mod tests {
     }
 
     /// Returns the number of the record at which the verification fails, continued from an earlier state.
-    fn breaks_at(connection: &Connection, seen: &Seen<'_>, records: u64) -> Option<u64> {
+    fn breaks_at(connection: &Connection, seen: &VerifierState<'_>, records: u64) -> Option<u64> {
         let mut seen = seen.clone();
         for record in Records::new(connection, seen.folder, seen.records + 1) {
-            if let Err(JournalError::Broken { seq, .. }) = record.and_then(|record| seen.take(&record)) {
+            if let Err(JournalError::Broken { seq, .. }) = record.and_then(|record| seen.check_record(&record)) {
                 return Some(seq);
             }
         }
@@ -495,7 +495,7 @@ mod tests {
         let file = folder.join(DATABASE);
         database.execute("ATTACH ?1 AS written", [file.to_str().unwrap()]).unwrap();
         database.execute_batch("INSERT INTO main.record SELECT * FROM written.record").unwrap();
-        let mut seen = Seen::nothing(&folder, &[]);
+        let mut seen = VerifierState::new(&folder, &[]);
         let (mut bits, mut impossible) = (0, 0);
         for seq in 1..=records {
             for column in COLUMNS.split(", ") {
@@ -521,7 +521,7 @@ mod tests {
                 }
             }
             let record = Records::new(&database, &folder, seq).next().unwrap().unwrap();
-            seen.take(&record).unwrap();
+            seen.check_record(&record).unwrap();
         }
         assert!(bits > 190_000 && impossible < 1_000, "{bits} bits, {impossible} impossible");
     }

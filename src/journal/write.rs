@@ -12,7 +12,7 @@ use super::artefact::{self, Artefact};
 use super::canonical::canonical_json;
 use super::clock::utc;
 use super::error::JournalError;
-use super::held::HeldFile;
+use super::locked_file::LockedFile;
 use super::key::AuditKey;
 use super::record::{Entry, Kind, Record, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
@@ -44,7 +44,7 @@ pub struct Journal {
     connection: Connection,
     folder: PathBuf,
     /// Held, not read.
-    _lock: HeldFile,
+    _lock: LockedFile,
     boot_id: String,
     run: String,
     part: String,
@@ -76,7 +76,7 @@ struct Tail {
 }
 
 impl Tail {
-    fn of_nothing() -> Self {
+    fn empty() -> Self {
         Self { seq: 0, mono_ns: 0, cycle: 0, hash: "0".repeat(64), last_command_id: None, closed: false }
     }
 }
@@ -115,7 +115,7 @@ impl Journal {
             part,
             first_command_id,
             key,
-            tail: Tail::of_nothing(),
+            tail: Tail::empty(),
             seal: None,
             anchored: 0,
             doubtful: None,
@@ -146,7 +146,7 @@ impl Journal {
     /// # Errors
     /// Those of [`Journal::open`].
     pub fn open_with(folder: impl AsRef<Path>, key: Option<AuditKey>) -> Result<Self, JournalError> {
-        Self::open_locked(RunLock::take(folder)?, key)
+        Self::open_locked(RunLock::acquire(folder)?, key)
     }
 
     /// Opens a journal as [`Journal::open_with`] does, for a caller that already holds the lock of the run.
@@ -246,7 +246,7 @@ impl Journal {
     /// Those of [`Journal::append`]: then the command must not be executed.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
         let entry = Entry { kind: Kind::Intent, ..entry };
-        let stands = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry));
+        let stands = self.reread_tail()?.filter(|record| record.is_of(&entry));
         if let Some(id) = stands.and_then(|record| record.command_id) {
             return Ok(id);
         }
@@ -288,7 +288,7 @@ impl Journal {
     /// # Errors
     /// Those of [`Journal::store`].
     pub fn adopt(&mut self, name: &str, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
-        self.adopt_known(Artefact::of(&self.folder, name)?, mono_ns, cycle)
+        self.adopt_known(Artefact::from_file(&self.folder, name)?, mono_ns, cycle)
     }
 
     /// Records a file that [`Artefact::of`] has already synced to the disk and read.
@@ -309,7 +309,7 @@ impl Journal {
     /// # Errors
     /// The disk is full or not writable.
     pub fn anchor(&mut self) -> Result<Anchor, JournalError> {
-        self.ask_where_it_ends()?;
+        self.reread_tail()?;
         self.seal()?;
         self.write_anchor()
     }
@@ -327,7 +327,7 @@ impl Journal {
     /// # Errors
     /// Those of [`Journal::append`].
     pub fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
-        self.ask_where_it_ends()?;
+        self.reread_tail()?;
         if !self.tail.closed {
             let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
             self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
@@ -376,7 +376,7 @@ impl Journal {
 
     /// Seals and anchors the journal if [`SEALED_EVERY`] records were added since the last time. A failure here does
     /// not affect the record just written: sealing is tried again after the next record, and at the latest at the end.
-    fn move_along(&mut self) {
+    fn seal_when_due(&mut self) {
         if self.tail.closed {
             return;
         }
@@ -390,12 +390,12 @@ impl Journal {
 
     fn insert(&mut self, entry: Entry) -> Result<Record, JournalError> {
         let record = self.put(entry)?;
-        self.move_along();
+        self.seal_when_due();
         Ok(record)
     }
 
     fn put(&mut self, entry: Entry) -> Result<Record, JournalError> {
-        if let Some(stands) = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry)) {
+        if let Some(stands) = self.reread_tail()?.filter(|record| record.is_of(&entry)) {
             return Ok(stands);
         }
         if self.tail.closed && entry.kind != Kind::Seal {
@@ -435,7 +435,7 @@ impl Journal {
             prev_hash: self.tail.hash.clone(),
             hash: String::new(),
         };
-        record.hash = record.hash_due();
+        record.hash = record.expected_hash();
         record
     }
 
@@ -446,7 +446,7 @@ impl Journal {
 
     /// Reads the end of the chain again after a failed write, because the record may or may not be stored. Returns that
     /// record if it is stored.
-    fn ask_where_it_ends(&mut self) -> Result<Option<Record>, JournalError> {
+    fn reread_tail(&mut self) -> Result<Option<Record>, JournalError> {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;
         let stands = self.tail.hash == record.hash;
@@ -461,7 +461,7 @@ impl Journal {
     /// sign the changes.
     fn is_whole(&self) -> Result<(), JournalError> {
         let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
-        let (mut records, mut head) = (0, Tail::of_nothing().hash);
+        let (mut records, mut head) = (0, Tail::empty().hash);
         if let Some(anchor) = read_anchor(&self.folder)? {
             if anchor.records > self.tail.seq {
                 let what = format!("{} records were written, and {} are present", anchor.records, self.tail.seq);
@@ -478,7 +478,7 @@ impl Journal {
         }
         for record in self.records(records + 1) {
             let record = record?;
-            if let Some(flaw) = record.flaw_behind(records, &head) {
+            if let Some(flaw) = record.successor_flaw(records, &head) {
                 return broken(records + 1, flaw);
             }
             (records, head) = (record.seq, record.hash);
@@ -490,7 +490,7 @@ impl Journal {
 /// Lock of a run. While it lives, no other process can continue the run.
 #[derive(Debug)]
 pub struct RunLock {
-    file: HeldFile,
+    file: LockedFile,
     folder: PathBuf,
 }
 
@@ -499,7 +499,7 @@ impl RunLock {
     ///
     /// # Errors
     /// The folder has no journal, or another process drives the run.
-    pub fn take(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
+    pub fn acquire(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         if !folder.join(DATABASE).is_file() {
             return Err(JournalError::Absent { path: folder });
@@ -508,11 +508,11 @@ impl RunLock {
     }
 }
 
-fn lock(folder: &Path) -> Result<HeldFile, JournalError> {
+fn lock(folder: &Path) -> Result<LockedFile, JournalError> {
     let path = folder.join(LOCK);
     let failed = JournalError::file(&path, "creating it");
     let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(&failed)?;
-    HeldFile::take(file).map_err(|error| match error {
+    LockedFile::lock(file).map_err(|error| match error {
         TryLockError::WouldBlock => JournalError::Busy { path: folder.to_owned() },
         TryLockError::Error(error) => JournalError::file(&path, "locking it")(error),
     })
@@ -553,9 +553,9 @@ fn read_tail(connection: &Connection, folder: &Path) -> Result<Tail, JournalErro
     let sql = "SELECT seq, mono_ns, cycle, hash FROM record ORDER BY seq DESC LIMIT 1";
     let last = connection.query_row(sql, [], |row| {
         let (seq, mono_ns, cycle, hash) = (whole(row, 0)?, whole(row, 1)?, row.get(2)?, row.get(3)?);
-        Ok(Tail { seq, mono_ns, cycle, hash, ..Tail::of_nothing() })
+        Ok(Tail { seq, mono_ns, cycle, hash, ..Tail::empty() })
     });
-    let Some(tail) = last.optional().map_err(&failed)? else { return Ok(Tail::of_nothing()) };
+    let Some(tail) = last.optional().map_err(&failed)? else { return Ok(Tail::empty()) };
     let ask = |sql| connection.prepare_cached(sql).map_err(&failed);
     let last_command_id =
         ask("SELECT max(command_id) FROM record NOT INDEXED")?.query_row([], |row| row.get(0)).map_err(&failed)?;

@@ -5,7 +5,7 @@
 use regrind_control::{CycleRow, JobProgress};
 
 use crate::packml::{PRODUCTION, SIMULATION, state_number};
-use crate::told::{Now, Told};
+use crate::cell_status::{RunStatus, CellStatus};
 
 /// Figure that is published.
 #[derive(Clone, Copy, Debug)]
@@ -18,7 +18,7 @@ pub struct Figure {
     pub unit: Option<&'static str>,
     /// Description, for people.
     pub about: &'static str,
-    of: fn(&Told) -> Option<FigureValue>,
+    read: fn(&CellStatus) -> Option<FigureValue>,
 }
 
 /// Kind of the values of a figure.
@@ -43,45 +43,45 @@ pub enum FigureValue {
 
 impl Figure {
     /// Returns the value of the figure; `None` if it is unknown.
-    pub fn of(&self, told: &Told) -> Option<FigureValue> {
-        (self.of)(told).filter(|value| !matches!(value, FigureValue::Number(number) if !number.is_finite()))
+    pub fn value(&self, told: &CellStatus) -> Option<FigureValue> {
+        (self.read)(told).filter(|value| !matches!(value, FigureValue::Number(number) if !number.is_finite()))
     }
 }
 
-const fn whole(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
-    Figure { name, kind: FigureKind::Whole, unit: None, about, of }
+const fn whole(name: &'static str, about: &'static str, of: fn(&CellStatus) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Whole, unit: None, about, read: of }
 }
 
 const fn number(
     name: &'static str,
     unit: &'static str,
     about: &'static str,
-    of: fn(&Told) -> Option<FigureValue>,
+    of: fn(&CellStatus) -> Option<FigureValue>,
 ) -> Figure {
-    Figure { name, kind: FigureKind::Number, unit: Some(unit), about, of }
+    Figure { name, kind: FigureKind::Number, unit: Some(unit), about, read: of }
 }
 
-const fn truth(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
-    Figure { name, kind: FigureKind::Truth, unit: None, about, of }
+const fn truth(name: &'static str, about: &'static str, of: fn(&CellStatus) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Truth, unit: None, about, read: of }
 }
 
-const fn text(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
-    Figure { name, kind: FigureKind::Text, unit: None, about, of }
+const fn text(name: &'static str, about: &'static str, of: fn(&CellStatus) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Text, unit: None, about, read: of }
 }
 
 /// All published figures of a cell.
 pub const FIGURES: &[Figure] = &[
     whole("Status/StateCurrent", "Number of the state by PackML; 4 (Idle) where no run is on", |told| {
-        match &told.now {
-            Now::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
-            Now::Silent { .. } | Now::Gone { .. } => None,
-            Now::On { snapshot, .. } => Some(FigureValue::Whole(state_number(snapshot.state))),
+        match &told.run_status {
+            RunStatus::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
+            RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
+            RunStatus::Active { snapshot, .. } => Some(FigureValue::Whole(state_number(snapshot.state))),
         }
     }),
-    text("Status/StateName", "Name of the state by PackML", |told| match &told.now {
-        Now::NoRun => Some(FigureValue::Text("Idle".into())),
-        Now::Silent { .. } | Now::Gone { .. } => None,
-        Now::On { snapshot, .. } => Some(FigureValue::Text(snapshot.state.to_string())),
+    text("Status/StateName", "Name of the state by PackML", |told| match &told.run_status {
+        RunStatus::NoRun => Some(FigureValue::Text("Idle".into())),
+        RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
+        RunStatus::Active { snapshot, .. } => Some(FigureValue::Text(snapshot.state.to_string())),
     }),
     whole("Status/UnitModeCurrent", "Number of the mode by PackML: 1 production, 16 simulation", |told| {
         told.snapshot().map(|now| FigureValue::Whole(if now.simulation { SIMULATION } else { PRODUCTION }))
@@ -92,18 +92,18 @@ pub const FIGURES: &[Figure] = &[
     truth("Simulation", "Whether any machine of the cell is simulated", |told| {
         told.snapshot().map(|now| FigureValue::Truth(now.simulation))
     }),
-    text("Message", "State and phase, for people", |told| match &told.now {
-        Now::NoRun => Some(in_words("no run is on")),
-        Now::Silent { run } => Some(FigureValue::Text(format!(
+    text("Message", "State and phase, for people", |told| match &told.run_status {
+        RunStatus::NoRun => Some(in_words("no run is on")),
+        RunStatus::Unresponsive { run } => Some(FigureValue::Text(format!(
             "the program of {run} does not answer: what the machines do is not known; see to them"
         ))),
-        Now::Gone { run, machines_within: true } => Some(FigureValue::Text(format!(
+        RunStatus::ProgramGone { run, machines_within: true } => Some(FigureValue::Text(format!(
             "the program of {run} has gone before its end, and its simulated machines with it"
         ))),
-        Now::Gone { run, machines_within: false } => Some(FigureValue::Text(format!(
+        RunStatus::ProgramGone { run, machines_within: false } => Some(FigureValue::Text(format!(
             "the program of {run} has gone before its end: what the machines do is not known; see to them, then: regrind resume"
         ))),
-        Now::On { snapshot, .. } => Some(in_words(&snapshot.message)),
+        RunStatus::Active { snapshot, .. } => Some(in_words(&snapshot.message)),
     }),
     text("Next Step", "What a person does next", |told| told.snapshot().map(|now| in_words(&now.next))),
     text("Phase", "Phase of the cycle, in which the cell is or will go on", |told| {
@@ -157,11 +157,11 @@ pub const FIGURES: &[Figure] = &[
         told.snapshot().map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", "))
     }),
     text("Last Run/Name", "The last run that came to its end", |told| {
-        told.last.as_ref().map(|last| in_words(&last.run))
+        told.last_run.as_ref().map(|last| in_words(&last.run))
     }),
-    text("Last Run/Verdict", "How it ended", |told| told.last.as_ref().map(|last| in_words(&last.verdict))),
+    text("Last Run/Verdict", "How it ended", |told| told.last_run.as_ref().map(|last| in_words(&last.verdict))),
     truth("Last Run/Accepted", "Whether its part is accepted", |told| {
-        told.last.as_ref().map(|last| FigureValue::Truth(last.accepted))
+        told.last_run.as_ref().map(|last| FigureValue::Truth(last.accepted))
     }),
 ];
 
@@ -177,15 +177,15 @@ fn if_known(name: &str) -> Option<FigureValue> {
     Some(name).filter(|name| !name.is_empty()).map(in_words)
 }
 
-fn job(told: &Told) -> Option<JobProgress> {
+fn job(told: &CellStatus) -> Option<JobProgress> {
     told.snapshot()?.progress
 }
 
-fn time_left_s(told: &Told, which: usize) -> Option<FigureValue> {
+fn time_left_s(told: &CellStatus, which: usize) -> Option<FigureValue> {
     job(told)?.left_s.map(|left_s| FigureValue::Number(left_s[which]))
 }
 
-fn measured(told: &Told) -> Option<&CycleRow> {
+fn measured(told: &CellStatus) -> Option<&CycleRow> {
     told.snapshot()?.cycles.last()
 }
 
@@ -194,12 +194,12 @@ mod tests {
     use super::*;
     use regrind_control::Snapshot;
 
-    fn on(snapshot: Snapshot) -> Told {
-        Told { now: Now::On { run: "a run".into(), snapshot: Box::new(snapshot) }, last: None }
+    fn on(snapshot: Snapshot) -> CellStatus {
+        CellStatus { run_status: RunStatus::Active { run: "a run".into(), snapshot: Box::new(snapshot) }, last_run: None }
     }
 
-    fn value(name: &str, told: &Told) -> Option<FigureValue> {
-        FIGURES.iter().find(|figure| figure.name == name).unwrap().of(told)
+    fn value(name: &str, told: &CellStatus) -> Option<FigureValue> {
+        FIGURES.iter().find(|figure| figure.name == name).unwrap().value(told)
     }
 
     #[test]
@@ -230,7 +230,7 @@ mod tests {
             rms_mm: 1e-3,
             with_uncertainty: false,
             probability: 0.975,
-            pv_of: regrind_cell::PvOf::All,
+            pv_of: regrind_cell::PvPoints::All,
         };
         let told = on(Snapshot { tolerance: Some(limits), ..Snapshot::default() });
         assert_eq!(value("Limits/PV", &told), None, "it is not limited");
@@ -239,9 +239,9 @@ mod tests {
 
     #[test]
     fn a_run_that_was_left_is_not_called_idle() {
-        let gone = Told { now: Now::Gone { run: "a run".into(), machines_within: false }, last: None };
+        let gone = CellStatus { run_status: RunStatus::ProgramGone { run: "a run".into(), machines_within: false }, last_run: None };
         assert_eq!((value("Status/StateCurrent", &gone), value("Status/StateName", &gone)), (None, None));
-        assert_eq!(value("Status/StateCurrent", &Told::default()), Some(FigureValue::Whole(4)));
+        assert_eq!(value("Status/StateCurrent", &CellStatus::default()), Some(FigureValue::Whole(4)));
         assert_eq!(value("Run", &gone), Some(FigureValue::Text("a run".into())));
     }
 }

@@ -10,19 +10,19 @@
 
 mod error;
 mod figures;
-mod news;
+mod publisher_event;
 mod opcua;
 mod packml;
 mod settings;
 mod sparkplug;
-mod told;
-mod turn;
+mod cell_status;
+mod publisher_lock;
 
 pub use error::LiveError;
 pub use figures::{FIGURES, Figure, FigureKind, FigureValue};
-pub use news::{News, Notes, notes};
+pub use publisher_event::{PublisherEvent, EventSender, event_queue};
 pub use opcua::UaServer;
 pub use settings::{OpcUaSettings, SparkplugSettings};
 pub use sparkplug::Node;
-pub use told::{Ended, Now, Told};
-pub use turn::Turn;
+pub use cell_status::{EndedRun, RunStatus, CellStatus};
+pub use publisher_lock::PublisherLock;

@@ -7,7 +7,7 @@ use regrind_cell::{Alarm, AlarmId};
 use super::texts::Language;
 
 /// Texts of an alarm in one language.
-pub(crate) struct Said<'a> {
+pub(crate) struct AlarmTexts<'a> {
     /// Cause of the alarm, with its values.
     pub(crate) what: Cow<'a, str>,
     /// Consequence of the alarm.
@@ -17,13 +17,13 @@ pub(crate) struct Said<'a> {
 }
 
 /// Returns the texts of an alarm in a language.
-pub(crate) fn said(alarm: &Alarm, language: Language) -> Said<'_> {
+pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     let Some((head, consequence, remedy)) = translated(alarm.id, language) else {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
-        return Said { what: Cow::Borrowed(&alarm.what), consequence: &alarm.consequence, remedy };
+        return AlarmTexts { what: Cow::Borrowed(&alarm.what), consequence: &alarm.consequence, remedy };
     };
     let case = case(&alarm.what, alarm.id.head());
-    Said { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
+    AlarmTexts { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
 }
 
 /// Returns the part of an alarm's cause that follows its head: the values of the case. An older record has another
@@ -394,16 +394,16 @@ mod tests {
             let what = format!("{}: grinder at 12 mm.", id.head());
             let alarm = Alarm { id, what, consequence: "c".to_owned(), remedy, clears: Role::Operator };
             for language in [Language::De, Language::Zh] {
-                let said = said(&alarm, language);
+                let said = alarm_texts(&alarm, language);
                 assert!(said.what.ends_with(": grinder at 12 mm."), "{id:?}: {}", said.what);
                 assert!(!said.what.starts_with(id.head()), "{id:?} is not translated");
                 assert_eq!(said.remedy.len(), alarm.remedy.len(), "{id:?} in {language:?}");
             }
-            assert_eq!(said(&alarm, Language::En).what, alarm.what);
+            assert_eq!(alarm_texts(&alarm, Language::En).what, alarm.what);
             let older = id.head().replace(|letter: char| letter.is_alphabetic(), "#");
             let older = Alarm { what: format!("{older}: grinder at 12 mm."), ..alarm };
-            assert!(said(&older, Language::De).what.ends_with(": grinder at 12 mm."), "{id:?}: its older wording");
-            assert!(!said(&older, Language::De).what.contains('#'), "{id:?}: its older wording");
+            assert!(alarm_texts(&older, Language::De).what.ends_with(": grinder at 12 mm."), "{id:?}: its older wording");
+            assert!(!alarm_texts(&older, Language::De).what.contains('#'), "{id:?}: its older wording");
         }
     }
 }

@@ -25,7 +25,7 @@ struct Line {
 }
 
 impl Line {
-    fn of(
+    fn new(
         [name, class]: [&'static str; 2],
         k: usize,
         cycles: &[CycleSummary],
@@ -45,10 +45,10 @@ impl Line {
 /// Draws the chart; empty if nothing was measured.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
     let lines = [
-        Line::of(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
-        Line::of(["RMS", "rms"], 1, cycles, tolerance.map(|tolerance| tolerance.rms_mm), ahead),
+        Line::new(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
+        Line::new(["RMS", "rms"], 1, cycles, tolerance.map(|tolerance| tolerance.rms_mm), ahead),
     ];
-    let Some(scale) = Scale::of(&lines) else {
+    let Some(scale) = Scale::fitting(&lines) else {
         return html! { p .quiet { (Text::NotMeasured.to(language)) } };
     };
     html! {
@@ -120,7 +120,7 @@ struct Scale {
 
 impl Scale {
     /// Returns the scale on which all lines are visible; `None` if there is nothing to show.
-    fn of(lines: &[Line]) -> Option<Self> {
+    fn fitting(lines: &[Line]) -> Option<Self> {
         let all = || lines.iter().flat_map(|line| &line.points);
         let first = all().map(|(cycle, ..)| *cycle).min()?;
         let forecast = || lines.iter().filter_map(|line| line.forecast);
@@ -173,7 +173,7 @@ mod tests {
     fn what_a_correction_is_expected_to_leave_is_shown_while_the_run_is_on() {
         let mut cycles = [measured(1, 20.0, 5.0), measured(2, 5.0, 1.0)];
         cycles[0].expected = Some([4.0, 0.9]);
-        let of = |cycles: &[CycleSummary], ahead| Line::of(["PV", "pv"], 0, cycles, None, ahead).forecast;
+        let of = |cycles: &[CycleSummary], ahead| Line::new(["PV", "pv"], 0, cycles, None, ahead).forecast;
         assert_eq!(of(&cycles, true), None, "it was made before the last measurement");
         assert_eq!(of(&cycles[..1], true), Some((2, 4.0)));
         assert_eq!(of(&cycles[..1], false), None);

@@ -23,7 +23,7 @@ use tokio::task::AbortHandle;
 
 use super::guard::{self, Entrance, Guard, Peer};
 use super::sign_in::place;
-use super::view::{self, PageOf};
+use super::view::{self, PageSubject};
 use super::{assets, sign_in};
 
 /// Maximum number of simultaneous connections: of authorised clients, of clients that are not yet authorised, and of
@@ -48,7 +48,7 @@ impl Door {
     ///
     /// # Errors
     /// Fails if no random numbers are available for the key.
-    pub fn new(entrance: Entrance, of: PageOf, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
+    pub fn new(entrance: Entrance, of: PageSubject, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
         // The page belongs to no run, so refusals go to the log only.
         Ok(Self { guard: Arc::new(Guard::new(entrance, of, log, Box::new(drop))?) })
     }
@@ -191,7 +191,7 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
     let own = Router::new()
         .route("/token", get(guard::token))
         .route("/sign-out", post(sign_in::sign_out))
-        .fallback(async |State(guard): State<Arc<Guard>>, headers: HeaderMap| view::not_here(guard.of, &headers))
+        .fallback(async |State(guard): State<Arc<Guard>>, headers: HeaderMap| view::not_here(guard.subject, &headers))
         .with_state(Arc::clone(&guard));
     own.merge(routes)
         .layer(from_fn_with_state(Arc::clone(&guard), guard::let_in))

@@ -26,7 +26,7 @@ use sha2::{Digest, Sha256};
 use super::sign_in::SignedIn;
 use super::tls::Tls;
 use super::users::{Person, UsersFile};
-use super::view::{self, PageOf};
+use super::view::{self, PageSubject};
 
 /// Cookies of a page; the port is part of their names, because a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
@@ -40,7 +40,7 @@ const TOKENS: usize = 1024;
 /// Maximum number of wrong keys within a minute. For further ones, the answer is that there are too many.
 const WRONG_KEYS: u32 = 20;
 /// Maximum number of refusals that are logged within a minute. Further ones are only counted.
-const TOLD: u32 = 10;
+const MAX_LOGGED_REFUSALS: u32 = 10;
 const MINUTE: Duration = Duration::from_secs(60);
 
 /// Names of the loopback address.
@@ -94,7 +94,7 @@ impl Entrance {
 
 pub(crate) struct Guard {
     pub(crate) entrance: Entrance,
-    pub(crate) of: PageOf,
+    pub(crate) subject: PageSubject,
     pub(crate) signed_in: SignedIn,
     key: String,
     wrong: Mutex<Rate>,
@@ -103,13 +103,13 @@ pub(crate) struct Guard {
     tokens: Mutex<VecDeque<(String, String, Instant)>>,
     /// Browser that has control.
     holder: Mutex<Option<String>>,
-    log: Box<Told>,
+    log: Box<LogSink>,
     /// Function that writes a message to the record of the runs concerned.
     on_record: Box<dyn Fn(String) + Send + Sync>,
 }
 
 /// Function that logs messages that are recorded nowhere else.
-pub(crate) type Told = dyn Fn(&str) + Send + Sync;
+pub(crate) type LogSink = dyn Fn(&str) + Send + Sync;
 
 /// Number of occurrences of an event within a minute.
 pub(crate) struct Rate {
@@ -132,7 +132,7 @@ impl Rate {
     }
 
     /// Returns the number of occurrences since the minute began.
-    pub(crate) fn so_far(&self) -> u32 {
+    pub(crate) fn current_count(&self) -> u32 {
         self.count
     }
 
@@ -148,13 +148,13 @@ impl Rate {
 impl Guard {
     pub(crate) fn new(
         entrance: Entrance,
-        of: PageOf,
-        log: Box<Told>,
+        of: PageSubject,
+        log: Box<LogSink>,
         on_record: Box<dyn Fn(String) + Send + Sync>,
     ) -> io::Result<Self> {
         Ok(Self {
             entrance,
-            of,
+            subject: of,
             signed_in: SignedIn::default(),
             key: random_word()?,
             wrong: Mutex::new(Rate::new()),
@@ -239,22 +239,22 @@ impl Guard {
     pub(crate) fn refused(&self, what: &str) -> bool {
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
-            let untold = if refusals.is_over() { refusals.so_far().saturating_sub(TOLD) } else { 0 };
+            let untold = if refusals.is_over() { refusals.current_count().saturating_sub(MAX_LOGGED_REFUSALS) } else { 0 };
             (refusals.count(), untold)
         };
         if untold > 0 {
             (self.log)(&format!("{untold} more were refused in that minute"));
         }
-        if told <= TOLD {
+        if told <= MAX_LOGGED_REFUSALS {
             (self.log)(&format!("refused {what}"));
-        } else if told == TOLD + 1 {
+        } else if told == MAX_LOGGED_REFUSALS + 1 {
             (self.log)("more was refused within the same minute: it is counted, and not told one by one");
         }
-        told <= TOLD
+        told <= MAX_LOGGED_REFUSALS
     }
 
     /// Logs a successful sign-in.
-    pub(crate) fn tell(&self, what: &str) {
+    pub(crate) fn log_sign_in(&self, what: &str) {
         (self.log)(what);
     }
 
@@ -423,7 +423,7 @@ fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
         guard.record_refusal(&format!("{what} for {}", printable(request.uri().path())));
     }
     let status = if told.is_none() { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::UNAUTHORIZED };
-    view::key_needed(status, guard.of, request.headers())
+    view::key_needed(status, guard.subject, request.headers())
 }
 
 fn not_signed_in(guard: &Guard, request: &Request) -> Response {
@@ -431,7 +431,7 @@ fn not_signed_in(guard: &Guard, request: &Request) -> Response {
         let path = printable(request.uri().path());
         guard.record_refusal(&format!("an order of somebody who has not signed in, for {path}"));
     }
-    view::sign_in(StatusCode::UNAUTHORIZED, guard.of, request.headers(), None)
+    view::sign_in(StatusCode::UNAUTHORIZED, guard.subject, request.headers(), None)
 }
 
 fn key_in(query: Option<&str>) -> Option<&str> {

@@ -38,11 +38,11 @@ pub use door::Door;
 pub use guard::{Entrance, Session};
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
-pub use view::{PageOf, plant_document};
+pub use view::{PageSubject, plant_document};
 
 use guard::Guard;
 use history::History;
-use live::Live;
+use live::RunWatcher;
 
 /// Function that returns the planned points of a run in touching order: x and y in millimetres, model frame.
 pub type PlannedPoints = dyn Fn(&Path) -> Option<Vec<[f64; 2]>> + Send + Sync;
@@ -50,7 +50,7 @@ pub type PlannedPoints = dyn Fn(&Path) -> Option<Vec<[f64; 2]>> + Send + Sync;
 /// Page of a cell with its state.
 pub struct Page {
     guard: Arc<Guard>,
-    live: Live,
+    live: RunWatcher,
     history: Arc<History>,
     planned: Box<PlannedPoints>,
 }
@@ -71,10 +71,10 @@ impl Page {
         log: Box<dyn Fn(&str) + Send + Sync>,
     ) -> io::Result<Self> {
         let history = Arc::new(History::new(runs));
-        let live = Live::new(Arc::clone(&history));
+        let live = RunWatcher::new(Arc::clone(&history));
         let runs = Arc::clone(&history);
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
-        let guard = Arc::new(Guard::new(entrance, PageOf::Cell, log, on_record)?);
+        let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
         Ok(Self { guard, live, history, planned })
     }
 

@@ -17,7 +17,7 @@ const BETWEEN_TRIES: Duration = Duration::from_secs(1);
 
 /// Current knowledge about a run.
 #[derive(Clone, Default)]
-pub(crate) struct Seen {
+pub(crate) struct ObservedRun {
     /// Last snapshot from the program of the run; `None` if there was none.
     pub(crate) snapshot: Option<Arc<Snapshot>>,
     /// True if the program answers.
@@ -25,7 +25,7 @@ pub(crate) struct Seen {
     pub(crate) summary: Arc<RunSummary>,
 }
 
-impl Seen {
+impl ObservedRun {
     /// Returns true if the run has no end on record and no program that answers. The state of its machines is then
     /// unknown.
     pub(crate) fn is_lost(&self) -> bool {
@@ -33,24 +33,24 @@ impl Seen {
     }
 }
 
-pub(crate) struct Live {
+pub(crate) struct RunWatcher {
     history: Arc<History>,
-    watched: Mutex<HashMap<PathBuf, Sender<Seen>>>,
+    watched: Mutex<HashMap<PathBuf, Sender<ObservedRun>>>,
 }
 
-impl Live {
+impl RunWatcher {
     pub(crate) fn new(history: Arc<History>) -> Self {
         Self { history, watched: Mutex::default() }
     }
 
     /// Returns a receiver of the current status of a run and of its changes.
-    pub(crate) fn look(self: &Live, folder: &Path) -> Receiver<Seen> {
+    pub(crate) fn subscribe(self: &RunWatcher, folder: &Path) -> Receiver<ObservedRun> {
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
         watched.retain(|_, seen| seen.receiver_count() > 0);
         if let Some(seen) = watched.get(folder) {
             return seen.subscribe();
         }
-        let (seen, looked) = tokio::sync::watch::channel(Seen::default());
+        let (seen, looked) = tokio::sync::watch::channel(ObservedRun::default());
         watched.insert(folder.to_owned(), seen.clone());
         tokio::spawn(keep_watching(folder.to_owned(), Arc::clone(&self.history), seen));
         looked
@@ -58,7 +58,7 @@ impl Live {
 }
 
 /// Watches a run until no browser shows it.
-async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Seen>) {
+async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<ObservedRun>) {
     let watching = async {
         loop {
             // After any end of the connection the program can return, because another program can continue the run.
@@ -79,7 +79,7 @@ async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Seen
 }
 
 /// Follows the program of a run as long as it answers.
-async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<Seen>) -> std::io::Result<()> {
+async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun>) -> std::io::Result<()> {
     let mut watch = watch(folder).await?;
     let mut read_at = None;
     while let Some(snapshot) = watch.next().await? {
@@ -93,7 +93,7 @@ async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<Seen>) -> s
         let snapshot = Some(Arc::new(snapshot));
         seen.send_if_modified(|now| {
             let changed = now.snapshot != snapshot || !now.answers;
-            *now = Seen { snapshot, answers: true, summary };
+            *now = ObservedRun { snapshot, answers: true, summary };
             changed
         });
     }
@@ -106,7 +106,7 @@ async fn read(folder: &Path, history: &Arc<History>) -> Arc<RunSummary> {
 }
 
 /// Returns true if the part was accepted, false if it was not, and `None` if the result is unknown.
-pub(crate) fn verdict(seen: &Seen) -> Option<bool> {
+pub(crate) fn verdict(seen: &ObservedRun) -> Option<bool> {
     match seen.summary.result {
         RunResult::Accepted => Some(true),
         RunResult::NotAccepted | RunResult::Aborted | RunResult::Stopped => Some(false),

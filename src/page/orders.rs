@@ -14,7 +14,7 @@ use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use regrind_cell::Role;
-use regrind_control::{OnBehalf, Reply, Request, ask_for};
+use regrind_control::{OnBehalf, Reply, Request, send_request_on_behalf};
 use serde::Serialize;
 use tokio::task::{JoinHandle, spawn_blocking};
 
@@ -141,7 +141,7 @@ pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: Stri
         let folders = run.map_or_else(|| history.live(), |run| history.folder(&run).into_iter().collect());
         for folder in folders {
             let by = OnBehalf { name: None, station: "page".into() };
-            drop(ask_for(&folder, &Request::Remark { what: what.clone() }, Some(by)));
+            drop(send_request_on_behalf(&folder, &Request::Remark { what: what.clone() }, Some(by)));
         }
     })
 }
@@ -151,5 +151,5 @@ async fn give(folder: PathBuf, request: Request, session: &Session) -> std::io::
     let screen = session.id.get(..6).map_or("page".to_owned(), |short| format!("page, screen {short}"));
     let station = if session.from.is_loopback() { screen } else { format!("{screen}, at {}", session.from) };
     let by = OnBehalf { name: session.person.as_ref().map(ToString::to_string), station };
-    spawn_blocking(move || ask_for(&folder, &request, Some(by))).await.map_err(std::io::Error::other)?
+    spawn_blocking(move || send_request_on_behalf(&folder, &request, Some(by))).await.map_err(std::io::Error::other)?
 }

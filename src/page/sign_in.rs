@@ -24,7 +24,7 @@ use super::view;
 /// Duration of a session: a shift and its handover.
 const LASTS: Duration = Duration::from_secs(12 * 3600);
 /// Maximum number of browsers that are signed in at a time. Beyond it, the oldest session ends.
-const MOST: usize = 256;
+const MAX_SESSIONS: usize = 256;
 /// Maximum number of attempts within a minute under one name from one place. Further attempts are not checked. Other
 /// users at that place can still sign in.
 const TRIES: u32 = 10;
@@ -73,7 +73,7 @@ impl SignedIn {
 
     fn add(&self, session: &str, proven: Proven) {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
-        if sessions.len() >= MOST {
+        if sessions.len() >= MAX_SESSIONS {
             sessions.remove(0);
         }
         sessions.push((session.to_owned(), proven, Instant::now()));
@@ -92,7 +92,7 @@ impl SignedIn {
             // The pair with the fewest attempts is removed. A name under attack therefore stays, however many other
             // names are tried.
             let least = |of: &mut dyn Iterator<Item = (&(IpAddr, String), &Rate)>| {
-                of.min_by_key(|(_, rate)| (rate.so_far(), Reverse(rate.age()))).map(|(tried, _)| tried.clone())
+                of.min_by_key(|(_, rate)| (rate.current_count(), Reverse(rate.age()))).map(|(tried, _)| tried.clone())
             };
             let is_here = |(tried, _): &(&(IpAddr, String), &Rate)| tried.0 == this.0;
             let forgotten = match tries.iter().filter(is_here).count() >= NAMES_OF_PLACE {
@@ -178,11 +178,11 @@ pub(crate) async fn sign_in(
     Form(given): Form<Credentials>,
 ) -> Response {
     if guard.entrance.users.is_none() {
-        return view::not_here(guard.of, &headers);
+        return view::not_here(guard.subject, &headers);
     }
     let refuse = |status, what: String, told: Text| {
         guard.record_refusal(&what);
-        view::sign_in(status, guard.of, &headers, Some(told))
+        view::sign_in(status, guard.subject, &headers, Some(told))
     };
     if let Some(what) = foreign_origin(&guard, &headers) {
         return refuse(StatusCode::FORBIDDEN, what, Text::SignInRefused);
@@ -207,7 +207,7 @@ pub(crate) async fn sign_in(
     };
     guard.signed_in.forget_tries(from, &name);
     let signed_in = format!("{} signed in at the page, from {from}", proven.person());
-    guard.tell(&signed_in);
+    guard.log_sign_in(&signed_in);
     guard.record(signed_in);
     // The session gets a new random name, which nobody can have known before.
     let Ok(session) = random_word() else { return StatusCode::INTERNAL_SERVER_ERROR.into_response() };

@@ -14,19 +14,19 @@ use tokio::sync::watch::Receiver;
 
 use super::Shared;
 use super::guard::Session;
-use super::live::Seen;
+use super::live::ObservedRun;
 use super::texts::Language;
 use super::view::{self, Piece};
 
 /// Maximum silence of the stream. A browser that gets nothing for longer shows that its figures are old.
-const MOST_BETWEEN: Duration = Duration::from_secs(1);
+const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// Browser that shows a run.
-struct Looking {
+struct RunEventStream {
     page: Shared,
     session: Session,
     language: Language,
-    seen: Receiver<Seen>,
+    seen: Receiver<ObservedRun>,
     /// Last version of each piece that was sent.
     sent: Vec<(Piece, String)>,
     is_first: bool,
@@ -39,9 +39,9 @@ pub(crate) async fn events(
     headers: HeaderMap,
 ) -> Response {
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
-    let seen = page.live.look(&folder);
+    let seen = page.live.subscribe(&folder);
     let language = view::language(&headers);
-    let looking = Looking { page, session, language, seen, sent: Vec::new(), is_first: true };
+    let looking = RunEventStream { page, session, language, seen, sent: Vec::new(), is_first: true };
     let stream = unfold(looking, |mut looking| async {
         let event = looking.next().await?;
         Some((Ok::<_, Infallible>(event), looking))
@@ -49,16 +49,16 @@ pub(crate) async fn events(
     Sse::new(stream).into_response()
 }
 
-impl Looking {
+impl RunEventStream {
     /// Waits for the next update for the browser; `None` if there will be no more.
     async fn next(&mut self) -> Option<Event> {
         if !self.is_first {
-            if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await {
+            if let Ok(Err(_)) = tokio::time::timeout(MAX_SILENCE, self.seen.changed()).await {
                 return None;
             }
         } else if self.seen.borrow().summary.run.is_empty() {
             // Nothing is known yet, because the watcher has just started.
-            let _ = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await;
+            let _ = tokio::time::timeout(MAX_SILENCE, self.seen.changed()).await;
         }
         self.is_first = false;
         if !self.page.guard.lets(&self.session) {

@@ -2,7 +2,7 @@
 //! machines stay in the wording of the cell.
 
 use regrind_cell::{Device, JobStep, Phase, StateName};
-use regrind_control::Next;
+use regrind_control::NextStep;
 use regrind_report::RunResult;
 
 use super::users::PageRole;
@@ -379,18 +379,18 @@ pub(crate) fn role(role: PageRole) -> Text {
 }
 
 /// Returns the next action of a person, and the machine that it concerns.
-pub(crate) fn next(next: &Next, language: Language) -> (String, Option<Device>) {
+pub(crate) fn next(next: &NextStep, language: Language) -> (String, Option<Device>) {
     let (text, device) = match next {
-        Next::Load => (Text::Load, None),
-        Next::SeeClear { device } => (Text::SeeClear, Some(*device)),
-        Next::Bring { what } => return (what.clone(), None),
-        Next::SeeToAlarm => (Text::SeeToAlarm, None),
-        Next::ClearAlarm => (Text::ClearAlarm, None),
-        Next::ResumeOrStop => (Text::ResumeOrStop, None),
-        Next::SeeWhetherItStands { device } => (Text::SeeStands, Some(*device)),
-        Next::KeepAway => (Text::KeepAway, None),
-        Next::EmergencyCircuit => (Text::EmergencyCircuit, None),
-        Next::ReadReport => (Text::ReadReport, None),
+        NextStep::Load => (Text::Load, None),
+        NextStep::SeeClear { device } => (Text::SeeClear, Some(*device)),
+        NextStep::Bring { what } => return (what.clone(), None),
+        NextStep::SeeToAlarm => (Text::SeeToAlarm, None),
+        NextStep::ClearAlarm => (Text::ClearAlarm, None),
+        NextStep::ResumeOrStop => (Text::ResumeOrStop, None),
+        NextStep::SeeWhetherItStands { device } => (Text::SeeStands, Some(*device)),
+        NextStep::KeepAway => (Text::KeepAway, None),
+        NextStep::EmergencyCircuit => (Text::EmergencyCircuit, None),
+        NextStep::ReadReport => (Text::ReadReport, None),
         _ => (Text::Nothing, None),
     };
     (text.to(language).to_owned(), device)

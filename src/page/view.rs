@@ -8,18 +8,18 @@ use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
-use regrind_control::{JobProgress, Next, Snapshot, SoFar};
-use regrind_report::{AlarmStory, ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
+use regrind_control::{JobProgress, NextStep, Snapshot, PreviewStatistics};
+use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
 
 use super::Shared;
-use super::alarms::said;
+use super::alarms::alarm_texts;
 use super::chart::chart;
 use super::guard::{Session, text};
 use super::history::Listed;
-use super::live::{Seen, verdict};
+use super::live::{ObservedRun, verdict};
 use super::texts::{self, Language, Text};
 use super::users::Person;
 
@@ -53,8 +53,8 @@ impl Piece {
 }
 
 /// Returns all pieces of the page of a run.
-pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Piece, String); 8] {
-    let Seen { snapshot, summary, .. } = seen;
+pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) -> [(Piece, String); 8] {
+    let ObservedRun { snapshot, summary, .. } = seen;
     let snapshot = snapshot.as_deref();
     let live = snapshot.filter(|_| seen.answers);
     let tolerance = summary.tolerance.as_ref();
@@ -72,7 +72,7 @@ pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Pi
 }
 
 /// Returns the state of a run for the scripts of the page.
-pub(crate) fn state(seen: &Seen, session: &Session, has_control: bool) -> Value {
+pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) -> Value {
     let live = seen.snapshot.as_deref().filter(|_| seen.answers);
     let cycles: Vec<_> = seen
         .summary
@@ -112,9 +112,9 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
         can.push("resume");
     }
     match live.next_step {
-        Next::Load if has_control => can.push("loaded"),
-        Next::SeeClear { .. } if has_control => can.push("clear"),
-        Next::SeeWhetherItStands { .. } if has_control => can.push("over"),
+        NextStep::Load if has_control => can.push("loaded"),
+        NextStep::SeeClear { .. } if has_control => can.push("clear"),
+        NextStep::SeeWhetherItStands { .. } if has_control => can.push("over"),
         _ => {}
     }
     can.retain(|order| session.may(order));
@@ -126,7 +126,7 @@ fn is_over(state: StateName) -> bool {
 }
 
 /// Returns the state in one word, with a shape and a colour, readable from a distance of two metres.
-fn banner(seen: &Seen, language: Language) -> Markup {
+fn banner(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let mark = |class: &str, shape: &str, word: &str, more: &str| {
         html! {
@@ -147,7 +147,7 @@ fn banner(seen: &Seen, language: Language) -> Markup {
         };
         let more =
             [phase, cycle, not_confirmed].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(" · ");
-        let (class, shape) = look(live);
+        let (class, shape) = state_symbol(live);
         return mark(class, shape, say(texts::state(live.state)), &more);
     }
     if seen.is_lost() && !seen.summary.run.is_empty() {
@@ -177,12 +177,12 @@ const TRIANGLE: &str = "M12 2 L23 21 H1 Z";
 const UNKNOWN: &str = "M12 2 L22 12 L12 22 L2 12 Z";
 
 /// Returns the colour and the shape of a state.
-fn look(live: &Snapshot) -> (&'static str, &'static str) {
+fn state_symbol(live: &Snapshot) -> (&'static str, &'static str) {
     use StateName as S;
     match live.state {
         S::Aborting | S::Aborted => ("bad", OCTAGON),
         _ if !live.alarms.is_empty() || !live.unconfirmed.is_empty() => ("alarm", TRIANGLE),
-        S::Execute if matches!(live.next_step, Next::Load | Next::SeeClear { .. } | Next::Bring { .. }) => {
+        S::Execute if matches!(live.next_step, NextStep::Load | NextStep::SeeClear { .. } | NextStep::Bring { .. }) => {
             ("asks", TRIANGLE)
         }
         S::Execute | S::Starting | S::Unholding | S::Unsuspending | S::Completing => ("runs", PLAY),
@@ -191,7 +191,7 @@ fn look(live: &Snapshot) -> (&'static str, &'static str) {
     }
 }
 
-fn about(seen: &Seen, language: Language) -> Markup {
+fn about(seen: &ObservedRun, language: Language) -> Markup {
     let RunSummary { run, part, name, recipe, operator, began, ended, .. } = &*seen.summary;
     let say = |text: Text| text.to(language);
     html! {
@@ -213,7 +213,7 @@ fn when(utc: &str) -> String {
 }
 
 /// Returns the next action of a person, with its buttons.
-fn next(seen: &Seen, language: Language) -> Markup {
+fn next(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
         // For a lost run the banner already says what to do.
@@ -224,11 +224,11 @@ fn next(seen: &Seen, language: Language) -> Markup {
     html! {
         p .sentence { (sentence) @if let Some(device) = device { " " strong { (device) } } }
         @match &live.next_step {
-            Next::Load => { button type="button" data-order="loaded" { (say(Text::Loaded)) } }
-            Next::SeeClear { device } => {
+            NextStep::Load => { button type="button" data-order="loaded" { (say(Text::Loaded)) } }
+            NextStep::SeeClear { device } => {
                 button type="button" data-order="clear" data-device=(named.unwrap_or_default()) { (device) " " (say(Text::IsClear)) }
             }
-            Next::SeeWhetherItStands { .. } => {
+            NextStep::SeeWhetherItStands { .. } => {
                 label { (say(Text::WhatYouSaw)) input id="evidence" type="text" maxlength="300" autocomplete="off"; }
                 button type="button" data-order="over" data-device=(named.unwrap_or_default()) { (say(Text::DeclareOver)) }
             }
@@ -254,7 +254,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
             @if let Some(left) = left_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
         }
         progress max=(total.max(1)) value=(done) aria-label=(device) {}
-        @if let Some(SoFar { touched, rms_um, least_um, most_um }) = live.so_far {
+        @if let Some(PreviewStatistics { touched, rms_um, least_um, most_um }) = live.so_far {
             p .quiet title=(Text::PreliminaryMeans.to(language)) {
                 (Text::PreliminaryPoints.to(language)) ": " (touched) " " (Text::Touched.to(language))
                 (format!(", RMS {rms_um:.2} µm, {least_um:+.2} … {most_um:+.2} µm"))
@@ -276,7 +276,7 @@ fn range([least, most]: [f64; 2]) -> String {
 }
 
 /// Returns the active alarms. For a run that has ended, or whose program is gone, returns all alarms on record.
-fn alarms(seen: &Seen, language: Language) -> Markup {
+fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
         return html! {
@@ -287,12 +287,12 @@ fn alarms(seen: &Seen, language: Language) -> Markup {
     let told = &seen.summary.alarms;
     html! {
         @if told.is_empty() && !seen.summary.run.is_empty() { p .quiet { (say(Text::NoAlarmRaised)) } }
-        @for AlarmStory { alarm, raised, withdrawn } in told {
+        @for AlarmHistory { alarm, raised, withdrawn } in told {
             @if withdrawn.is_none() && seen.is_lost() {
                 (standing(alarm, language))
             } @else {
                 article .alarm .past {
-                    h3 { (said(alarm, language).what) }
+                    h3 { (alarm_texts(alarm, language).what) }
                     p .quiet {
                         (say(Text::Raised)) " " (when(raised)) ", "
                         @match withdrawn {
@@ -308,7 +308,7 @@ fn alarms(seen: &Seen, language: Language) -> Markup {
 
 /// Returns an alarm that needs action.
 fn standing(alarm: &Alarm, language: Language) -> Markup {
-    let (say, said) = (|text: Text| text.to(language), said(alarm, language));
+    let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
     html! {
         article .alarm {
             h3 { (said.what) }
@@ -394,8 +394,8 @@ pub(crate) async fn run(
     headers: HeaderMap,
 ) -> Response {
     let language = language(&headers);
-    let Some(folder) = page.history.folder(&id) else { return not_here(PageOf::Cell, &headers) };
-    let mut looked = page.live.look(&folder);
+    let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
+    let mut looked = page.live.subscribe(&folder);
     let known = looked.borrow().summary.run.is_empty();
     if known {
         // An active run reports its status at once. For a run that has ended, the record contains it.
@@ -409,7 +409,7 @@ pub(crate) async fn run(
 }
 
 /// Returns the page of a run: the cell while the run is active, and its result afterwards.
-fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
+fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let made = pieces(seen, has_control || !session.may("control"), language);
     let piece = |piece: Piece| {
@@ -491,7 +491,7 @@ fn colours(of: ColourMap) -> String {
 /// Filter for a list of runs. An empty field matches all runs.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(crate) struct Wanted {
+pub(crate) struct RunFilter {
     part: String,
     recipe: String,
     result: String,
@@ -500,7 +500,7 @@ pub(crate) struct Wanted {
     until: String,
 }
 
-impl Wanted {
+impl RunFilter {
     fn fits(&self, run: &Listed) -> bool {
         let has = |value: &str, wanted: &str| {
             wanted.is_empty() || value.to_lowercase().contains(&wanted.trim().to_lowercase())
@@ -517,7 +517,7 @@ impl Wanted {
 pub(crate) async fn runs(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(wanted): Query<Wanted>,
+    Query(wanted): Query<RunFilter>,
     headers: HeaderMap,
 ) -> Response {
     let language = language(&headers);
@@ -551,7 +551,7 @@ pub(crate) async fn runs(
             }
         }
     };
-    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), kind: Kind::Of(PageOf::Cell) }, main)
+    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), kind: Kind::Plain(PageSubject::Cell) }, main)
 }
 
 fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> Markup {
@@ -605,7 +605,7 @@ pub(crate) async fn compare(
     let main = html! {
         main .compare {
             @for (id, summary) in &found {
-                @let seen = Seen { summary: std::sync::Arc::clone(summary), ..Seen::default() };
+                @let seen = ObservedRun { summary: std::sync::Arc::clone(summary), ..ObservedRun::default() };
                 @let tolerance = summary.tolerance.as_ref();
                 section data-compared=(id) {
                     h2 { a href=(format!("/runs/{}", in_path(id))) { (id) } }
@@ -629,7 +629,7 @@ pub(crate) async fn compare(
 
 /// Serves the report of a run from its folder.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
-    let Some(folder) = page.history.folder(&id) else { return not_here(PageOf::Cell, &headers) };
+    let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let read = spawn_blocking(move || {
         std::fs::read(folder.join(RUN_REPORT)).or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
     });
@@ -649,15 +649,15 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
 }
 
 /// Returns the page for an address that does not exist.
-pub(crate) fn not_here(of: PageOf, headers: &HeaderMap) -> Response {
+pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
-    (StatusCode::NOT_FOUND, document("404", &Frame { language, person: None, kind: Kind::Of(of) }, main))
+    (StatusCode::NOT_FOUND, document("404", &Frame { language, person: None, kind: Kind::Plain(of) }, main))
         .into_response()
 }
 
 /// Returns the page for a client without a key.
-pub(crate) fn key_needed(status: StatusCode, of: PageOf, headers: &HeaderMap) -> Response {
+pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
         main .list {
@@ -666,11 +666,11 @@ pub(crate) fn key_needed(status: StatusCode, of: PageOf, headers: &HeaderMap) ->
             form method="get" action="/" { label { "key " input name="key" type="password" autocomplete="off"; } " " button { "OK" } }
         }
     };
-    (status, document("Regrind", &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
+    (status, document("Regrind", &Frame { language, person: None, kind: Kind::Plain(of) }, main)).into_response()
 }
 
 /// Returns the sign-in page, with a message for a user whose sign-in failed.
-pub(crate) fn sign_in(status: StatusCode, of: PageOf, headers: &HeaderMap, told: Option<Text>) -> Response {
+pub(crate) fn sign_in(status: StatusCode, of: PageSubject, headers: &HeaderMap, told: Option<Text>) -> Response {
     let language = language(headers);
     let say = |text: Text| text.to(language);
     let main = html! {
@@ -685,7 +685,7 @@ pub(crate) fn sign_in(status: StatusCode, of: PageOf, headers: &HeaderMap, told:
             p .quiet { (say(Text::WhoMakesUsers)) }
         }
     };
-    (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
+    (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Plain(of) }, main)).into_response()
 }
 
 /// Frame around every page.
@@ -698,7 +698,7 @@ struct Frame<'a> {
 
 /// Subject of a page. It decides the content of the page's head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PageOf {
+pub enum PageSubject {
     /// One cell and its runs.
     Cell,
     /// All cells of a plant. This page is in English.
@@ -708,7 +708,7 @@ pub enum PageOf {
 /// Kind of a page: which scripts and styles it needs.
 #[derive(Clone, Copy)]
 enum Kind<'a> {
-    Of(PageOf),
+    Plain(PageSubject),
     /// Page of the cell with maps.
     WithMaps,
     /// Page of the plant, which is reloaded after some seconds if it changes.
@@ -719,11 +719,11 @@ enum Kind<'a> {
 }
 
 impl Kind<'_> {
-    fn of(self) -> PageOf {
+    fn subject(self) -> PageSubject {
         match self {
-            Self::Of(of) => of,
-            Self::WithMaps => PageOf::Cell,
-            Self::Plant { .. } => PageOf::Plant,
+            Self::Plain(of) => of,
+            Self::WithMaps => PageSubject::Cell,
+            Self::Plant { .. } => PageSubject::Plant,
         }
     }
 }
@@ -761,9 +761,9 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
             }
             body {
                 nav {
-                    @match kind.of() {
-                        PageOf::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
-                        PageOf::Plant => {
+                    @match kind.subject() {
+                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
+                        PageSubject::Plant => {
                             @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
                         }
                     }

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use regrind_journal::{
-    Against, Anchor, JournalError, Kind, PublicKey, Reader, Record, Verified, restore, restore_file, verify_against,
+    ExternalEvidence, Anchor, JournalError, Kind, PublicKey, Reader, Record, Verified, restore, restore_file, verify_against,
 };
 use serde_json::Value;
 
@@ -120,7 +120,7 @@ impl PlantRun {
                 if seq != records.len() as u64 + 1 {
                     return Err(broken("it does not follow the record before it: the plant lacks records").into());
                 }
-                let record = Record::of_text(text, &head, &hash);
+                let record = Record::from_text(text, &head, &hash);
                 records.push(record.ok_or_else(|| broken("its text in the plant is not that of a journal"))?);
                 head = hash;
             }
@@ -137,7 +137,7 @@ impl PlantRun {
     /// [`JournalError::Broken`] with the first record that cannot be believed.
     pub fn prove(&self, folder: &Path, keys: &[PublicKey]) -> Result<Verified, PlantError> {
         let keys = if keys.is_empty() { self.keys.clone() } else { keys.to_vec() };
-        let verified = verify_against(folder, &Against { anchor: None, keys })?;
+        let verified = verify_against(folder, &ExternalEvidence { anchor: None, keys })?;
         match (verified.records, &verified.head) == (self.records, &self.head) {
             true => Ok(verified),
             false => {

@@ -31,7 +31,7 @@ pub struct Knowledge {
 }
 
 /// Result as the plant delivered it.
-struct Given {
+struct DeliveredResult {
     kind: String,
     is_own: bool,
     from: CellRun,
@@ -51,7 +51,7 @@ impl Knowledge {
     /// # Errors
     /// The plant cannot be reached, or the role is not a cell's. A fault of one result is in the answer and is reported
     /// to the plant.
-    pub async fn ask(
+    pub async fn query(
         link: &Link,
         artefacts: Option<&ArtefactSettings>,
         (kind, simulation): (&str, bool),
@@ -83,11 +83,11 @@ impl Knowledge {
         link: &Link,
         artefacts: Option<&ArtefactSettings>,
         (rows, simulation): (Vec<Row>, bool),
-    ) -> Result<Vec<Given>, PlantError> {
+    ) -> Result<Vec<DeliveredResult>, PlantError> {
         let mut believed = Vec::new();
         for row in rows {
             let (cell, run): (String, String) = (row.get(2), row.get(3));
-            match given(&row, artefacts, simulation) {
+            match read_result(&row, artefacts, simulation) {
                 Ok(given) => believed.push(given),
                 Err(why) => {
                     let words = format!("the learned error of {run} of {cell} is ignored: {why}");
@@ -103,7 +103,7 @@ impl Knowledge {
 }
 
 /// Reads a result from a row, if its content is what the row says.
-fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<Given, String> {
+fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<DeliveredResult, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
     let sha256: &[u8] = row.get(4);
@@ -120,7 +120,7 @@ fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> R
     }
     let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
     let learned = Learned::of_another(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
-    Ok(Given { kind, is_own, from, learned })
+    Ok(DeliveredResult { kind, is_own, from, learned })
 }
 
 /// Reads a file up to the maximum size of a result, whatever size the database gives.

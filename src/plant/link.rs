@@ -32,7 +32,7 @@ impl Link {
     /// or it cannot be reached.
     pub async fn open(settings: &DatabaseSettings) -> Result<Self, PlantError> {
         let place = format!("{}:{}/{}", settings.host, settings.port, settings.name);
-        let proof = regrind_trust::proof(&settings.host, settings.certificates.as_deref(), "[database]")?;
+        let proof = regrind_trust::tls_config(&settings.host, settings.certificates.as_deref(), "[database]")?;
         let config = config(settings, proof.is_some())?;
         let unreached = |what: String| PlantError::Unreachable { place: place.clone(), what };
         let late = |_| unreached(format!("no answer within {} s", PATIENCE.as_secs()));
@@ -69,7 +69,7 @@ impl Link {
     ///
     /// # Errors
     /// The database cannot be reached, or refuses the query.
-    pub async fn ask(&self, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<Vec<Row>, PlantError> {
+    pub async fn query(&self, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<Vec<Row>, PlantError> {
         self.client.query(text, values).await.map_err(refused("the query"))
     }
 
@@ -77,7 +77,7 @@ impl Link {
     ///
     /// # Errors
     /// The database cannot be reached, or refuses the report.
-    pub async fn tell_state(&self, run: Option<&str>, snapshot: &Value) -> Result<(), PlantError> {
+    pub async fn report_state(&self, run: Option<&str>, snapshot: &Value) -> Result<(), PlantError> {
         let told = self.client.execute("SELECT tell_state($1, $2::text::jsonb)", &[&run, &snapshot.to_string()]).await;
         told.map(drop).map_err(refused("the state of the cell"))
     }
@@ -125,7 +125,7 @@ fn config(settings: &DatabaseSettings, is_proven: bool) -> Result<Config, PlantE
         ANSWER.as_millis()
     ));
     if let Some(path) = password_file {
-        config.password(regrind_trust::password(path)?);
+        config.password(regrind_trust::read_password(path)?);
     }
     Ok(config)
 }

@@ -50,7 +50,7 @@ pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
     let rows =
         step.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await.map_err(&failed)?;
     let applied: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
-    let before = held_against_ours(&applied)?;
+    let before = compare_migrations(&applied)?;
     for (version, text) in &MIGRATIONS[applied.len()..] {
         step.batch_execute(text).await.map_err(&failed)?;
         let sha256 = regrind_journal::sha256_hex(text.as_bytes());
@@ -77,7 +77,7 @@ pub async fn is_known(client: &Client) -> Result<(), PlantError> {
         Err(error) => return Err(refused("the query of its layout")(error)),
     };
     let applied: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
-    match held_against_ours(&applied)? {
+    match compare_migrations(&applied)? {
         found if found < known() => Err(layout(found, older)),
         _ => Ok(()),
     }
@@ -88,7 +88,7 @@ fn known() -> i32 {
 }
 
 /// Returns the newest applied version, if every applied migration is one of this program's.
-fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
+fn compare_migrations(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
             None => {

@@ -65,7 +65,7 @@ impl Study {
     ///
     /// # Errors
     /// The role is not a worker's, or the plant cannot be reached.
-    pub async fn of(link: &Link, job: &Job) -> Result<Self, PlantError> {
+    pub async fn read(link: &Link, job: &Job) -> Result<Self, PlantError> {
         let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
         let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
         let (names, contents): (Vec<String>, Vec<Vec<u8>>) = (row.get(2), row.get(3));
@@ -83,7 +83,7 @@ impl Job {
     ///
     /// # Errors
     /// The role is not a worker's, or the plant cannot be reached.
-    pub async fn take(link: &Link) -> Result<Option<Self>, PlantError> {
+    pub async fn lease_next(link: &Link) -> Result<Option<Self>, PlantError> {
         let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
         let row = link.client().query_opt(text, &[&seconds]).await.map_err(refused("a job"))?;

@@ -37,7 +37,7 @@ pub struct Lease {
 
 /// Part that a cell has begun.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Begun {
+pub struct StartedPart {
     /// Lease under which the part was begun.
     pub lease: Lease,
     /// Name of the run.
@@ -49,7 +49,7 @@ impl Lease {
     ///
     /// # Errors
     /// The role is not a cell's, or the plant cannot be reached.
-    pub async fn take(link: &Link) -> Result<Option<Self>, PlantError> {
+    pub async fn acquire(link: &Link) -> Result<Option<Self>, PlantError> {
         let text = "SELECT id, serial, recipe, due::text, lease FROM take_work($1)";
         let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a part"))?;
         Ok(row.map(|row| Self {
@@ -90,7 +90,7 @@ impl Lease {
     }
 }
 
-impl Begun {
+impl StartedPart {
     /// Finds the parts that this cell has begun and whose runs have no end in the plant yet.
     ///
     /// # Errors

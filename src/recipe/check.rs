@@ -6,12 +6,12 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::tables::{
-    Acceptance, Compensation, Grinding, Leaning, Measure, Mode, NominalTable, PatternWord, RecipeFile,
-    RegistrationSettings, StartAt, Um, Wheel,
+    Acceptance, Compensation, Grinding, TiltKind, MeasurementSettings, SelectionMode, NominalTable, PatternKind, RecipeFile,
+    RegistrationSettings, RegistrationStart, Micrometres, WheelDimensions,
 };
-use super::{NominalSource, Pattern, TableWords};
-use crate::cell::Beginning;
-use crate::compensation::path::Pattern as TrackPattern;
+use super::{NominalSource, MeasuringPattern, TableSettings};
+use crate::cell::FirstStep;
+use crate::compensation::path::TrackPattern as TrackPattern;
 use crate::document::Document;
 use crate::geometry::Aperture;
 use crate::measuring::Layout;
@@ -19,7 +19,7 @@ use crate::registration::{Coordinate, ProbeSide};
 use crate::surface::{DefinedSurface, SurfaceDefinition};
 
 /// Maximum number of points: more than any part is measured with.
-const MOST_POINTS: f64 = 1e6;
+const MAX_POINTS: f64 = 1e6;
 
 /// Checks a recipe as written. Errors are reported to `document`. Returns the values that several keys define together,
 /// or `None` for those that are invalid.
@@ -27,11 +27,11 @@ pub(super) fn check(
     written: &RecipeFile,
     path: &Path,
     document: &mut Document,
-) -> (Option<NominalSource>, Option<Pattern>) {
+) -> (Option<NominalSource>, Option<MeasuringPattern>) {
     let folder = path.parent().unwrap_or(Path::new(""));
     let nominal = nominal(&written.nominal, folder, document);
-    compare_with_part(written, nominal.as_ref(), document);
-    compare_tables(written, document);
+    check_against_part(written, nominal.as_ref(), document);
+    check_tables(written, document);
     measure(&written.measure, document);
     chosen_touches(written, document);
     registration(&written.registration, document);
@@ -43,7 +43,7 @@ pub(super) fn check(
 }
 
 /// Joins a path of a recipe to the recipe's folder. An absolute path stays unchanged.
-fn beside(folder: &Path, path: &str) -> PathBuf {
+fn resolve_path(folder: &Path, path: &str) -> PathBuf {
     folder.join(path)
 }
 
@@ -77,8 +77,8 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
     }
     let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
     Some(NominalSource::File {
-        path: beside(folder, file),
-        table: TableWords {
+        path: resolve_path(folder, file),
+        table: TableSettings {
             columns: written.columns.clone(),
             unit: written.unit.clone(),
             height_unit: written.height_unit.clone(),
@@ -95,7 +95,7 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
             Ok(()) => return Some(aperture),
             Err(error) => {
                 let key = format!("nominal.aperture.{}", error.key());
-                document.report(&key, in_place(error.key(), &error.to_string()), "", "");
+                document.report(&key, without_key(error.key(), &error.to_string()), "", "");
             }
         },
     }
@@ -129,7 +129,7 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
                 // A term of a list, such as `terms.[0, 1]`, is not a key of the file, so the problem is placed at the
                 // list.
                 let key = format!("nominal.{}", inner.split(".[").next().unwrap_or(&inner));
-                document.report(&key, in_place(&inner, &error.to_string()), "", "");
+                document.report(&key, without_key(&inner, &error.to_string()), "", "");
             }
         },
     }
@@ -137,7 +137,7 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
 }
 
 /// Removes the key at the beginning of a sentence, so that the sentence can follow the full key.
-fn in_place(key: &str, sentence: &str) -> String {
+fn without_key(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),
         None => format!("is refused: {sentence}"),
@@ -145,11 +145,11 @@ fn in_place(key: &str, sentence: &str) -> String {
 }
 
 /// Tolerance for the comparison of two probabilities that are meant to be equal.
-const ROUNDING: f64 = 1e-9;
+const PROBABILITY_TOLERANCE: f64 = 1e-9;
 
 fn chosen_touches(written: &RecipeFile, document: &mut Document) {
     let risk = written.measure.accepted_risk;
-    if written.measure.mode == Mode::Fixed {
+    if written.measure.mode == SelectionMode::Fixed {
         if risk.is_some() {
             let remedy = "remove it, or write `mode = \"adaptive\"`";
             document.report(
@@ -170,7 +170,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         );
     }
     if let (Some(risk), Some(probability)) = (risk, written.acceptance.probability)
-        && 1.0 - probability > risk + ROUNDING
+        && 1.0 - probability > risk + PROBABILITY_TOLERANCE
     {
         document.report(
             "measure.accepted_risk",
@@ -182,7 +182,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
             &format!("raise it to {:.3}, or the probability to {:.3}", 1.0 - probability, 1.0 - risk),
         );
     }
-    if written.measure.pattern == PatternWord::Free {
+    if written.measure.pattern == PatternKind::Free {
         let remedy = "choose another pattern, or write `mode = \"fixed\"`";
         document.report(
             "measure.mode",
@@ -210,7 +210,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
     }
 }
 
-fn measure(written: &Measure, document: &mut Document) {
+fn measure(written: &MeasurementSettings, document: &mut Document) {
     if written.safe_height_mm < written.approach_mm {
         document.report(
             "measure.safe_height_mm",
@@ -227,7 +227,7 @@ fn measure(written: &Measure, document: &mut Document) {
     }
 }
 
-fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<Pattern> {
+fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document) -> Option<MeasuringPattern> {
     let keys = [
         ("spacing_mm", written.spacing_mm.is_some()),
         ("columns", written.columns.is_some()),
@@ -239,10 +239,10 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         ("file_height_unit", written.file_height_unit.is_some()),
     ];
     let (name, takes, needs) = match written.pattern {
-        PatternWord::Grid => ("grid", &["spacing_mm", "columns", "rows"][..], "`spacing_mm`, or `columns` and `rows`"),
-        PatternWord::Spiral => ("spiral", &["spacing_mm", "points"][..], "`spacing_mm` or `points`"),
-        PatternWord::File => ("file", &["file", "file_columns", "file_unit", "file_height_unit"][..], "`file`"),
-        PatternWord::Free => ("free", &["points"][..], "`points`, the minimum number of points"),
+        PatternKind::Grid => ("grid", &["spacing_mm", "columns", "rows"][..], "`spacing_mm`, or `columns` and `rows`"),
+        PatternKind::Spiral => ("spiral", &["spacing_mm", "points"][..], "`spacing_mm` or `points`"),
+        PatternKind::File => ("file", &["file", "file_columns", "file_unit", "file_height_unit"][..], "`file`"),
+        PatternKind::Free => ("free", &["points"][..], "`points`, the minimum number of points"),
     };
     let allowed = format!("the pattern \"{name}\" requires {needs}");
     for (key, _) in keys.iter().filter(|(key, there)| *there && !takes.contains(key)) {
@@ -254,21 +254,21 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         );
     }
     let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
-        (PatternWord::Grid, Some(spacing), (None, None), _) => Some(Pattern::Laid(Layout::GridSpacing(spacing))),
-        (PatternWord::Grid, None, (Some(columns), Some(rows)), _) => {
-            Some(Pattern::Laid(Layout::GridPoints([columns, rows])))
+        (PatternKind::Grid, Some(spacing), (None, None), _) => Some(MeasuringPattern::Generated(Layout::GridSpacing(spacing))),
+        (PatternKind::Grid, None, (Some(columns), Some(rows)), _) => {
+            Some(MeasuringPattern::Generated(Layout::GridPoints([columns, rows])))
         }
-        (PatternWord::Spiral, Some(spacing), _, None) => Some(Pattern::Laid(Layout::SpiralSpacing(spacing))),
-        (PatternWord::Spiral, None, _, Some(points)) => Some(Pattern::Laid(Layout::SpiralPoints(points))),
-        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File {
-            path: beside(folder, file),
-            table: TableWords {
+        (PatternKind::Spiral, Some(spacing), _, None) => Some(MeasuringPattern::Generated(Layout::SpiralSpacing(spacing))),
+        (PatternKind::Spiral, None, _, Some(points)) => Some(MeasuringPattern::Generated(Layout::SpiralPoints(points))),
+        (PatternKind::File, ..) => written.file.as_ref().map(|file| MeasuringPattern::File {
+            path: resolve_path(folder, file),
+            table: TableSettings {
                 columns: written.file_columns.clone(),
                 unit: written.file_unit.clone(),
                 height_unit: written.file_height_unit.clone(),
             },
         }),
-        (PatternWord::Free, _, _, Some(least_points)) => Some(Pattern::Free { least_points }),
+        (PatternKind::Free, _, _, Some(least_points)) => Some(MeasuringPattern::Free { min_points: least_points }),
         _ => None,
     };
     // An invalid key is already reported.
@@ -289,7 +289,7 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
 }
 
 fn registration(written: &RegistrationSettings, document: &mut Document) {
-    if !written.lock.is_empty() && written.start == StartAt::Search {
+    if !written.lock.is_empty() && written.start == RegistrationStart::Search {
         document.report(
             "registration.lock",
             "locks directions while `start` is \"search\"",
@@ -367,7 +367,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         let remedy = "add `wheel_radius_um = 100.0`, the uncertainty of the wheel's radius, or remove the table";
         document.report(KEY, "has no parameter", "at least one parameter to compensate is required", remedy);
     }
-    if written.cycle.begin_with == Beginning::Measure {
+    if written.cycle.begin_with == FirstStep::Measure {
         document.report(
             KEY,
             "is set in a recipe that begins with a measurement",
@@ -391,7 +391,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
             "remove one of the two: without the table the map corrects these errors",
         );
     }
-    if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, Wheel::Sphere { .. }) {
+    if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, WheelDimensions::Sphere { .. }) {
         document.report(
             "compensation.parameters.wheel_radius_um",
             "requires a spherical wheel",
@@ -429,11 +429,11 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
 
 /// Minimum angle between the normal and the axis of a ball that follows the surface: within 2 degrees of the pole the
 /// ball hardly moves.
-const LEAST_LEAD_DEG: f64 = 2.01;
+const MIN_LEAD_DEG: f64 = 2.01;
 
 fn grinding(written: &Grinding, document: &mut Document) {
     let wheel = written.wheel;
-    if let Wheel::Torus { radius_mm, minor_radius_mm, .. } | Wheel::Cup { radius_mm, minor_radius_mm, .. } = wheel
+    if let WheelDimensions::Torus { radius_mm, minor_radius_mm, .. } | WheelDimensions::Cup { radius_mm, minor_radius_mm, .. } = wheel
         && minor_radius_mm > radius_mm
     {
         document.report(
@@ -452,9 +452,9 @@ fn grinding(written: &Grinding, document: &mut Document) {
         );
     }
     if let Some(tilt) = written.tilt
-        && tilt.lean == Leaning::Following
-        && tilt.angle_deg.abs() < LEAST_LEAD_DEG
-        && matches!(wheel, Wheel::Sphere { .. })
+        && tilt.lean == TiltKind::Following
+        && tilt.angle_deg.abs() < MIN_LEAD_DEG
+        && matches!(wheel, WheelDimensions::Sphere { .. })
     {
         document.report(
             "grinding.tilt.angle_deg",
@@ -474,7 +474,7 @@ fn grinding(written: &Grinding, document: &mut Document) {
 }
 
 /// Checks the tables against each other.
-fn compare_tables(written: &RecipeFile, document: &mut Document) {
+fn check_tables(written: &RecipeFile, document: &mut Document) {
     if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
         && most < rms
     {
@@ -485,7 +485,7 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
             "raise it well above the RMS of the first cycle, or remove it",
         );
     }
-    if written.compensation.learn && written.cycle.begin_with == Beginning::Measure {
+    if written.compensation.learn && written.cycle.begin_with == FirstStep::Measure {
         document.report(
             "compensation.learn",
             "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
@@ -493,7 +493,7 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
             "remove one of the two",
         );
     }
-    let (Um(allowance), Um(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
+    let (Micrometres(allowance), Micrometres(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
     let cycles = written.cycle.max_cycles;
     if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(
@@ -506,7 +506,7 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
 }
 
 /// Checks lengths against the size and the curvature of the part, if a formula or an outline defines them.
-fn compare_with_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
+fn check_against_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
     let (surface, aperture) = match nominal {
         Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
         Some(NominalSource::File { aperture, .. }) => (None, aperture.as_ref()),
@@ -514,14 +514,14 @@ fn compare_with_part(written: &RecipeFile, nominal: Option<&NominalSource>, docu
     };
     if let Some(aperture) = aperture {
         let [[x0, y0], [x1, y1]] = aperture.bounds();
-        compare_with_size(written, [x1 - x0, y1 - y0], document);
+        check_against_size(written, [x1 - x0, y1 - y0], document);
     }
     if let Some(surface) = surface {
-        compare_with_curvature(written, surface, document);
+        check_against_curvature(written, surface, document);
     }
 }
 
-fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Document) {
+fn check_against_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Document) {
     let measure = &written.measure;
     let smaller_mm = size_mm[0].min(size_mm[1]);
     let left_mm = size_mm.map(|size| size - 2.0 * measure.edge_margin_mm);
@@ -533,7 +533,7 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
             "lower it",
         );
     } else if let Some(spacing) = measure.spacing_mm {
-        compare_spacing(spacing, left_mm, document);
+        check_spacing(spacing, left_mm, document);
     }
     let lengths = [
         ("measure.probe_radius_mm", measure.probe_radius_mm, 0.5),
@@ -549,19 +549,19 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
         }
     }
     let cutoff_mm = written.compensation.cutoff_mm;
-    if let (PatternWord::Grid, Some(columns), Some(rows)) = (measure.pattern, measure.columns, measure.rows) {
+    if let (PatternKind::Grid, Some(columns), Some(rows)) = (measure.pattern, measure.columns, measure.rows) {
         let apart = |size: f64, n: u32| size / f64::from(n.max(2) - 1);
-        compare_cutoff(cutoff_mm, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
+        check_cutoff(cutoff_mm, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
     } else if let Some(spacing) = measure.spacing_mm.filter(|spacing| *spacing <= left_mm[0].min(left_mm[1])) {
-        compare_cutoff(cutoff_mm, spacing, document);
+        check_cutoff(cutoff_mm, spacing, document);
     }
 }
 
-fn compare_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) {
+fn check_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) {
     let points = (left_mm[0] / spacing_mm + 1.0) * (left_mm[1] / spacing_mm + 1.0);
     let found = format!("is {spacing_mm} mm on {:.4} x {:.4} mm", left_mm[0], left_mm[1]);
-    if points > MOST_POINTS {
-        let allowed = format!("that makes {points:.1e} points; at most {MOST_POINTS:.0e} are allowed");
+    if points > MAX_POINTS {
+        let allowed = format!("that makes {points:.1e} points; at most {MAX_POINTS:.0e} are allowed");
         document.report("measure.spacing_mm", found, &allowed, "choose a coarser spacing");
     } else if spacing_mm > left_mm[0].min(left_mm[1]) {
         let allowed = "it must be at most the smaller side";
@@ -569,7 +569,7 @@ fn compare_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) 
     }
 }
 
-fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
+fn check_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
     if cutoff_mm < 2.0 * apart_mm {
         document.report(
             "compensation.cutoff_mm",
@@ -581,8 +581,8 @@ fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
 }
 
 /// Checks the wheel and the probe against the smallest concave radius of the surface on their side.
-fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
-    let hollows = curvature::sharpest_hollows_mm(surface);
+fn check_against_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
+    let hollows = curvature::min_concave_radii_mm(surface);
     let (radius_mm, place) = match written.measure.side {
         ProbeSide::Above => hollows[0],
         ProbeSide::Below => hollows[1],
@@ -595,7 +595,7 @@ fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, docume
             }
         }
     };
-    let ball_mm = if let Wheel::Sphere { radius_mm } = written.grinding.wheel { radius_mm } else { 0.0 };
+    let ball_mm = if let WheelDimensions::Sphere { radius_mm } = written.grinding.wheel { radius_mm } else { 0.0 };
     for (key, ball_mm) in
         [("measure.probe_radius_mm", written.measure.probe_radius_mm), ("grinding.wheel.radius_mm", ball_mm)]
     {

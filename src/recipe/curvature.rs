@@ -3,20 +3,20 @@
 use crate::surface::DefinedSurface;
 
 /// Number of evaluated positions along each axis of the aperture's box.
-const PLACES: usize = 61;
+const POSITIONS_PER_AXIS: usize = 61;
 
 /// Returns the smallest concave radius towards +z and towards -z, in mm, and its position. The radius is infinite if
 /// there is no concave region.
 ///
 /// Curvature is computed from finite differences of the exact gradient on a grid. It is accurate to a few percent,
 /// which is enough to check a recipe. The registration checks the offset surface itself.
-pub(super) fn sharpest_hollows_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
+pub(super) fn min_concave_radii_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
     let [[x0, y0], [x1, y1]] = surface.aperture().bounds();
-    let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (PLACES - 1) as f64;
+    let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (POSITIONS_PER_AXIS - 1) as f64;
     let step_mm = 1e-4 * (x1 - x0).min(y1 - y0);
     let mut sharpest = [(f64::INFINITY, [0.0; 2]); 2];
-    for j in 0..PLACES {
-        for i in 0..PLACES {
+    for j in 0..POSITIONS_PER_AXIS {
+        for i in 0..POSITIONS_PER_AXIS {
             let place = [at(x0, x1, i), at(y0, y1, j)];
             if !surface.aperture().contains(place[0], place[1]) {
                 continue;
@@ -55,19 +55,19 @@ fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64
 mod tests {
     use super::*;
 
-    fn hollows(surface: &str) -> [f64; 2] {
+    fn concave_radii_mm(surface: &str) -> [f64; 2] {
         let text = format!("[surface]\n{surface}\n[aperture]\nkind = 'circle'\nradius_mm = 20\n");
-        sharpest_hollows_mm(&DefinedSurface::from_toml(&text).unwrap()).map(|(radius, _)| radius)
+        min_concave_radii_mm(&DefinedSurface::from_toml(&text).unwrap()).map(|(radius, _)| radius)
     }
 
     #[test]
     fn hollows_of_known_surfaces() {
-        let [up, down] = hollows("kind = 'sphere'\nradius_mm = 50");
+        let [up, down] = concave_radii_mm("kind = 'sphere'\nradius_mm = 50");
         assert!((up - 50.0).abs() < 1e-3 && down.is_infinite(), "{up} {down}");
-        let [up, down] = hollows("kind = 'sphere'\nradius_mm = -50");
+        let [up, down] = concave_radii_mm("kind = 'sphere'\nradius_mm = -50");
         assert!((down - 50.0).abs() < 1e-3 && up.is_infinite(), "{up} {down}");
-        let [up, down] = hollows("kind = 'biconic'\nradius_x_mm = 60\nradius_y_mm = -80");
+        let [up, down] = concave_radii_mm("kind = 'biconic'\nradius_x_mm = 60\nradius_y_mm = -80");
         assert!((up / 60.0 - 1.0).abs() < 0.01 && (down / 80.0 - 1.0).abs() < 0.01, "{up} {down}");
-        assert_eq!(hollows("kind = 'plane'"), [f64::INFINITY; 2]);
+        assert_eq!(concave_radii_mm("kind = 'plane'"), [f64::INFINITY; 2]);
     }
 }

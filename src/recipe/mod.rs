@@ -22,12 +22,12 @@ use crate::document::{Document, Problems, RenamedKey, problem_at, read_text, sch
 use crate::geometry::{Aperture, Pose};
 use crate::measuring::Layout;
 use crate::registration::{self, Coordinate, Start};
-use crate::surface::{DefinedSurface, Projection};
+use crate::surface::{DefinedSurface, PlaneProjection};
 
 use tables::RecipeFile;
 pub use tables::{
-    Acceptance, Compensation, Cycle, Grinding, Leaning, MachineParameters, Measure, Mode, Part, RegistrationSettings,
-    SpindleAxis, StartAt, Tilt, Um, Wheel,
+    Acceptance, Compensation, CycleSettings, Grinding, TiltKind, ParameterTolerances, MeasurementSettings, SelectionMode, Part, RegistrationSettings,
+    SpindleAxis, RegistrationStart, Tilt, Micrometres, WheelDimensions,
 };
 
 /// Checked recipe.
@@ -38,9 +38,9 @@ pub struct Recipe {
     /// Source of the nominal surface.
     pub nominal: NominalSource,
     /// Settings of the measurement.
-    pub measure: Measure,
+    pub measure: MeasurementSettings,
     /// Pattern of the measured points.
-    pub pattern: Pattern,
+    pub pattern: MeasuringPattern,
     /// Settings of the registration.
     pub registration: RegistrationSettings,
     /// Acceptance limits.
@@ -50,7 +50,7 @@ pub struct Recipe {
     /// Settings of grinding.
     pub grinding: Grinding,
     /// Maximum number of cycles, and the action if the part does not improve.
-    pub cycle: Cycle,
+    pub cycle: CycleSettings,
     /// Truth of a simulated cell, as written. Only the simulator reads it.
     pub simulation: Option<toml::Table>,
     path: PathBuf,
@@ -61,7 +61,7 @@ pub struct Recipe {
 
 /// Format of a table of points in the words of the recipe, for files that do not state it themselves.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct TableWords {
+pub struct TableSettings {
     /// Columns of x, y and z.
     pub columns: Option<String>,
     /// Unit. The default is mm.
@@ -78,9 +78,9 @@ pub enum NominalSource {
         /// Path of the file. Relative paths of a recipe are relative to the recipe.
         path: PathBuf,
         /// Format of a table of points.
-        table: TableWords,
+        table: TableSettings,
         /// Surface onto which scattered points are projected.
-        projection: Projection,
+        projection: PlaneProjection,
         /// Outline of the part, if it is smaller than the points.
         aperture: Option<Aperture>,
     },
@@ -90,20 +90,20 @@ pub enum NominalSource {
 
 /// Pattern of the measured points.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Pattern {
+pub enum MeasuringPattern {
     /// Points that Regrind lays out.
-    Laid(Layout),
+    Generated(Layout),
     /// Points of a file, in the model frame.
     File {
         /// Path of the file. Relative paths of a recipe are relative to the recipe.
         path: PathBuf,
         /// Format of a table of points.
-        table: TableWords,
+        table: TableSettings,
     },
     /// Points that the operator chooses. The machine receives no plan.
     Free {
         /// Minimum number of points.
-        least_points: u32,
+        min_points: u32,
     },
 }
 
@@ -147,8 +147,8 @@ impl Recipe {
             NominalSource::Surface(_) => None,
         };
         let pattern = match &self.pattern {
-            Pattern::File { path, .. } => Some(path.as_path()),
-            Pattern::Laid(_) | Pattern::Free { .. } => None,
+            MeasuringPattern::File { path, .. } => Some(path.as_path()),
+            MeasuringPattern::Generated(_) | MeasuringPattern::Free { .. } => None,
         };
         nominal.into_iter().chain(pattern).collect()
     }
@@ -160,7 +160,7 @@ impl Recipe {
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         let notes = document.rename_keys(RENAMED);
-        document.hold_against(&SCHEMA);
+        document.check_schema(&SCHEMA);
         let written: Option<RecipeFile> = document.as_written();
         let made = written.as_ref().map(|written| check::check(written, path, &mut document));
         document.finish()?;
@@ -204,23 +204,23 @@ impl Recipe {
         registration::Options {
             distance_model: settings.distance,
             start: match settings.start {
-                StartAt::Search => Start::Search,
-                StartAt::Fixture => Start::Pose(fixture_cmm_from_model),
+                RegistrationStart::Search => Start::Search,
+                RegistrationStart::Fixture => Start::Pose(fixture_cmm_from_model),
             },
             side: self.measure.side,
             locked: Coordinate::locked_flags(&settings.lock),
             loss: settings.loss,
             outlier_sigmas: settings.outlier_sigmas,
-            rms_limit_mm: settings.max_rms_um.map(Um::mm),
+            rms_limit_mm: settings.max_rms_um.map(Micrometres::mm),
             ..registration::Options::new(self.measure.probe_radius_mm)
         }
     }
 
     /// Returns the probability with which a figure must be within its limit. Unless the recipe sets it, the risk of a
     /// wrong acceptance is at most the accepted risk of a measurement with chosen touches.
-    pub fn probability(&self) -> f64 {
-        let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == Mode::Adaptive);
-        let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::USUAL).map_or(Tolerance::USUAL, |risk| 1.0 - risk);
+    pub fn required_probability(&self) -> f64 {
+        let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == SelectionMode::Adaptive);
+        let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::DEFAULT_PROBABILITY).map_or(Tolerance::DEFAULT_PROBABILITY, |risk| 1.0 - risk);
         self.acceptance.probability.unwrap_or(usual)
     }
 

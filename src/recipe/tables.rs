@@ -7,20 +7,20 @@
 use schemars::{JsonSchema, Schema, json_schema};
 use serde::{Deserialize, Serialize};
 
-use crate::cell::{Beginning, Disposal, PvOf};
-use crate::compensation::path::{PathMode, Pattern as TrackPattern};
-use crate::compensation::{GainRule, Order, Roughness, Smoothing};
+use crate::cell::{FirstStep, HoldOrStop, PvPoints};
+use crate::compensation::path::{PathMode, TrackPattern as TrackPattern};
+use crate::compensation::{GainRule, FilterOrder, SplineSmoothness, Smoothing};
 use crate::geometry::Aperture;
 use crate::registration::{Coordinate, Loss, ProbeSide};
 use crate::surface::analytic::{Formula, SamplingDefinition};
-use crate::surface::{Distance, Projection};
+use crate::surface::{DistanceModel, PlaneProjection};
 
 /// A length in micrometres, as recipes have it.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq, PartialOrd, Serialize)]
 #[serde(transparent)]
-pub struct Um(pub f64);
+pub struct Micrometres(pub f64);
 
-impl Um {
+impl Micrometres {
     /// Returns the length in millimetres.
     pub fn mm(self) -> f64 {
         1e-3 * self.0
@@ -42,7 +42,7 @@ pub(super) struct RecipeFile {
     pub nominal: NominalTable,
     /// Measurement of the part.
     #[schemars(extend("x-required" = true))]
-    pub measure: Measure,
+    pub measure: MeasurementSettings,
     /// Registration of the measured points.
     pub registration: RegistrationSettings,
     /// Acceptance limits of the part: at least one of pv_um and rms_um.
@@ -55,7 +55,7 @@ pub(super) struct RecipeFile {
     #[schemars(extend("x-required" = true))]
     pub grinding: Grinding,
     /// Number of cycles, and the response to a cycle without improvement.
-    pub cycle: Cycle,
+    pub cycle: CycleSettings,
     /// Truth of a simulated cell; real cells ignore it.
     #[schemars(schema_with = "any_table")]
     pub simulation: Option<toml::Table>,
@@ -101,7 +101,7 @@ pub(super) struct NominalTable {
     #[schemars(length(min = 1, max = 12), example = &"um")]
     pub height_unit: Option<String>,
     /// Projection of scattered points of a file for the triangulation.
-    pub projection: Option<Projection>,
+    pub projection: Option<PlaneProjection>,
     /// A formula z(x, y).
     #[schemars(with = "Option<Formula>")]
     pub surface: Option<toml::Table>,
@@ -116,7 +116,7 @@ pub(super) struct NominalTable {
 /// Pattern of the targets.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum PatternWord {
+pub(super) enum PatternKind {
     /// A grid: spacing_mm, or columns and rows.
     #[default]
     Grid,
@@ -131,7 +131,7 @@ pub(super) enum PatternWord {
 /// Targets that the CMM touches.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Mode {
+pub enum SelectionMode {
     /// All targets of the pattern.
     #[default]
     Fixed,
@@ -143,12 +143,12 @@ pub enum Mode {
 /// Measurement of the part.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
-pub struct Measure {
+pub struct MeasurementSettings {
     /// Radius of the probe, or of the reflector of a tracker.
     #[schemars(range(min = 0.05, max = 50.0), example = 1.5)]
     pub probe_radius_mm: f64,
     /// Targets that the CMM touches.
-    pub mode: Mode,
+    pub mode: SelectionMode,
     /// Probability of accepting a part that is out of tolerance, in mode adaptive, which requires this key. By writing
     /// this key you accept the risk.
     #[schemars(range(min = 0.01, max = 0.1), example = 0.025)]
@@ -156,7 +156,7 @@ pub struct Measure {
     /// Side of the nominal surface on which the probe centres are.
     pub side: ProbeSide,
     /// Pattern of the targets.
-    pub(super) pattern: PatternWord,
+    pub(super) pattern: PatternKind,
     /// Distance between the points of a grid or a spiral.
     #[schemars(range(min = 0.005, max = 10000.0))]
     pub(super) spacing_mm: Option<f64>,
@@ -204,7 +204,7 @@ pub struct Measure {
     pub qualify: bool,
     /// Maximum difference between the radius found on the reference sphere and that of the probe.
     #[schemars(range(min = 0.05, max = 1000.0))]
-    pub radius_tolerance_um: Um,
+    pub radius_tolerance_um: Micrometres,
     /// Minimum and maximum temperature of a measurement, in °C. With this key, a measurement without a temperature is
     /// not used.
     #[schemars(inner(range(min = -40.0, max = 120.0)), example = [19.5, 20.5])]
@@ -214,7 +214,7 @@ pub struct Measure {
 /// Start of a registration.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum StartAt {
+pub enum RegistrationStart {
     /// A search for the pose.
     #[default]
     Search,
@@ -227,7 +227,7 @@ pub enum StartAt {
 #[serde(default, deny_unknown_fields)]
 pub struct RegistrationSettings {
     /// Shape of the nominal surface between its points.
-    pub distance: Distance,
+    pub distance: DistanceModel,
     /// Loss function of the distances: the square, or less for a large distance.
     pub loss: Loss,
     /// Outlier limit in robust standard deviations. A point farther away does not affect the pose. It counts in the
@@ -242,9 +242,9 @@ pub struct RegistrationSettings {
     /// Without this key the fixture is assumed to be exact, and setting and tilt are not estimated, because they have
     /// the same effect.
     #[schemars(range(min = 0.0, max = 10000.0), example = 0.5)]
-    pub lock_uncertainty_um: Option<Um>,
+    pub lock_uncertainty_um: Option<Micrometres>,
     /// Start of the registration: a search, or the pose of the cell's fixture.
-    pub start: StartAt,
+    pub start: RegistrationStart,
     /// Maximum shift of the part from its position in the fixture.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub max_shift_mm: f64,
@@ -256,7 +256,7 @@ pub struct RegistrationSettings {
     pub min_coverage: f64,
     /// Maximum rms deviation of a fit; a fit with a larger one is refused.
     #[schemars(range(min = 0.01, max = 1000000.0))]
-    pub max_rms_um: Option<Um>,
+    pub max_rms_um: Option<Micrometres>,
 }
 
 /// Acceptance limits of the part.
@@ -265,12 +265,12 @@ pub struct RegistrationSettings {
 pub struct Acceptance {
     /// Maximum peak to valley of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
-    pub pv_um: Option<Um>,
+    pub pv_um: Option<Micrometres>,
     /// Points that the peak to valley includes.
-    pub pv_of: PvOf,
+    pub pv_of: PvPoints,
     /// Maximum rms of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
-    pub rms_um: Option<Um>,
+    pub rms_um: Option<Micrometres>,
     /// Whether a figure must be within its limit with `probability`. If false, the most probable value is compared with
     /// the limit.
     pub expanded_uncertainty: bool,
@@ -293,7 +293,7 @@ pub struct Compensation {
     /// Root mean square of the error that is new in each pass, if it is known. Without this key, it is estimated from
     /// the cycles.
     #[schemars(range(min = 0.001, max = 1000.0))]
-    pub repeatability_um: Option<Um>,
+    pub repeatability_um: Option<Micrometres>,
     /// Start with the repeatable error that the last finished run found, if the run had the same part and cell, the
     /// same wheel and way of grinding, the same number of targets, and the same cut-off, smoothing and gain. The form
     /// of earlier parts after the same kind of pass is then the prior of the form, as far as the measurement agrees
@@ -301,31 +301,31 @@ pub struct Compensation {
     pub learn: bool,
     /// Minimum removal of a pass, at the place where it removes least.
     #[schemars(range(min = 0.0, max = 1000.0))]
-    pub min_depth_um: Um,
+    pub min_depth_um: Micrometres,
     /// Cut-off wavelength; shorter waves are not corrected.
     #[schemars(range(min = 0.05, max = 10000.0), example = 8.0)]
     pub cutoff_mm: f64,
     /// Filter that smooths the map of the deviations.
     pub smoothing: Smoothing,
     /// Polynomials that the Gaussian filters pass unchanged.
-    pub filter_order: Order,
+    pub filter_order: FilterOrder,
     /// Choice of the spline's smoothness, if `smoothing` is a spline.
-    pub roughness: Roughness,
+    pub roughness: SplineSmoothness,
     /// Maximum correction at any place of the part.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
-    pub max_correction_um: Um,
+    pub max_correction_um: Micrometres,
     /// Maximum removal at any place below the surface of the first pass, over all passes: the allowance plus the
     /// permitted depth below the nominal surface.
     #[schemars(range(min = 0.01, max = 100000.0), example = 300.0)]
-    pub removal_budget_um: Um,
+    pub removal_budget_um: Micrometres,
     /// Depth of each pass below the pass before. A pass goes deeper if the part is so low at a place that the wheel
     /// would otherwise cut air there. Locally, it removes in addition the height of the excess material. The limit of
     /// the machine is grinder.limits.max_depth_mm of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
-    pub depth_of_cut_um: Um,
+    pub depth_of_cut_um: Micrometres,
     /// Parameters of the machine that are compensated after the first pass, each with its tolerance; the map has the
     /// rest of the error. Default: the map has the whole error.
-    pub parameters: Option<MachineParameters>,
+    pub parameters: Option<ParameterTolerances>,
     /// Distance between the nodes of the map.
     #[schemars(range(min = 0.01, max = 10000.0))]
     pub spacing_mm: f64,
@@ -339,19 +339,19 @@ pub struct Compensation {
 /// tolerance is compensated if it exceeds its uncertainty. If it exceeds its tolerance, a person is asked.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
-pub struct MachineParameters {
+pub struct ParameterTolerances {
     /// Tolerance of the radius of a spherical wheel.
     #[schemars(range(min = 0.1, max = 10000.0), example = 100.0)]
-    pub wheel_radius_um: Option<Um>,
+    pub wheel_radius_um: Option<Micrometres>,
     /// Tolerance of the setting of the wheel along x; estimated if x is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
-    pub wheel_x_um: Option<Um>,
+    pub wheel_x_um: Option<Micrometres>,
     /// Tolerance of the setting of the wheel along y; estimated if y is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
-    pub wheel_y_um: Option<Um>,
+    pub wheel_y_um: Option<Micrometres>,
     /// Tolerance of the height of the wheel; estimated if z is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
-    pub wheel_z_um: Option<Um>,
+    pub wheel_z_um: Option<Micrometres>,
     /// Tolerance of the tilt of the part in the grinder about x; estimated if rx is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 60.0)]
     pub part_tilt_x_urad: Option<f64>,
@@ -360,11 +360,11 @@ pub struct MachineParameters {
     pub part_tilt_y_urad: Option<f64>,
 }
 
-impl MachineParameters {
+impl ParameterTolerances {
     /// Returns the tolerances in millimetres and radians, in the order of [`crate::compensation::ParameterKind::ALL`].
     pub fn tolerances(&self) -> [Option<f64>; crate::compensation::ParameterKind::COUNT] {
         let [radius, x, y, z] =
-            [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Um::mm));
+            [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Micrometres::mm));
         let [tilt_x, tilt_y] = [self.part_tilt_x_urad, self.part_tilt_y_urad].map(|urad| urad.map(|urad| 1e-6 * urad));
         [radius, x, y, z, tilt_x, tilt_y, None]
     }
@@ -376,7 +376,7 @@ impl MachineParameters {
 pub struct Grinding {
     /// The wheel.
     #[schemars(extend("x-required" = true))]
-    pub wheel: Wheel,
+    pub wheel: WheelDimensions,
     /// Tilt of the wheel, on a grinder with a tilting head. Default: the wheel is upright.
     pub tilt: Option<Tilt>,
     /// Feed along the track.
@@ -395,7 +395,7 @@ pub struct Grinding {
     pub scallop_nm: Option<f64>,
     /// Maximum distance of the straight lines of the program from the path of the wheel's centre.
     #[schemars(range(min = 0.001, max = 100.0))]
-    pub chord_error_um: Um,
+    pub chord_error_um: Micrometres,
     /// Length of the tracks beyond the edge of the part.
     #[schemars(range(min = 0.0, max = 1000.0))]
     pub overrun_mm: f64,
@@ -406,13 +406,13 @@ pub struct Grinding {
     pub path_mode: PathMode,
     /// Maximum rounding of a corner by the controller with path_mode = "blend".
     #[schemars(range(min = 0.001, max = 1000.0))]
-    pub path_tolerance_um: Um,
+    pub path_tolerance_um: Micrometres,
     /// Passes without in-feed at the end.
     #[schemars(range(max = 20))]
     pub spark_out_passes: u16,
     /// Level of the first pass above the nominal surface; each further pass goes deeper by the depth of cut.
     #[schemars(range(min = 0.0, max = 10000.0))]
-    pub allowance_um: Um,
+    pub allowance_um: Micrometres,
     /// Grinding ratio G: mm³ of material removed for each mm³ of wheel worn. Only `regrind plan` uses it, to estimate
     /// the wear of the wheel.
     #[schemars(range(min = 0.01, max = 1000000.0), example = 200.0)]
@@ -422,7 +422,7 @@ pub struct Grinding {
 /// Mode of the tilt of a wheel.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
-pub enum Leaning {
+pub enum TiltKind {
     /// The same angle everywhere.
     #[default]
     Constant,
@@ -436,7 +436,7 @@ pub enum Leaning {
 #[serde(default, deny_unknown_fields)]
 pub struct Tilt {
     /// Mode of the tilt: constant, or following the surface.
-    pub lean: Leaning,
+    pub lean: TiltKind,
     /// Angle of the head, right-handed about its axis: from upright, or from the normal if the head follows the
     /// surface. A positive B tilts to +x, a positive A to -y.
     #[schemars(range(min = -90.0, max = 90.0), extend("x-required" = true), example = 20.0)]
@@ -445,7 +445,7 @@ pub struct Tilt {
 
 impl Default for Tilt {
     fn default() -> Self {
-        Self { lean: Leaning::Constant, angle_deg: f64::NAN }
+        Self { lean: TiltKind::Constant, angle_deg: f64::NAN }
     }
 }
 
@@ -462,7 +462,7 @@ pub enum SpindleAxis {
 /// A wheel by its dimensions, as it is ordered and dressed; [`crate::compensation::path::Wheel`] is one that stands on a part.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(tag = "shape", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Wheel {
+pub enum WheelDimensions {
     /// A ball.
     Sphere {
         /// Its radius.
@@ -500,7 +500,7 @@ pub enum Wheel {
     },
 }
 
-impl Wheel {
+impl WheelDimensions {
     /// Returns the wheel radius that the grinder uses.
     pub fn radius_mm(&self) -> f64 {
         match *self {
@@ -517,32 +517,32 @@ fn missing() -> f64 {
 /// Number of cycles, and the response to a cycle without improvement.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
-pub struct Cycle {
+pub struct CycleSettings {
     /// First step of the first cycle: a pass, or a measurement of the part as it is.
-    pub begin_with: Beginning,
+    pub begin_with: FirstStep,
     /// Maximum number of cycles of grinding and measuring.
     #[schemars(range(min = 1, max = 100))]
     pub max_cycles: u16,
     /// Response to a stall: a cycle that improves the part by next to nothing.
-    pub on_stall: Disposal,
+    pub on_stall: HoldOrStop,
     /// Response to a cycle that makes the part worse.
-    pub on_divergence: Disposal,
+    pub on_divergence: HoldOrStop,
     /// Minimum decrease of the rms in a cycle. A cycle stalls if its rms decreases, or is expected to decrease, by less
     /// than this, or by less than 2 %.
     #[schemars(range(min = 0.0, max = 10000.0))]
-    pub stall_um: Um,
+    pub stall_um: Micrometres,
     /// Whether a person at the cell confirms a part from the queue of a plant before its run begins.
     pub confirm_work: bool,
 }
 
-impl Default for Measure {
+impl Default for MeasurementSettings {
     fn default() -> Self {
         Self {
             probe_radius_mm: f64::NAN,
-            mode: Mode::Fixed,
+            mode: SelectionMode::Fixed,
             accepted_risk: None,
             side: ProbeSide::Auto,
-            pattern: PatternWord::Grid,
+            pattern: PatternKind::Grid,
             spacing_mm: None,
             columns: None,
             rows: None,
@@ -558,7 +558,7 @@ impl Default for Measure {
             safe_height_mm: 10.0,
             min_coverage: 0.95,
             qualify: true,
-            radius_tolerance_um: Um(2.0),
+            radius_tolerance_um: Micrometres(2.0),
             temperature_c: None,
         }
     }
@@ -567,12 +567,12 @@ impl Default for Measure {
 impl Default for RegistrationSettings {
     fn default() -> Self {
         Self {
-            distance: Distance::Curved,
+            distance: DistanceModel::Curved,
             loss: Loss::None,
             outlier_sigmas: 6.0,
             lock: Vec::new(),
             lock_uncertainty_um: None,
-            start: StartAt::Search,
+            start: RegistrationStart::Search,
             max_shift_mm: 5.0,
             max_turn_deg: 5.0,
             min_coverage: 0.5,
@@ -590,7 +590,7 @@ impl Compensation {
 
 impl Default for Acceptance {
     fn default() -> Self {
-        Self { pv_um: None, pv_of: PvOf::default(), rms_um: None, expanded_uncertainty: true, probability: None }
+        Self { pv_um: None, pv_of: PvPoints::default(), rms_um: None, expanded_uncertainty: true, probability: None }
     }
 }
 
@@ -603,13 +603,13 @@ impl Default for Compensation {
             repeatability_um: None,
             learn: false,
             smoothing: Smoothing::default(),
-            filter_order: Order::default(),
-            roughness: Roughness::default(),
-            min_depth_um: Um(0.5),
+            filter_order: FilterOrder::default(),
+            roughness: SplineSmoothness::default(),
+            min_depth_um: Micrometres(0.5),
             cutoff_mm: f64::NAN,
-            max_correction_um: Um(f64::NAN),
-            removal_budget_um: Um(f64::NAN),
-            depth_of_cut_um: Um(f64::NAN),
+            max_correction_um: Micrometres(f64::NAN),
+            removal_budget_um: Micrometres(f64::NAN),
+            depth_of_cut_um: Micrometres(f64::NAN),
             spacing_mm: 1.0,
             max_displacement_mm: 1.0,
         }
@@ -619,33 +619,33 @@ impl Default for Compensation {
 impl Default for Grinding {
     fn default() -> Self {
         Self {
-            wheel: Wheel::Sphere { radius_mm: f64::NAN },
+            wheel: WheelDimensions::Sphere { radius_mm: f64::NAN },
             tilt: None,
             feed_mm_min: f64::NAN,
             track_mm: None,
             pattern: TrackPattern::Raster,
             one_way: false,
             scallop_nm: None,
-            chord_error_um: Um(0.1),
+            chord_error_um: Micrometres(0.1),
             overrun_mm: 2.0,
             safe_height_mm: 10.0,
             path_mode: PathMode::Blend,
-            path_tolerance_um: Um(0.1),
+            path_tolerance_um: Micrometres(0.1),
             spark_out_passes: 2,
-            allowance_um: Um(0.0),
+            allowance_um: Micrometres(0.0),
             grinding_ratio: None,
         }
     }
 }
 
-impl Default for Cycle {
+impl Default for CycleSettings {
     fn default() -> Self {
         Self {
-            begin_with: Beginning::Grind,
+            begin_with: FirstStep::Grind,
             max_cycles: 5,
-            on_stall: Disposal::Stop,
-            on_divergence: Disposal::Hold,
-            stall_um: Um(0.0),
+            on_stall: HoldOrStop::Stop,
+            on_divergence: HoldOrStop::Hold,
+            stall_um: Micrometres(0.0),
             confirm_work: true,
         }
     }

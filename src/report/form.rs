@@ -9,19 +9,19 @@ use serde_json::Value;
 
 use super::ReportError;
 use super::axis::three_digits;
-use super::story::Story;
+use super::run_history::RunHistory;
 use regrind_formats::{FormatError, escaped};
 
 /// Returns the figures of all cycles that have some: a row for each figure, a column for each cycle, and notes on each
 /// figure.
-pub(super) fn form(story: &Story, folder: &Path) -> Result<String, ReportError> {
+pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
     for (number, cycle) in &story.cycles {
         let Some(name) = &cycle.form else { continue };
         cycles.push((*number, read_figures(&folder.join(name))?));
     }
     let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
-    let html = format!("<h2>Form of the surface</h2>\n{}{}", told(&cycles, last), raw(&cycles, last));
+    let html = format!("<h2>Form of the surface</h2>\n{}{}", estimated_figures(&cycles, last), raw(&cycles, last));
     Ok(html + &notations(&cycles))
 }
 
@@ -45,7 +45,7 @@ fn heads(cycles: &[(u32, Value)]) -> String {
 }
 
 /// Returns the figures that the model estimates, with their intervals; empty for files of earlier versions.
-fn told(cycles: &[(u32, Value)], last: &Value) -> String {
+fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
     let list = listed(last, "form");
     if list.is_empty() {
         return String::new();

@@ -34,7 +34,7 @@ pub struct HeatMap {
     /// Object that the figures in the last line describe, and name of the counted items.
     figures_of: [&'static str; 2],
     /// Maximum size of the map on the page, in pixels of the page.
-    largest: [f64; 2],
+    max_size: [f64; 2],
 }
 
 impl HeatMap {
@@ -60,7 +60,7 @@ impl HeatMap {
             points: samples.len(),
             lines: Vec::new(),
             figures_of: ["", "points"],
-            largest: [WIDTH, HEIGHT],
+            max_size: [WIDTH, HEIGHT],
         };
         Ok(map.with_colours(ColourMap::Diverging))
     }
@@ -145,8 +145,8 @@ impl HeatMap {
     }
 
     /// Sets the maximum size of the map in pixels of the page, along x and along y.
-    pub fn at_most(self, largest: [f64; 2]) -> Self {
-        Self { largest, ..self }
+    pub fn with_max_size(self, largest: [f64; 2]) -> Self {
+        Self { max_size: largest, ..self }
     }
 
     /// Clears all pixels outside an aperture, even where a gap between samples would be filled.
@@ -254,7 +254,7 @@ impl HeatMap {
     /// Returns the size of the map in pixels of the page.
     fn size(&self) -> [f64; 2] {
         let extent_mm = self.extent_mm();
-        let scale = (self.largest[0] / extent_mm[0]).min(self.largest[1] / extent_mm[1]);
+        let scale = (self.max_size[0] / extent_mm[0]).min(self.max_size[1] / extent_mm[1]);
         // A long narrow part is drawn out of scale, because otherwise it would be only a line.
         extent_mm.map(|e| (e * scale).max(90.0))
     }
@@ -437,7 +437,7 @@ mod tests {
     #[test]
     fn maps_with_one_limit_have_one_scale_and_say_what_they_are_of() {
         let map = HeatMap::new("Cycle 1", "deviation", "µm", &SMALL_MAP).unwrap().of_nodes();
-        let map = map.with_limit(8e-3).unwrap().with_lines(vec!["mirror, SN 7".into()]).at_most([200.0, 200.0]);
+        let map = map.with_limit(8e-3).unwrap().with_lines(vec!["mirror, SN 7".into()]).with_max_size([200.0, 200.0]);
         assert_eq!((map.limit(), map.tones.tolerance), (8e-3, None));
         let svg = map.to_svg().unwrap();
         let document = roxmltree::Document::parse(&svg).unwrap();
@@ -460,7 +460,7 @@ mod tests {
         assert_eq!(broken(line, 12), ["PV 4.00 µm,", "RMS 1.29", "µm, 6 points"]);
         // A text without a place to break stays whole.
         assert_eq!((broken("unbroken", 3), broken("", 5)), (vec!["unbroken".to_owned()], vec![String::new()]));
-        let narrow = HeatMap::of_lengths("strip", "height", &SMALL_MAP).unwrap().at_most([10.0, 90.0]);
+        let narrow = HeatMap::of_lengths("strip", "height", &SMALL_MAP).unwrap().with_max_size([10.0, 90.0]);
         let narrow = narrow.with_tolerance(1e-3).unwrap();
         let svg = narrow.to_svg().unwrap();
         let document = roxmltree::Document::parse(&svg).unwrap();

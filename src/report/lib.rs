@@ -16,13 +16,13 @@
 
 mod axis;
 mod colour;
-mod course;
+mod convergence;
 mod dfq;
 mod form;
 mod heat_map;
 mod maps;
 mod marked;
-mod means;
+mod equipment;
 mod plot;
 mod ply;
 mod qif;
@@ -30,10 +30,10 @@ mod raster;
 mod results;
 mod run;
 mod states;
-mod story;
+mod run_history;
 mod summary;
 mod svg;
-mod told;
+mod record_content;
 mod words;
 mod xml;
 
@@ -52,7 +52,7 @@ pub use ply::{coloured_ply, save_coloured_ply};
 pub use results::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_results};
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
-pub use story::AlarmStory;
+pub use run_history::AlarmHistory;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
 pub use words::{ending_words, in_air, words};
 

@@ -5,10 +5,10 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::course::histogram;
+use super::convergence::histogram;
 use super::heat_map::HeatMap;
 use super::run::when;
-use super::story::Story;
+use super::run_history::RunHistory;
 use super::{ReportError, range};
 use regrind_formats::{MapNode, escaped, read_error_map};
 
@@ -20,15 +20,15 @@ const ALONE: [f64; 2] = [600.0, 460.0];
 const BESIDE: f64 = 172.0;
 
 /// Map of a cycle with its heading.
-struct Drawn {
+struct CycleMap {
     cycle: u32,
     title: String,
     part: String,
     samples_um: Vec<[f64; 3]>,
 }
 
-impl Drawn {
-    fn largest_um(&self) -> f64 {
+impl CycleMap {
+    fn max_magnitude_um(&self) -> f64 {
         let [low, high] = range(self.samples_um.iter().map(|s| s[2]));
         low.abs().max(high.abs())
     }
@@ -37,7 +37,7 @@ impl Drawn {
     fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
         let width = largest[0] + BESIDE;
         let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
-            .and_then(|map| map.of_nodes().at_most(largest).with_limit(limit_um))
+            .and_then(|map| map.of_nodes().with_max_size(largest).with_limit(limit_um))
             .and_then(|map| map.with_lines(vec![shortened(&self.part, width, 6.8)]).to_svg());
         let drawn = match svg {
             Ok(svg) => within_html(&svg),
@@ -63,28 +63,28 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
 }
 
 /// Draws the maps that are on record.
-pub(super) fn maps(story: &Story, folder: &Path, begin: &Value) -> Result<String, ReportError> {
+pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };
     let first = mapped().next().filter(|(cycle, _)| *cycle != last.0);
     let part = begin["content"]["part_name"].as_str().unwrap_or("Part");
     let serial = story.begin.as_ref().map_or("", |begin| begin.part.as_str());
     let mark = if begin["simulation"] == true { " (SIMULATION)" } else { "" };
-    let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<Drawn, ReportError> {
+    let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<CycleMap, ReportError> {
         let nodes = read_error_map(&folder.join(name))?;
         let samples_um = nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
         let title = format!("Cycle {cycle}, {}{mark}", when(utc));
-        Ok(Drawn { cycle, title, part: format!("{part}, {serial}"), samples_um })
+        Ok(CycleMap { cycle, title, part: format!("{part}, {serial}"), samples_um })
     };
     let (first, last) = (first.map(read).transpose()?, read(last)?);
     let mut html = "<h2>Error of the part, filtered</h2>\n".to_owned();
     if let Some(first) = first {
-        let common = first.largest_um().max(last.largest_um());
+        let common = first.max_magnitude_um().max(last.max_magnitude_um());
         for drawn in [&first, &last] {
             html += &drawn.figure(common, OF_A_PAIR, "on one scale")?;
         }
     }
-    html += &last.figure(last.largest_um(), ALONE, "on its own scale")?;
+    html += &last.figure(last.max_magnitude_um(), ALONE, "on its own scale")?;
     let heading = format!("Cycle {}, {}", last.cycle, last.part);
     let spread = histogram(&shortened(&heading, 460.0, 8.5), &last.samples_um)?;
     let _ = writeln!(html, "<figure>{}</figure>", within_html(&spread));

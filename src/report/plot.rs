@@ -59,7 +59,7 @@ impl Plot {
         svg.frame(&Frame {
             corner: CORNER,
             size: SIZE,
-            x_ticks: x.ticks(self.most_x_ticks()),
+            x_ticks: x.ticks(self.max_x_ticks()),
             y_ticks: y.ticks(8),
             x_label: &self.x.label,
             y_label: &self.y.label,
@@ -84,7 +84,7 @@ impl Plot {
     }
 
     /// Returns the maximum number of ticks of the x axis. Counts get no ticks at fractions.
-    fn most_x_ticks(&self) -> usize {
+    fn max_x_ticks(&self) -> usize {
         const MOST: usize = 10;
         let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
         let [low, high] = super::range(all());

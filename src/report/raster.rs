@@ -146,9 +146,9 @@ fn extent(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
 }
 
 fn check(title: &str, samples: &[[f64; 3]]) -> Result<(), ReportError> {
-    const LEAST: usize = 2;
-    if samples.len() < LEAST {
-        return Err(ReportError::TooFewPoints { figure: title.into(), found: samples.len(), least: LEAST });
+    const MIN_POINTS: usize = 2;
+    if samples.len() < MIN_POINTS {
+        return Err(ReportError::TooFewPoints { figure: title.into(), found: samples.len(), least: MIN_POINTS });
     }
     for (index, sample) in samples.iter().enumerate() {
         if let Some(k) = sample.iter().position(|c| !c.is_finite()) {

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use super::form::read_figures;
-use super::story::{CycleStory, Measurement, Story};
+use super::run_history::{CycleHistory, Measurement, RunHistory};
 use super::words::{ending_words, verdict_words};
 use super::{ReportError, dfq, qif};
 use regrind_cell::{Conformity, Ending, Figures, Tolerance, Verdict};
@@ -47,8 +47,8 @@ pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Pat
 /// # Errors
 /// Fails if the record does not pass verification, or if nothing was measured.
 pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
-    let (story, verified) = Story::proven(folder)?;
-    let results = Results::of(&story, verified.head.to_string()).with_areas(&story, folder)?;
+    let (story, verified) = RunHistory::read_verified(folder)?;
+    let results = Results::from_history(&story, verified.head.to_string()).with_areas(&story, folder)?;
     if results.measured.iter().all(|of| of.figures.is_empty()) {
         return Err(ReportError::NothingMeasured { run: results.run });
     }
@@ -126,14 +126,14 @@ pub(super) enum Standing {
 }
 
 impl Results {
-    fn of(story: &Story, head: String) -> Self {
+    fn from_history(story: &RunHistory, head: String) -> Self {
         let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
         let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
         let content = |key: &str| text(&begin["content"][key]);
         let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
         let tolerance = story.tolerance();
-        let all = |(cycle, of): (&u32, &CycleStory)| {
-            let measured = |one: &Measurement| Measured::of(*cycle, one, tolerance.as_ref());
+        let all = |(cycle, of): (&u32, &CycleHistory)| {
+            let measured = |one: &Measurement| Measured::new(*cycle, one, tolerance.as_ref());
             of.measurements.iter().map(measured).collect::<Vec<_>>()
         };
         Self {
@@ -165,7 +165,7 @@ impl Results {
     }
 
     /// Adds the figures of an area to the last measurement of each cycle. They are read from a file of the cycle.
-    fn with_areas(mut self, story: &Story, folder: &Path) -> Result<Self, ReportError> {
+    fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
             let told = read_figures(&folder.join(name))?;
@@ -179,7 +179,7 @@ impl Results {
 }
 
 impl Measured {
-    fn of(cycle: u32, of: &Measurement, tolerance: Option<&Tolerance>) -> Self {
+    fn new(cycle: u32, of: &Measurement, tolerance: Option<&Tolerance>) -> Self {
         let judgement = of.judgements.last();
         let figures = of.figures.as_ref().map(|figures| figures_of(figures, tolerance, judgement.is_some()));
         let mut figures = figures.unwrap_or_default();
@@ -241,7 +241,7 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
             };
             Figure {
                 kind: Kind { name: compared.name, what: what_of(compared.name, of_form), limit_mm },
-                found_mm: compared.found_mm,
+                found_mm: compared.median_mm,
                 expanded_mm: compared.expanded_mm,
                 standing,
             }
@@ -258,12 +258,12 @@ const RMS: &str = "root mean square of the deviations from the nominal surface a
 
 const FORM_PV: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
                        the probe taken off";
-const FORM_MOST: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
+const FORM_PV_998: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
                          the probe taken off, over the aperture: the touched points and the places between them, without the outermost 0.1 % of \
                          these at either end";
 const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, the scatter \
                         of the probe taken off";
-const MOST: &str =
+const PV_998: &str =
     "largest less least deviation from the nominal surface along its normal, without the outermost 0.1 % at either end";
 
 fn what_of(name: &str, of_form: bool) -> &'static str {
@@ -272,8 +272,8 @@ fn what_of(name: &str, of_form: bool) -> &'static str {
         ("RMS", true) => FORM_RMS,
         ("PV", false) => PV,
         ("PV", true) => FORM_PV,
-        (_, false) => MOST,
-        (_, true) => FORM_MOST,
+        (_, false) => PV_998,
+        (_, true) => FORM_PV_998,
     }
 }
 

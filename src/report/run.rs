@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use super::ReportError;
-use super::course::convergence;
+use super::convergence::convergence;
 use super::form::form;
 use super::maps::{maps, within_html};
-use super::means::{last_model, last_registration, means, registered, signatures};
-use super::story::{Measurement, PassStory, Story};
+use super::equipment::{last_model, last_registration, equipment, registered, signatures};
+use super::run_history::{Measurement, PassHistory, RunHistory};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
-use regrind_cell::{Compared, Conformity, Ending, Figures, JobResult, ParameterTold, Tolerance};
+use regrind_cell::{ComparedFigure, Conformity, Ending, Figures, JobResult, RecordedParameter, Tolerance};
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
@@ -52,11 +52,11 @@ pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
 /// # Errors
 /// Fails if the record does not pass verification, or if a file on record cannot be read.
 pub fn run_report(folder: &Path) -> Result<String, ReportError> {
-    let (story, verified) = Story::proven(folder)?;
+    let (story, verified) = RunHistory::read_verified(folder)?;
     html(&story, folder, &verified)
 }
 
-fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, ReportError> {
+fn html(story: &RunHistory, folder: &Path, verified: &Verified) -> Result<String, ReportError> {
     let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
     let name = begin["content"]["part_name"].as_str().unwrap_or("Part");
     let run = begin["run"].as_str().unwrap_or_default();
@@ -72,7 +72,7 @@ fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, Rep
     html += &judged(story);
     let registration = last_registration(story, folder)?;
     html += &facts(story, &begin);
-    html += &means(story, registration.as_ref().map(|(_, found)| found));
+    html += &equipment(story, registration.as_ref().map(|(_, found)| found));
     html += &cycles(story);
     if let Some(plot) = convergence(story) {
         let _ = writeln!(html, "<figure>{}</figure>", within_html(&plot));
@@ -96,7 +96,7 @@ fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, Rep
     Ok(html)
 }
 
-fn verdict(story: &Story) -> String {
+fn verdict(story: &RunHistory) -> String {
     let (class, words) = match (&story.ending, story.home) {
         (Some(ending @ Ending::Accepted { .. }), _) => ("good", ending_words(ending)),
         (Some(ending), _) => ("bad", ending_words(ending)),
@@ -109,8 +109,8 @@ fn verdict(story: &Story) -> String {
 }
 
 /// Returns how far the last pass came, if it did not reach its end. The rest of the part is unchanged.
-fn broken_off_pass(story: &Story) -> String {
-    let Some(PassStory { cycle, ground, result }) = story.pass else { return String::new() };
+fn broken_off_pass(story: &RunHistory) -> String {
+    let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
     let how = match result {
         Some(JobResult::Complete) => return String::new(),
         Some(JobResult::Stopped) => "was stopped",
@@ -133,8 +133,8 @@ fn broken_off_pass(story: &Story) -> String {
 }
 
 /// Returns the judged figures of the last measurement with their limits.
-fn judged(story: &Story) -> String {
-    let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_found()) else {
+fn judged(story: &RunHistory) -> String {
+    let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_measured()) else {
         return String::new();
     };
     let judged = if of.judgements.is_empty() { "measured and not judged" } else { "judged" };
@@ -143,9 +143,9 @@ fn judged(story: &Story) -> String {
          <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
     );
     for compared in tolerance.compare(figures) {
-        let Compared { name, found_mm, expanded_mm, between_mm: [low_mm, high_mm], limit_mm, .. } = compared;
+        let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } = compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
-        let within = compared.within_in_words().unwrap_or_default();
+        let within = compared.probability_in_words().unwrap_or_default();
         let _ = writeln!(
             html,
             "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
@@ -165,8 +165,8 @@ fn um(mm: f64) -> String {
 }
 
 /// Returns the comparison of a figure with its limit, with the calculation shown to the reader.
-fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
-    let Compared { found_mm, held_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
+fn comparison(compared: &ComparedFigure, with_uncertainty: bool) -> String {
+    let ComparedFigure { median_mm: found_mm, compared_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
         return String::new();
     }
@@ -209,14 +209,14 @@ fn decision_rule(tolerance: &Tolerance) -> String {
          pose are in their uncertainty. Where no form shows they are known from above alone. U is half of the interval that holds the \
          figure with 95 %. PV is the largest less the least deviation along the normal{}.",
         match tolerance.pv_of {
-            regrind_cell::PvOf::All => ", of the touched points",
-            regrind_cell::PvOf::MostPoints =>
+            regrind_cell::PvPoints::All => ", of the touched points",
+            regrind_cell::PvPoints::MostPoints =>
                 ", PV 99.8 % that of the aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end",
         }
     )
 }
 
-fn facts(story: &Story, begin: &Value) -> String {
+fn facts(story: &RunHistory, begin: &Value) -> String {
     let Some(first) = &story.begin else { return String::new() };
     let content = |key: &str| begin["content"][key].as_str().unwrap_or("not recorded").to_owned();
     let source = |key: &str| format!("{}, sha256 {}", content(key), content(&format!("{key}_sha256")));
@@ -242,7 +242,7 @@ pub(super) fn when(utc: &str) -> String {
 }
 
 /// Returns a row for each measurement with its verdict, and below it the reason and further remarks.
-fn cycles(story: &Story) -> String {
+fn cycles(story: &RunHistory) -> String {
     let tolerance = story.tolerance();
     let named = |m: &Measurement| Some(tolerance.as_ref()?.compare(m.figures.as_ref()?)[0].name);
     let named = story.cycles.values().flat_map(|cycle| &cycle.measurements).filter_map(named).next_back();
@@ -274,9 +274,9 @@ fn cycles(story: &Story) -> String {
 
 /// Returns which part of a correction went into parameters of the machine, and which part was left for the map; empty
 /// if the recipe compensates no parameters.
-fn parameters(story: &Story) -> String {
-    let row = |number: u32, of: &ParameterTold| {
-        let ParameterTold { name, unit, off, expanded, taken, told, removes_rms_um } = of;
+fn parameters(story: &RunHistory) -> String {
+    let row = |number: u32, of: &RecordedParameter| {
+        let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
         format!(
             "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{off:.2} \u{b1} {expanded:.2} {unit}</td>\
              <td class=\"n\">{taken:.2} {unit}</td><td class=\"n\">{told:.2} {unit}</td><td class=\"n\">{removes_rms_um:.2}</td></tr>\n",
@@ -321,7 +321,7 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
     // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
-    let of = |tolerance: &Tolerance| tolerance.compare(f).map(|compared| [compared.found_mm, compared.expanded_mm]);
+    let of = |tolerance: &Tolerance| tolerance.compare(f).map(|compared| [compared.median_mm, compared.expanded_mm]);
     let [[pv_mm, pv_expanded_mm], [rms_mm, rms_expanded_mm]] = tolerance.map_or_else(points, of);
     format!(
         "<td class=\"n\">{} \u{b1} {}</td><td class=\"n\">{:.3} \u{b1} {:.3}</td><td class=\"n\">{}</td><td class=\"n\">{}</td>\
@@ -347,8 +347,8 @@ fn judgement_of(measurement: &Measurement) -> (String, String) {
     (verdict_words(last), format!("{}{earlier}", last.reason))
 }
 
-fn alarms(story: &Story) -> String {
-    let row = |told: &super::story::AlarmStory| {
+fn alarms(story: &RunHistory) -> String {
+    let row = |told: &super::run_history::AlarmHistory| {
         let withdrawn = told.withdrawn.as_deref().map_or("not withdrawn".to_owned(), when);
         [when(&told.raised), withdrawn, alarm_words(&told.alarm), role_words(&told.alarm)]
     };
@@ -356,8 +356,8 @@ fn alarms(story: &Story) -> String {
     table("Alarms", "alarms", "No alarm was raised.", heads, story.alarms.iter().map(row))
 }
 
-fn orders(story: &Story) -> String {
-    let row = |order: &super::story::Order| {
+fn orders(story: &RunHistory) -> String {
+    let row = |order: &super::run_history::Order| {
         let record = &order.record;
         [when(&record.utc), format!("{} at {}", record.actor, record.station), order.words(), order.answer()]
     };

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::ReportError;
-use super::story::{AlarmStory, CycleStory, Story};
+use super::run_history::{AlarmHistory, CycleHistory, RunHistory};
 use super::words::{ending_words, home_words, verdict_words};
 use regrind_cell::{Ending, Tolerance};
 use regrind_journal::{Reader, Record};
@@ -39,7 +39,7 @@ pub struct RunSummary {
     /// Cycles about which something is on record.
     pub cycles: Vec<CycleSummary>,
     /// Alarms, in the order in which they were raised.
-    pub alarms: Vec<AlarmStory>,
+    pub alarms: Vec<AlarmHistory>,
     /// Time of the last record, RFC 3339 in UTC.
     pub last: String,
     /// Names that the measuring machine and the grinder reported; `None` for a machine that has not answered.
@@ -94,14 +94,14 @@ pub struct CycleSummary {
 /// # Errors
 /// Fails if the folder contains no record of a run, or if the record cannot be read.
 pub fn run_summary(folder: &Path) -> Result<RunSummary, ReportError> {
-    let mut story = Story::default();
+    let mut story = RunHistory::default();
     for record in Reader::open(folder)?.records(0) {
-        story.take(record?);
+        story.add_record(record?);
     }
     Ok(summary(&story))
 }
 
-fn summary(story: &Story) -> RunSummary {
+fn summary(story: &RunHistory) -> RunSummary {
     let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
     let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
     let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
@@ -143,13 +143,13 @@ fn result_of(ending: &Ending) -> RunResult {
     }
 }
 
-fn cycle_summary(cycle: u32, story: &CycleStory, tolerance: Option<&Tolerance>) -> CycleSummary {
+fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>) -> CycleSummary {
     let last = story.measurements.last();
     let judgement = last.and_then(|of| of.judgements.last());
     let unusable = || last.and_then(|of| of.unusable.clone()).unwrap_or_default();
     let figures = last.and_then(|of| of.figures.as_ref()).map(|figures| {
         let points = [[figures.pv_mm, figures.pv_expanded_mm], [figures.rms_mm, figures.rms_expanded_mm]];
-        let of = |tolerance: &Tolerance| tolerance.compare(figures).map(|of| [of.found_mm, of.expanded_mm]);
+        let of = |tolerance: &Tolerance| tolerance.compare(figures).map(|of| [of.median_mm, of.expanded_mm]);
         tolerance.map_or(points, of).map(|figure| figure.map(|mm| 1e3 * mm))
     });
     CycleSummary {

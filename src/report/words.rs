@@ -4,17 +4,17 @@ use std::fmt::Write;
 
 use serde_json::Value;
 
-use super::told::Told;
+use super::record_content::RecordContent;
 use regrind_cell::{
-    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Interval, Judgement,
-    Mismatch, Occupation, Reconciliation, RecordFailure, Role,
+    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, GateResult, GateFailure, RecordedInterval, Judgement,
+    ConnectionRefusal, Occupation, Reconciliation, RecordFailure, Role,
 };
 use regrind_journal::Record;
 
 /// Returns the content of a record in one line. Content that this version of the program cannot read is returned as it
 /// was written.
 pub fn words(record: &Record) -> String {
-    let told = told_words(&Told::of(record));
+    let told = told_words(&RecordContent::from_record(record));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
     let mut line = told.unwrap_or_else(as_written);
     if !record.reason.is_empty() {
@@ -24,24 +24,24 @@ pub fn words(record: &Record) -> String {
     line.replace(|c: char| c.is_control(), " ")
 }
 
-fn told_words(told: &Told) -> Option<String> {
+fn told_words(told: &RecordContent) -> Option<String> {
     match told {
-        Told::Begun(value) => begin_words(value),
-        Told::OpenedAgain => Some("reopened".to_owned()),
-        Told::Command(command) => Some(command_words(command)),
-        Told::Event(event) => Some(event_words(event)),
-        Told::Answer(answer) => Some(format!("answered: {answer}")),
-        Told::Word(device, value) => person_words(*device, value),
-        Told::Step(device, value) => step_words(*device, value),
-        Told::Remarks(device, remarks) => Some(format!("{device}: {}", remarks.join("; "))),
-        Told::Remark(remark) => Some(remark.clone()),
-        Told::Pass(value) => pass_words(value),
-        Told::Transfer(value) => transfer_words(value),
-        Told::File(value) => artefact_words(value),
-        Told::Seal(value) => seal_words(value),
-        Told::End(ending, _) => Some(ending_words(ending)),
-        Told::Home(home) => Some(home_words(*home)),
-        Told::Unknown => None,
+        RecordContent::Begun(value) => begin_words(value),
+        RecordContent::Reopened => Some("reopened".to_owned()),
+        RecordContent::Command(command) => Some(command_words(command)),
+        RecordContent::Event(event) => Some(event_words(event)),
+        RecordContent::Answer(answer) => Some(format!("answered: {answer}")),
+        RecordContent::Confirmation(device, value) => person_words(*device, value),
+        RecordContent::Step(device, value) => step_words(*device, value),
+        RecordContent::Remarks(device, remarks) => Some(format!("{device}: {}", remarks.join("; "))),
+        RecordContent::Remark(remark) => Some(remark.clone()),
+        RecordContent::Pass(value) => pass_words(value),
+        RecordContent::Transfer(value) => transfer_words(value),
+        RecordContent::File(value) => artefact_words(value),
+        RecordContent::Seal(value) => seal_words(value),
+        RecordContent::End(ending, _) => Some(ending_words(ending)),
+        RecordContent::Home(home) => Some(home_words(*home)),
+        RecordContent::Unknown => None,
     }
 }
 
@@ -257,14 +257,14 @@ fn found_words(simulated: bool, found: &Occupation) -> String {
     }
 }
 
-fn mismatch_words(why: &Mismatch) -> String {
+fn mismatch_words(why: &ConnectionRefusal) -> String {
     match why {
-        Mismatch::Unreachable(words) => format!("unreachable: {words}"),
-        Mismatch::WrongDevice(words) => format!("another device: {words}"),
-        Mismatch::WordOrder(words) => format!("another word order: {words}"),
-        Mismatch::Inches => "in inches".to_owned(),
-        Mismatch::Owned(words) => format!("owned by another client: {words}"),
-        Mismatch::AtAnotherJob(words) => format!("at the job of another run: {words}"),
+        ConnectionRefusal::Unreachable(words) => format!("unreachable: {words}"),
+        ConnectionRefusal::WrongDevice(words) => format!("another device: {words}"),
+        ConnectionRefusal::WordOrder(words) => format!("another word order: {words}"),
+        ConnectionRefusal::Inches => "in inches".to_owned(),
+        ConnectionRefusal::Owned(words) => format!("owned by another client: {words}"),
+        ConnectionRefusal::AtAnotherJob(words) => format!("at the job of another run: {words}"),
     }
 }
 
@@ -279,13 +279,13 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
 }
 
 /// Returns in words if a measurement is usable, and if not, why.
-pub(super) fn gate_words(gate: &Gate) -> String {
+pub(super) fn gate_words(gate: &GateResult) -> String {
     match gate {
-        Gate::Passed => "usable".to_owned(),
-        Gate::Failed(GateFailure::NoPart) => "not usable: nothing was touched".to_owned(),
-        Gate::Failed(GateFailure::Contacts) => "not usable: contact points".to_owned(),
-        Gate::Failed(GateFailure::Inches) => "not usable: inches".to_owned(),
-        Gate::Failed(
+        GateResult::Passed => "usable".to_owned(),
+        GateResult::Failed(GateFailure::NoPart) => "not usable: nothing was touched".to_owned(),
+        GateResult::Failed(GateFailure::Contacts) => "not usable: contact points".to_owned(),
+        GateResult::Failed(GateFailure::Inches) => "not usable: inches".to_owned(),
+        GateResult::Failed(
             GateFailure::Coverage(words)
             | GateFailure::Foreign(words)
             | GateFailure::Broken(words)
@@ -305,7 +305,7 @@ fn figures_words(figures: &Figures) -> String {
     );
     if let Some(form) = &figures.form {
         let um =
-            |of: &Interval| format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
+            |of: &RecordedInterval| format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
         let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
         let _ = write!(line, "; form without the noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }
@@ -318,7 +318,7 @@ fn figures_words(figures: &Figures) -> String {
 /// Returns in words the estimates of the parameters of the machine with their compensation, and the error that is left
 /// for the map.
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
-    let told = summary.parameters.iter().map(regrind_cell::ParameterTold::in_words);
+    let told = summary.parameters.iter().map(regrind_cell::RecordedParameter::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
     told.chain(left.map(|mm| format!("left for the map: {:.2} µm RMS", 1e3 * mm))).collect()
 }

@@ -45,7 +45,7 @@ pub enum TrustError {
 ///
 /// # Errors
 /// The certificates cannot be read, or a server on another computer has none.
-pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Result<Option<ClientConfig>, TrustError> {
+pub fn tls_config(host: &str, certificates: Option<&Path>, table: &'static str) -> Result<Option<ClientConfig>, TrustError> {
     let is_here = host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback());
     match certificates {
         Some(path) => {
@@ -60,7 +60,7 @@ pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Re
 ///
 /// # Errors
 /// The file cannot be read, is longer than the maximum, or other users can read it.
-pub fn password(path: &Path) -> Result<String, TrustError> {
+pub fn read_password(path: &Path) -> Result<String, TrustError> {
     let unread = |source| TrustError::Password { path: path.to_owned(), source };
     if let Some(open) = readable_by_others(path).map_err(unread)? {
         return Err(TrustError::PasswordIsOpen { path: path.to_owned(), open });
@@ -97,10 +97,10 @@ mod tests {
     #[test]
     fn a_server_here_need_not_prove_itself_and_any_other_must() {
         for here in ["localhost", "127.0.0.1", "127.8.0.1", "::1", "/run/postgresql"] {
-            assert!(proof(here, None, "[database]").unwrap().is_none(), "{here}");
+            assert!(tls_config(here, None, "[database]").unwrap().is_none(), "{here}");
         }
         for other in ["plant", "localhost.example", "10.0.0.1", "::2", "0.0.0.0", ""] {
-            let refused = proof(other, None, "[database]").unwrap_err().to_string();
+            let refused = tls_config(other, None, "[database]").unwrap_err().to_string();
             assert!(refused.starts_with(other) && refused.contains("`certificates` of [database]"), "{refused}");
         }
     }
@@ -109,13 +109,13 @@ mod tests {
     fn a_file_without_certificates_proves_nothing_and_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("ca.pem");
-        let missing = proof("plant", Some(&path), "[database]").unwrap_err().to_string();
+        let missing = tls_config("plant", Some(&path), "[database]").unwrap_err().to_string();
         assert!(missing.starts_with(&path.display().to_string()), "{missing}");
         for text in ["", "no PEM", "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"] {
             fs::write(&path, text).unwrap();
             // Named certificates are read even if the host needs none.
             for host in ["plant", "localhost"] {
-                let refused = proof(host, Some(&path), "[database]").unwrap_err().to_string();
+                let refused = tls_config(host, Some(&path), "[database]").unwrap_err().to_string();
                 assert!(refused.contains("ca.pem: no certificates in PEM"), "{text:?}: {refused}");
             }
         }
@@ -125,10 +125,10 @@ mod tests {
     fn a_password_is_its_line_and_nobody_elses() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cell.password");
-        assert!(matches!(password(&path), Err(TrustError::Password { .. })));
+        assert!(matches!(read_password(&path), Err(TrustError::Password { .. })));
         for (text, read) in [("a b \r\n", "a b "), ("a\n\n", "a"), ("", ""), (" \u{e9}", " \u{e9}")] {
             regrind_formats::write_private(&path, text.as_bytes()).unwrap();
-            assert_eq!(password(&path).unwrap(), read);
+            assert_eq!(read_password(&path).unwrap(), read);
         }
     }
 
@@ -138,13 +138,13 @@ mod tests {
         let path = folder.path().join("cell.password");
         for (bytes, is_read) in [(4095, true), (4096, true), (4097, false), (1 << 20, false)] {
             regrind_formats::write_private(&path, &vec![b'x'; bytes]).unwrap();
-            match password(&path) {
+            match read_password(&path) {
                 Ok(read) => assert!(is_read && read.len() == bytes),
                 Err(error) => assert!(!is_read && error.to_string().contains("longer than 4096 bytes"), "{error}"),
             }
         }
         regrind_formats::write_private(&path, b"\xff\xfe").unwrap();
-        assert!(password(&path).unwrap_err().to_string().contains("UTF-8"));
+        assert!(read_password(&path).unwrap_err().to_string().contains("UTF-8"));
     }
 
     #[cfg(unix)]
@@ -155,7 +155,7 @@ mod tests {
         let path = folder.path().join("cell.password");
         fs::write(&path, "secret").unwrap();
         fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).unwrap();
-        let refused = password(&path).unwrap_err().to_string();
+        let refused = read_password(&path).unwrap_err().to_string();
         assert!(refused.contains("chmod") && !refused.contains("secret"), "{refused}");
     }
 }

@@ -6,15 +6,15 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use proptest::prelude::*;
-use regrind::cell::{Beginning, Disposal};
-use regrind::compensation::{Order, Roughness};
+use regrind::cell::{FirstStep, HoldOrStop};
+use regrind::compensation::{FilterOrder, SplineSmoothness};
 use regrind::config::CellConfig;
 use regrind::device::{Coordinates, TcpWire, Wire, WordOrder};
 use regrind::document::Problems;
 use regrind::formats::read_points;
 use regrind::geometry::{Point, Pose};
 use regrind::measuring::Layout;
-use regrind::recipe::{NominalSource, Pattern, Recipe, StartAt, Um, Wheel};
+use regrind::recipe::{NominalSource, MeasuringPattern, Recipe, RegistrationStart, Micrometres, WheelDimensions};
 use regrind::registration::{Coordinate, ProbeSide, Start};
 use regrind::setup::SetupError;
 use regrind::surface::DefinedSurface;
@@ -82,13 +82,13 @@ fn the_default_recipe_is_what_it_says() {
     let recipe = recipe(RECIPE).unwrap();
     assert_eq!(recipe.part.name, "free-form mirror");
     assert_eq!(recipe.measure.probe_radius_mm, 1.5);
-    assert_eq!(recipe.pattern, Pattern::Laid(Layout::GridPoints([60, 30])));
+    assert_eq!(recipe.pattern, MeasuringPattern::Generated(Layout::GridPoints([60, 30])));
     assert_eq!(recipe.measure.side, ProbeSide::Above);
-    assert_eq!((recipe.acceptance.pv_um, recipe.acceptance.rms_um), (Some(Um(7.0)), Some(Um(1.0))));
+    assert_eq!((recipe.acceptance.pv_um, recipe.acceptance.rms_um), (Some(Micrometres(7.0)), Some(Micrometres(1.0))));
     assert_eq!(recipe.registration.max_turn_deg, 5.0);
     assert!((recipe.compensation.removal_budget_um.mm() - 0.4).abs() < 1e-15);
-    assert_eq!(recipe.grinding.wheel, Wheel::Sphere { radius_mm: 12.5 });
-    assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (Disposal::Stop, Disposal::Hold));
+    assert_eq!(recipe.grinding.wheel, WheelDimensions::Sphere { radius_mm: 12.5 });
+    assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (HoldOrStop::Stop, HoldOrStop::Hold));
     let options = recipe.registration_options(Pose::identity());
     assert_eq!((options.probe_radius_mm, options.start, options.rms_limit_mm), (1.5, Start::Search, Some(0.1)));
     let NominalSource::Surface(surface) = &recipe.nominal else { panic!("a formula") };
@@ -110,15 +110,15 @@ fn the_default_recipe_is_what_it_says() {
 fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
     let with = |measuring: &str| recipe(&changed(RECIPE, "[registration]", &format!("{measuring}\n\n[registration]")));
     let adaptive = |risk: f64| format!("[measuring]\nmode = \"adaptive\"\naccepted_risk = {risk}");
-    assert_eq!(recipe(RECIPE).unwrap().probability(), 0.975);
-    assert_eq!(with("[measuring]\nmode = \"fixed\"").unwrap().probability(), 0.975);
+    assert_eq!(recipe(RECIPE).unwrap().required_probability(), 0.975);
+    assert_eq!(with("[measuring]\nmode = \"fixed\"").unwrap().required_probability(), 0.975);
     for (risk, probability) in [(0.025, 0.975), (0.05, 0.975), (0.01, 0.99), (0.015, 0.985)] {
-        let found = with(&adaptive(risk)).unwrap().probability();
+        let found = with(&adaptive(risk)).unwrap().required_probability();
         assert!((found - probability).abs() < 1e-12, "{risk}: {found}");
     }
     let both = changed(RECIPE, "[registration]", &format!("{}\n\n[registration]", adaptive(0.05)));
     let both = changed(&both, "expanded_uncertainty = true", "probability = 0.96");
-    assert_eq!(recipe(&both).unwrap().probability(), 0.96);
+    assert_eq!(recipe(&both).unwrap().required_probability(), 0.96);
 }
 
 #[test]
@@ -127,14 +127,14 @@ fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
         let map = &recipe.compensation;
         (map.filter_order, map.roughness, recipe.registration.min_coverage)
     };
-    assert_eq!(told(&recipe(RECIPE).unwrap()), (Order::Plane, Roughness::Cutoff, 0.5));
+    assert_eq!(told(&recipe(RECIPE).unwrap()), (FilterOrder::Plane, SplineSmoothness::Cutoff, 0.5));
     let text = changed(
         RECIPE,
         "[compensation]\n",
         "[compensation]\nfilter_order = \"quadric\"\nroughness = \"cross-validation\"\n",
     );
     let text = changed(&text, "[registration]\n", "[registration]\nleast_coverage = 0.8\n");
-    assert_eq!(told(&recipe(&text).unwrap()), (Order::Quadric, Roughness::CrossValidation, 0.8));
+    assert_eq!(told(&recipe(&text).unwrap()), (FilterOrder::Quadric, SplineSmoothness::CrossValidation, 0.8));
 }
 
 /// Checks that the simulator has the same surface in its own representation.
@@ -215,7 +215,7 @@ fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
 fn the_telescope_holds_what_it_cannot_see() {
     let recipe = recipe(TELESCOPE).unwrap();
     assert_eq!(recipe.registration.lock, [Coordinate::X, Coordinate::Y, Coordinate::Rz]);
-    assert_eq!(recipe.registration.start, StartAt::Fixture);
+    assert_eq!(recipe.registration.start, RegistrationStart::Fixture);
     assert_eq!(recipe.measure.side, ProbeSide::Below);
     let cell = cell(FILES).unwrap();
     // opt_global -> mirror frame is p' = Rx (p - s), Rx = [[1, 0, 0], [0, c, -s], [0, s, c]] with tan = 1/2.
@@ -229,7 +229,7 @@ fn the_telescope_holds_what_it_cannot_see() {
     assert_eq!(files.inbox, "../exchange/cmm/in");
     assert_eq!((files.coordinates, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
     assert_eq!((files.accept_earlier_files, files.probe_tolerance_mm), (false, 1e-3));
-    assert_eq!(recipe.cycle.begin_with, Beginning::Measure);
+    assert_eq!(recipe.cycle.begin_with, FirstStep::Measure);
     assert_eq!(recipe.compensation.max_displacement_mm, 1.0);
 }
 
@@ -248,7 +248,7 @@ fn what_a_file_wire_leaves_out_is_not_guessed() {
     let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
     assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
     let recipe = recipe(RECIPE).unwrap();
-    assert_eq!(recipe.cycle.begin_with, Beginning::Grind);
+    assert_eq!(recipe.cycle.begin_with, FirstStep::Grind);
     assert_eq!(recipe.compensation.max_displacement_mm, 1.0);
 }
 

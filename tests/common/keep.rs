@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 /// Guard that keeps the run folders below a folder when it goes out of scope.
 #[allow(dead_code, reason = "not every test that includes this uses all of it")]
-pub struct Kept(pub PathBuf);
+pub struct KeepRunFolders(pub PathBuf);
 
-impl Drop for Kept {
+impl Drop for KeepRunFolders {
     fn drop(&mut self) {
         keep(&self.0);
     }

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind::cell::StateName;
-use regrind::drive::{Request, ask};
+use regrind::drive::{Request, send_request};
 use serde_json::Value;
 
 use crate::program::{PATIENCE, Running, changed, regrind};
@@ -23,12 +23,12 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
         if running.is_over() {
             return Some(running.end().0);
         }
-        if let Some(status) = folder().and_then(|folder| ask(&folder, &Request::Status).ok())
+        if let Some(status) = folder().and_then(|folder| send_request(&folder, &Request::Status).ok())
             && status.status.state == StateName::Held
         {
             let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
             // The program may have been killed meanwhile, or may still wait for a machine.
-            let _ = ask(&folder().unwrap(), &resume);
+            let _ = send_request(&folder().unwrap(), &resume);
         }
         assert!(began.elapsed() < PATIENCE, "it comes to no end: {:#?}", running.said);
         std::thread::park_timeout(std::time::Duration::from_millis(5));

@@ -64,7 +64,7 @@ pub struct Running {
     folder: Option<PathBuf>,
     pub said: Vec<String>,
     /// Text of the error stream, once the process has ended.
-    pub told: String,
+    pub error_text: String,
 }
 
 impl Running {
@@ -81,7 +81,7 @@ impl Running {
             let _ = errors.read_to_string(&mut text);
             text
         });
-        Self { child, lines, errors: Some(errors), folder, said: Vec::new(), told: String::new() }
+        Self { child, lines, errors: Some(errors), folder, said: Vec::new(), error_text: String::new() }
     }
 
     /// Waits for a line that satisfies a condition.
@@ -160,13 +160,13 @@ impl Running {
         while let Ok(line) = self.lines.recv() {
             self.said.push(line);
         }
-        self.told = self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default();
-        (code, self.told.clone())
+        self.error_text = self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default();
+        (code, self.error_text.clone())
     }
 
     /// Returns true if the error stream contains these words, once the process has ended.
-    pub fn has_been_told(&self, words: &str) -> bool {
-        self.told.contains(words)
+    pub fn has_error_text(&self, words: &str) -> bool {
+        self.error_text.contains(words)
     }
 
     /// Returns the folder of the run, once the program has printed it.

@@ -6,9 +6,9 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use regrind::cell::Actor;
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{ModbusCmm, ModbusGrinder};
-use regrind::drive::{Beside, Notice, Reply, Request, Run, ask};
+use regrind::drive::{BlockingExecutor, Notice, Reply, Request, RunInputs, send_request};
 use regrind::journal::{AuditKey, Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -86,7 +86,7 @@ pub struct Rig {
 
 /// Run that is complete except for its drive.
 pub struct Ready {
-    pub run: Run,
+    pub run: RunInputs,
     pub cmm: ModbusCmm,
     pub grinder: ModbusGrinder,
     pub notices: mpsc::UnboundedReceiver<Notice>,
@@ -163,20 +163,20 @@ impl Rig {
         };
         let journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
         let (notices, shown) = mpsc::unbounded_channel();
-        let link = |link: &Link| setup::modbus(link, true, 7, self.runs).unwrap();
+        let link = |link: &LinkConfig| setup::modbus_settings(link, true, 7, self.runs).unwrap();
         let cmm = ModbusCmm::new(link(&self.cell.cmm.link)).unwrap();
         let grinder = ModbusGrinder::new(link(&self.cell.grinder.link)).unwrap();
-        let run = Run {
+        let run = RunInputs {
             plan,
             task,
             journal: Box::new(journal),
             job: self.runs,
             actor: Actor { name: "a test".into(), station: "here".into() },
-            loaded,
-            poll: [self.cell.cmm.link.timing.poll, self.cell.grinder.link.timing.poll],
+            load_confirmed: loaded,
+            poll_intervals: [self.cell.cmm.link.timing.poll, self.cell.grinder.link.timing.poll],
             notices,
             interrupted: None,
-            beside: Beside::Threads,
+            executor: BlockingExecutor::Threads,
         };
         Ready { run, cmm, grinder, notices: shown, folder }
     }
@@ -194,7 +194,7 @@ pub async fn order(folder: &Path, request: Request) -> (Reply, Instant, Duration
     let folder = folder.to_owned();
     tokio::task::spawn_blocking(move || {
         let began = Instant::now();
-        let reply = ask(&folder, &request).unwrap();
+        let reply = send_request(&folder, &request).unwrap();
         (reply, began, began.elapsed())
     })
     .await

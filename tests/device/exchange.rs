@@ -815,7 +815,7 @@ async fn every_combination_of_wires_makes_two_machines() {
     let shops = [Shop::new(), Shop::new()];
     for wires in [[false, false], [false, true], [true, false], [true, true]] {
         let cell = cell_of(wires, &shops);
-        let (cmm, grinder) = setup::machines(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap();
+        let (cmm, grinder) = setup::create_drivers(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap();
         let by_files = [cmm.name(), grinder.name()].map(|name| name.contains("by files"));
         assert_eq!(by_files, wires, "{} and {}", cmm.name(), grinder.name());
         // A person can take a week; a network connection cannot. Only files accept a person's confirmation.
@@ -827,7 +827,7 @@ async fn every_combination_of_wires_makes_two_machines() {
     }
     let cell = cell_of([true, true], &shops);
     fs::remove_dir(&shops[0].outbox).unwrap();
-    let told = setup::machines(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap_err().to_string();
+    let told = setup::create_drivers(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap_err().to_string();
     assert!(told.contains("cmm.wire.outbox") && told.contains("does not exist"), "{told}");
     assert!(!shops[0].outbox.exists(), "no folder is made");
 }

@@ -4,7 +4,7 @@ use serde_json::json;
 
 use crate::browser::{Browser, Tab};
 use crate::program::{Running, changed, only_run, regrind, root, small_recipe};
-use crate::{SPEED, Shown, serve_with, users};
+use crate::{SPEED, CellPage, serve_with, users};
 
 const SCREEN: [u32; 2] = [1024, 768];
 
@@ -29,7 +29,7 @@ fn is_old(browser: &mut Browser, tab: &Tab) -> bool {
 #[ignore = "needs a browser: Debian package chromium"]
 fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
     tab.until(&mut browser, &banner("EXECUTE"));
@@ -57,7 +57,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
 #[ignore = "needs a browser: Debian package chromium"]
 fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 200.0);
+    let mut shown = CellPage::begin(home.path(), 200.0);
     // Hold the run, so that it waits for the browser, however long that takes to start.
     let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
     assert_eq!(held.0, 0, "{held:?}");
@@ -90,7 +90,7 @@ fn where_touches_are_chosen_the_map_is_shown_as_it_grows_and_how_well_it_is_know
     let text = std::fs::read_to_string(&recipe).unwrap();
     let measuring = "[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.025\n\n[registration]";
     std::fs::write(&recipe, text.replacen("[registration]", measuring, 1)).unwrap();
-    let mut shown = Shown::of(home.path(), &recipe);
+    let mut shown = CellPage::start(home.path(), &recipe);
     let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
     assert_eq!(held.0, 0, "{held:?}");
     let mut browser = Browser::start(home.path());
@@ -120,7 +120,7 @@ fn where_touches_are_chosen_the_map_is_shown_as_it_grows_and_how_well_it_is_know
 #[ignore = "needs a browser: Debian package chromium"]
 fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
     let home = tempfile::tempdir().unwrap();
-    let shown = Shown::begin(home.path(), 20.0);
+    let shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
     tab.until(&mut browser, &banner("EXECUTE"));
@@ -148,7 +148,7 @@ fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
 #[ignore = "needs a browser: Debian package chromium"]
 fn the_keyboard_alone_aborts_a_run() {
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
     tab.until(&mut browser, &banner("EXECUTE"));
@@ -217,7 +217,7 @@ fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
 fn axe_finds_nothing_serious_in_any_appearance() {
     let axe = std::fs::read_to_string(std::env::var("REGRIND_AXE").expect("REGRIND_AXE names axe.min.js")).unwrap();
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 200.0);
+    let mut shown = CellPage::begin(home.path(), 200.0);
     assert_eq!(shown.run.end().0, 0);
     users::add(home.path(), "A. Smith", "operator", users::PASSWORD);
     let (_page, for_users) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
@@ -254,7 +254,7 @@ fn pictures_are_made() {
     let recipe = home.path().join("freeform-mirror.toml");
     std::fs::write(&recipe, changed("recipes/freeform-mirror.toml", &[(SPEED, &format!("{SPEED}\nspeed = 200.0"))]))
         .unwrap();
-    let mut shown = Shown::of(home.path(), &recipe);
+    let mut shown = CellPage::start(home.path(), &recipe);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, [1180, 780]);
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");

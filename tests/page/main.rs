@@ -25,7 +25,7 @@ use program::{Running, regrind, small_recipe};
 const SPEED: &str = "[simulation]\nseed = 1";
 
 /// Cell at work, and its page.
-struct Shown {
+struct CellPage {
     run: Running,
     page: Running,
     /// Address that opens the page, with its key.
@@ -35,13 +35,13 @@ struct Shown {
     id: String,
 }
 
-impl Shown {
+impl CellPage {
     /// Begins a run whose machines are `speed` times as fast as real ones.
     fn begin(home: &Path, speed: f64) -> Self {
-        Self::of(home, &small_recipe(home, speed))
+        Self::start(home, &small_recipe(home, speed))
     }
 
-    fn of(home: &Path, recipe: &Path) -> Self {
+    fn start(home: &Path, recipe: &Path) -> Self {
         let recipe = recipe.display().to_string();
         let arguments = ["run", &recipe, "--cell", "sim", "--part", "SN-0042", "--operator", "A. Smith"];
         let mut run = Running::new(regrind(&arguments, home));

@@ -9,9 +9,9 @@ use serde_json::{Value, json};
 use crate::http::{Visitor, raw};
 use crate::program::{records_with, run};
 use crate::users::{PASSWORD, add};
-use crate::{Shown, serve, serve_with};
+use crate::{CellPage, serve, serve_with};
 
-fn remarks(shown: &Shown) -> Vec<String> {
+fn remarks(shown: &CellPage) -> Vec<String> {
     let all = records_with(&shown.folder, "remark");
     all.iter().map(|record| record["remark"].as_str().unwrap_or_default().to_owned()).collect()
 }
@@ -25,7 +25,7 @@ fn status(folder: &Path) -> Value {
 #[test]
 fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_goes_on() {
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut shown = CellPage::begin(home.path(), 20.0);
     shown.run.line("grinding", |line| line.contains("grinding"));
     let (visitor, stranger) = (shown.visitor(), Visitor::stranger(&shown.url));
     let path = format!("/runs/{}/orders", shown.id);
@@ -209,12 +209,12 @@ fn orders_that_are_never_finished_keep_nobody_out() {
 #[test]
 fn one_screen_has_control_every_screen_makes_safe_and_taking_over_is_on_record() {
     let home = tempfile::tempdir().unwrap();
-    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut shown = CellPage::begin(home.path(), 20.0);
     shown.run.line("grinding", |line| line.contains("grinding"));
     let (one, other) = (shown.visitor(), shown.visitor());
     let resume = |folder: &Path| json!({ "order": "resume", "reason": "", "seen": status(folder)["number"] });
-    let comes_to = |shown: &mut Shown, state: &str| {
-        let Shown { run, folder, .. } = shown;
+    let comes_to = |shown: &mut CellPage, state: &str| {
+        let CellPage { run, folder, .. } = shown;
         run.until(state, |_| (status(folder)["state"] == state).then_some(()));
     };
     assert!(one.order(&shown.id, &json!({ "order": "hold", "reason": "" })).1);

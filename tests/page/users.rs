@@ -12,7 +12,7 @@ use serde_json::json;
 
 use crate::http::{Visitor, raw_by_tls};
 use crate::program::{Running, records_with, regrind, run, small_recipe};
-use crate::{Shown, serve_with};
+use crate::{CellPage, serve_with};
 
 /// Password that somebody who watched it being typed cannot guess.
 pub const PASSWORD: &str = "grindstone 17 öl";
@@ -27,7 +27,7 @@ pub fn add(home: &Path, name: &str, role: &str, password: &str) -> (i32, String)
 }
 
 /// Returns a cell at work whose page has users, one for each role, named after the role.
-fn shown_to_users(home: &Path) -> Shown {
+fn shown_to_users(home: &Path) -> CellPage {
     for role in ["viewer", "quality", "operator", "engineer"] {
         assert_eq!(add(home, role, role, PASSWORD).0, 0, "{role}");
     }
@@ -36,7 +36,7 @@ fn shown_to_users(home: &Path) -> Shown {
     let folder = run.folder(home);
     let (page, url) = serve_with(home, &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
     let id = folder.file_name().unwrap().to_string_lossy().into_owned();
-    Shown { run, page, url, folder, id }
+    CellPage { run, page, url, folder, id }
 }
 
 #[test]
@@ -113,8 +113,8 @@ fn each_role_orders_what_is_its_own_and_the_record_has_who_it_was() {
     assert_eq!(quality.order(&shown.id, &plain("abort")).0, 403);
     assert_eq!(quality.take_control(&shown.id).0, 403);
     assert!(quality.order(&shown.id, &plain("hold")).1);
-    let number = |shown: &mut Shown| {
-        let Shown { run, folder, .. } = shown;
+    let number = |shown: &mut CellPage| {
+        let CellPage { run, folder, .. } = shown;
         run.until("Held", |_| {
             let (_, said, _) = crate::program::run(&["status", ".", "--json"], folder);
             let status = serde_json::from_str::<serde_json::Value>(&said).ok()?["status"].clone();

@@ -2,7 +2,7 @@
 
 use crate::http::Visitor;
 use crate::program::{replaced, run, run_folders, small_recipe};
-use crate::{Shown, serve};
+use crate::{CellPage, serve};
 
 #[test]
 fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
@@ -73,7 +73,7 @@ fn a_run_with_signs_of_addresses_in_its_name_is_shown_and_takes_orders() {
     let home = tempfile::tempdir().unwrap();
     let recipe = home.path().join("lens #3 100%41? & <half>.toml");
     std::fs::rename(small_recipe(home.path(), 20.0), &recipe).unwrap();
-    let mut shown = Shown::of(home.path(), &recipe);
+    let mut shown = CellPage::start(home.path(), &recipe);
     shown.run.line("grinding", |line| line.contains("grinding"));
     let visitor = shown.visitor();
     let list = visitor.get("/runs").text();
@@ -114,7 +114,7 @@ fn a_run_that_was_stopped_shows_the_alarms_that_it_ended_with() {
     let wrong = "[simulation.cmm]\nprobe_radius_error_um = 50.0\n\n[simulation.part]";
     let text = replaced(&text, "[simulation.part]", wrong);
     std::fs::write(&recipe, replaced(&text, "[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n")).unwrap();
-    let mut shown = Shown::of(home.path(), &recipe);
+    let mut shown = CellPage::start(home.path(), &recipe);
     let visitor = shown.visitor();
     let path = format!("/runs/{}", shown.id);
     let piece = |text: String, id: &str| {

@@ -105,7 +105,7 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
         part.programs.arcs_within_mm = Some(ARCS_WITHIN_MM);
         let (program, text) = read_back(&mut part, name);
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
-        let told = part.programs.arcs(&path).unwrap().unwrap();
+        let told = part.programs.arc_summary(&path).unwrap().unwrap();
         assert_eq!(program.waypoints.len() as u64, told.moves, "{name}");
         assert_eq!(program.waypoints.iter().filter(|stop| stop.arc.is_some()).count() as u64, told.arcs, "{name}");
         assert!(told.arcs > 50 && fewer * (told.arcs + told.lines) < summary.points, "{name}: {told:?}");

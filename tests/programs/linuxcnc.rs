@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use crate::compensate::Shop;
 use crate::generated::Move;
 use crate::path::{correction, error_mm, part, read, wheels, with};
-use regrind::compensation::path::{Lean, PathMode, PathOptions, Pattern, Rotary, TurnAxis};
+use regrind::compensation::path::{TiltMode, PathMode, PathOptions, TrackPattern, RotaryAxis, RotationAxis};
 use regrind::geometry::Vector;
 use regrind_sim::program::Control;
 
@@ -52,8 +52,8 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
         let mut part = part(name);
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
-            for (pattern, one_way) in [(Pattern::Raster, false), (Pattern::Raster, true), (Pattern::Spiral, false)] {
-                let spaced = if pattern == Pattern::Spiral { 3.0 } else { 6.0 };
+            for (pattern, one_way) in [(TrackPattern::Raster, false), (TrackPattern::Raster, true), (TrackPattern::Spiral, false)] {
+                let spaced = if pattern == TrackPattern::Spiral { 3.0 } else { 6.0 };
                 part.programs.options =
                     regrind::compensation::path::PathOptions { pattern, one_way, ..with(&plain, wheel, spaced) };
                 let file = folder.path().join("part.ngc");
@@ -97,10 +97,10 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     for (name, pattern) in [
-        ("freeform-mirror", Pattern::Raster),
-        ("biconic", Pattern::Raster),
-        ("shallow-wave", Pattern::Raster),
-        ("off-axis-asphere", Pattern::Spiral),
+        ("freeform-mirror", TrackPattern::Raster),
+        ("biconic", TrackPattern::Raster),
+        ("shallow-wave", TrackPattern::Raster),
+        ("off-axis-asphere", TrackPattern::Spiral),
     ] {
         let mut part = part(name);
         let options = with(&part.programs.options, part.programs.options.wheel, 4.0);
@@ -134,12 +134,12 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
     let mut part = part("freeform-mirror");
     let plain = part.programs.options;
     for (about, pivot_mm, lead_rad) in [
-        (TurnAxis::Y, None, 0.35),
-        (TurnAxis::Y, Some(Vector::new(0.0, 0.0, 180.0)), 0.35),
-        (TurnAxis::X, Some(Vector::new(5.0, 0.0, 180.0)), -0.5),
+        (RotationAxis::Y, None, 0.35),
+        (RotationAxis::Y, Some(Vector::new(0.0, 0.0, 180.0)), 0.35),
+        (RotationAxis::X, Some(Vector::new(5.0, 0.0, 180.0)), -0.5),
     ] {
-        let letter = if about == TurnAxis::X { 'A' } else { 'B' };
-        let rotary = Rotary {
+        let letter = if about == RotationAxis::X { 'A' } else { 'B' };
+        let rotary = RotaryAxis {
             letter,
             axis: about,
             reversed: false,
@@ -148,7 +148,7 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
             step_rad: 1e-6f64.to_radians(),
             pivot_mm,
         };
-        let lean = Some(Lean::Following { lead_rad });
+        let lean = Some(TiltMode::Following { lead_rad });
         part.programs.options = PathOptions { rotary: Some(rotary), tilt: lean, ..with(&plain, wheels(0.8)[0].1, 6.0) };
         let file = folder.path().join("part.ngc");
         part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();

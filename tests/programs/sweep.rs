@@ -6,7 +6,7 @@
 
 use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
 use crate::sample::{cases, seeds};
-use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
+use regrind::compensation::path::{PathOptions, TrackPattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
 /// Tolerance of a touching place, in millimetres.
@@ -113,7 +113,7 @@ pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
             let x = a * (2.0 * (k as f64 * 0.618_034).fract() - 1.0);
             [x, y]
         })
-        .filter(|[x, y]| part.programs.ground.1.contains(*x, *y))
+        .filter(|[x, y]| part.programs.surface_and_outline.1.contains(*x, *y))
         .collect()
 }
 
@@ -193,9 +193,9 @@ fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
 #[test]
 fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
     for (name, (wheel_name, wheel), pattern) in [
-        ("freeform-mirror", wheels(0.8)[0], Pattern::Raster),
-        ("freeform-mirror", wheels(0.8)[1], Pattern::Raster),
-        ("off-axis-asphere", wheels(0.8)[0], Pattern::Spiral),
+        ("freeform-mirror", wheels(0.8)[0], TrackPattern::Raster),
+        ("freeform-mirror", wheels(0.8)[1], TrackPattern::Raster),
+        ("off-axis-asphere", wheels(0.8)[0], TrackPattern::Spiral),
     ] {
         let mut part = part(name);
         part.programs.options = PathOptions { pattern, ..with(&part.programs.options, wheel, 1.0) };
@@ -208,12 +208,12 @@ fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
         for k in 0..GROOVES[0] * GROOVES[1] {
             let share = [(k % GROOVES[0]) as f64 / GROOVES[0] as f64, (k / GROOVES[0]) as f64 / GROOVES[1] as f64];
             let at: [f64; 2] = [0, 1].map(|i| part.half_mm[i] * (2.0 * share[i] + 1.0 / GROOVES[i] as f64 - 1.0));
-            if !part.programs.ground.1.contains(at[0], at[1]) {
+            if !part.programs.surface_and_outline.1.contains(at[0], at[1]) {
                 continue;
             }
             let across = match pattern {
-                Pattern::Raster => [0.0, 1.0],
-                Pattern::Spiral => at.map(|c| c / at[0].hypot(at[1]).max(1e-9)),
+                TrackPattern::Raster => [0.0, 1.0],
+                TrackPattern::Spiral => at.map(|c| c / at[0].hypot(at[1]).max(1e-9)),
             };
             let off: Vec<f64> = (0..PLACES)
                 .map(|i| told.track_mm * (i as f64 / PLACES as f64 - 0.5))
@@ -237,7 +237,7 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
     let mut part = part("off-axis-asphere");
     let wheel = Wheel::Sphere { radius_mm: 12.5 };
     part.programs.options = with(&part.programs.options, wheel, 0.4);
-    part.programs.options.pattern = Pattern::Spiral;
+    part.programs.options.pattern = TrackPattern::Spiral;
     let (swept, _) = program(&part);
     // h = s^2 / 8 (1 / R - k): hollow with 180 mm and more; on a slope s grows.
     let most = 0.4f64.powi(2) / 8.0 / 12.5 * 1.1;
@@ -252,7 +252,7 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
 fn no_spiral_cuts_deeper_anywhere() {
     for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
-        part.programs.options = PathOptions { pattern: Pattern::Spiral, ..with(&part.programs.options, wheel, 3.0) };
+        part.programs.options = PathOptions { pattern: TrackPattern::Spiral, ..with(&part.programs.options, wheel, 3.0) };
         let (swept, _) = program(&part);
         let [a, b] = part.half_mm;
         for k in 0..150 {

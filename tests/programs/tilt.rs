@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::path::{Part, correction, error_mm, part, truth, wheels, with};
 use crate::sweep::{distance, places};
-use regrind::compensation::path::{Field, Lean, PathOptions, Rotary, TurnAxis, Wheel};
+use regrind::compensation::path::{HeightField, TiltMode, PathOptions, RotaryAxis, RotationAxis, Wheel};
 use regrind::config::read_dialect;
 use regrind::geometry::{Aperture, Grid, Vector};
 use regrind_sim::program::{Control, Program, Waypoint};
@@ -16,11 +16,11 @@ const WITHIN_MM: f64 = 2e-4;
 const PIVOT_MM: [f64; 3] = [12.0, -7.0, 180.0];
 
 /// Returns a head with a wide range.
-fn head(about: TurnAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) -> Rotary {
-    Rotary {
-        letter: if about == TurnAxis::X { 'A' } else { 'B' },
+fn head(about: RotationAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) -> RotaryAxis {
+    RotaryAxis {
+        letter: if about == RotationAxis::X { 'A' } else { 'B' },
         axis: about,
-        reversed: about == TurnAxis::X,
+        reversed: about == RotationAxis::X,
         range_rad: [-2.0, 2.0],
         rate_rad_s: 1e3,
         step_rad: 10f64.powi(-angle_decimals).to_radians(),
@@ -90,7 +90,7 @@ fn clearance(wheel: &Wheel, pivot_mm: Option<[f64; 3]>, program: &Program, q: [f
     nearest
 }
 
-fn leaning(part: &Part, wheel: Wheel, rotary: Rotary, lean: Lean, track_mm: f64) -> PathOptions {
+fn leaning(part: &Part, wheel: Wheel, rotary: RotaryAxis, lean: TiltMode, track_mm: f64) -> PathOptions {
     PathOptions { rotary: Some(rotary), tilt: Some(lean), ..with(&part.programs.options, wheel, track_mm) }
 }
 
@@ -106,9 +106,9 @@ fn in_every_dialect_every_tilted_wheel_leaves_the_corrected_surface() {
         ("heidenhain", None, 4),
     ];
     let leans = [
-        (TurnAxis::Y, Lean::Following { lead_rad: 0.35 }),
-        (TurnAxis::X, Lean::Following { lead_rad: -0.5 }),
-        (TurnAxis::Y, Lean::Constant { angle_rad: -0.4 }),
+        (RotationAxis::Y, TiltMode::Following { lead_rad: 0.35 }),
+        (RotationAxis::X, TiltMode::Following { lead_rad: -0.5 }),
+        (RotationAxis::Y, TiltMode::Constant { angle_rad: -0.4 }),
     ];
     let mut part = part("freeform-mirror");
     let plain = part.programs.options;
@@ -145,7 +145,7 @@ fn steep(part: &mut Part) {
     let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) =
         places.map(|[_, y]| (-FALL_PER_MM * y * y, [0.0, -2.0 * FALL_PER_MM * y])).unzip();
     let outline = Aperture::Rectangle { centre_mm: [0.0, 9.0], width_mm: 16.0, height_mm: 16.0 };
-    part.programs.ground = (Field::hermite(on, &z, &slopes), outline);
+    part.programs.surface_and_outline = (HeightField::hermite(on, &z, &slopes), outline);
     part.half_mm = [8.0, 17.0];
 }
 
@@ -160,15 +160,15 @@ fn a_flank_too_steep_for_an_upright_wheel_is_ground_by_one_that_follows() {
     part.programs.options = with(&plain, ball, 2.0);
     let refused = part.programs.path(&correction(part.half_mm)).unwrap_err().to_string();
     assert!(refused.contains("slopes by"), "{refused}");
-    part.programs.options.rotary = Some(head(TurnAxis::X, None, 6));
+    part.programs.options.rotary = Some(head(RotationAxis::X, None, 6));
     let told = part.programs.path(&correction(part.half_mm)).unwrap_err().to_string();
     // Towards +y is a negative turn about x.
     assert!(told.contains("[grinding.tilt] with angle_deg = -"), "{told}");
     for (wheel, lead_rad) in [(ball, 0.4), (disc, 0.2), (cup, 0.0)] {
         for pivot_mm in [None, Some(PIVOT_MM)] {
-            let lean = Lean::Following { lead_rad };
+            let lean = TiltMode::Following { lead_rad };
             part.programs.options = plain;
-            part.programs.options = leaning(&part, wheel, head(TurnAxis::X, pivot_mm, 6), lean, 2.0);
+            part.programs.options = leaning(&part, wheel, head(RotationAxis::X, pivot_mm, 6), lean, 2.0);
             let (program, _) = written(&mut part, "linuxcnc");
             let turns: Vec<f64> = program.waypoints.iter().filter_map(|stop| stop.rotary_deg).collect();
             assert!(turns.iter().copied().fold(0.0, f64::max) > 45.0, "{wheel:?}");
@@ -201,9 +201,9 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
         let plain = with(&part.programs.options, part.programs.options.wheel, 8.0);
         part.programs.options = plain;
         let (_, upright) = written(&mut part, name);
-        let lean = Lean::Constant { angle_rad: 0.0 };
+        let lean = TiltMode::Constant { angle_rad: 0.0 };
         let decimals = i32::from(part.programs.dialect.numbers.angle_decimals);
-        part.programs.options = leaning(&part, plain.wheel, head(TurnAxis::Y, None, decimals), lean, 8.0);
+        part.programs.options = leaning(&part, plain.wheel, head(RotationAxis::Y, None, decimals), lean, 8.0);
         let (program, tilted) = written(&mut part, name);
         assert_eq!(program.axis, Some('B'), "{name}");
         let word = if name == "heidenhain" {
@@ -232,9 +232,9 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
 #[test]
 fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
     let mut part = part("shallow-wave");
-    let lean = Lean::Constant { angle_rad: 0.3 };
+    let lean = TiltMode::Constant { angle_rad: 0.3 };
     let wheel = part.programs.options.wheel;
-    part.programs.options = leaning(&part, wheel, head(TurnAxis::Y, Some(PIVOT_MM), 6), lean, 20.0);
+    part.programs.options = leaning(&part, wheel, head(RotationAxis::Y, Some(PIVOT_MM), 6), lean, 20.0);
     let (program, text) = written(&mut part, "linuxcnc");
     assert!(text.contains("(tilt: constant by 17.18") && text.contains("G93"), "{}", &text[..2000]);
     assert!(program.clone().with_head(None).unwrap_err().contains("no rotary axis"));
@@ -263,13 +263,13 @@ fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
 #[test]
 fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
     let mut part = part("freeform-mirror");
-    let (wheel, lean) = (Wheel::Sphere { radius_mm: 12.5 }, Lean::Following { lead_rad: 0.35 });
-    part.programs.options = leaning(&part, wheel, head(TurnAxis::Y, Some(PIVOT_MM), 6), lean, 8.0);
+    let (wheel, lean) = (Wheel::Sphere { radius_mm: 12.5 }, TiltMode::Following { lead_rad: 0.35 });
+    part.programs.options = leaning(&part, wheel, head(RotationAxis::Y, Some(PIVOT_MM), 6), lean, 8.0);
     let (program, _) = written(&mut part, "linuxcnc");
     let minutes: f64 = program.waypoints.iter().filter_map(|stop| stop.minutes).sum();
     let (_, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
     // The header has the time without the descent, a millimetre for each track.
-    let down = part.programs.path(&correction(part.half_mm)).unwrap().0.tracks() as f64 / summary.feed_mm_min;
+    let down = part.programs.path(&correction(part.half_mm)).unwrap().0.track_count() as f64 / summary.feed_mm_min;
     assert!((minutes - down - summary.duration_s / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.duration_s / 60.0);
     // The slides themselves travel far while the head turns.
     assert!(

@@ -557,7 +557,7 @@ fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
 
 #[test]
 fn the_picture_names_every_state_once_and_is_well_formed() {
-    let rows = table();
+    let rows = transition_table();
     let picture = state_picture(&rows);
     let document = roxmltree::Document::parse(&picture).unwrap();
     let texts: Vec<&str> = document.descendants().filter(|n| n.has_tag_name("text")).filter_map(|n| n.text()).collect();

@@ -63,7 +63,7 @@ fn report(seed: u64, ran: &Ran) -> Report {
     let [pv, rms] = ran.tolerance_mm;
     let tolerance_um = [1e3 * pv, 1e3 * rms];
     let missing = missing(ran);
-    Report { seed, ending: ran.ending.clone(), told: ran.told(), tolerance_um, grinds, cycles, missing }
+    Report { seed, ending: ran.ending.clone(), told: ran.failure_text(), tolerance_um, grinds, cycles, missing }
 }
 
 /// Returns the files of the first cycle that are missing.
@@ -240,8 +240,8 @@ fn every_recipe_ends_accepted() {
     for recipe in ["off-axis-asphere", "biconic", "shallow-wave"] {
         let ran = run(Setup::new(recipe, 1));
         let rows = ran.rows();
-        println!("{recipe}\n{}", ran.told());
-        assert!(ran.accepted(), "{recipe}\n{}", ran.told());
+        println!("{recipe}\n{}", ran.failure_text());
+        assert!(ran.accepted(), "{recipe}\n{}", ran.failure_text());
         assert!(missing(&ran).is_empty(), "{recipe}: {:?}", missing(&ran));
         for row in &rows {
             assert_eq!(ran.world.grinds_begun(JOB, row.cycle as u16), 1, "{recipe}, cycle {}", row.cycle);

@@ -36,7 +36,7 @@ struct Case {
 }
 
 impl Case {
-    fn of(number: u64) -> Self {
+    fn from_number(number: u64) -> Self {
         let kinds = [Kind::Chip, Kind::Corner, Kind::Pit, Kind::Bump, Kind::Scratch];
         let seed = number / 8 + 1;
         Self {
@@ -85,7 +85,7 @@ impl Case {
 }
 
 /// How a part ended.
-struct Told {
+struct CaseResult {
     case: Case,
     ending: String,
     accepted: bool,
@@ -122,7 +122,7 @@ fn has_neighbour(places_mm: &[[f64; 2]], k: usize, is: &dyn Fn(&usize) -> bool) 
     others.iter().any(|other| is(other) && away(*other) <= 1.5 * nearest_mm)
 }
 
-fn told(case: Case) -> Told {
+fn run_case(case: Case) -> CaseResult {
     let (defect, ran) = case.ran();
     let mut faults = String::new();
     let mut truth_um = [f64::NAN; 2];
@@ -191,7 +191,7 @@ fn told(case: Case) -> Told {
         write!(faults, " accepted with PV {:.2} and RMS {:.3} um where it was touched;", truth_um[0], truth_um[1])
             .unwrap();
     }
-    Told { case, ending: format!("{:?}", ran.ending).chars().take(60).collect(), accepted, truth_um, faults }
+    CaseResult { case, ending: format!("{:?}", ran.ending).chars().take(60).collect(), accepted, truth_um, faults }
 }
 
 #[test]
@@ -207,7 +207,7 @@ fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     let take = || {
         let mut done = Vec::new();
         while let Some(number) = drawn.get(next.fetch_add(1, Ordering::Relaxed) as usize) {
-            let told = told(Case::of(*number));
+            let told = run_case(Case::from_number(*number));
             println!(
                 "{:?} PV {:.2} RMS {:.3} um {}{}",
                 told.case, told.truth_um[0], told.truth_um[1], told.ending, told.faults
@@ -216,12 +216,12 @@ fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
         }
         done
     };
-    let parts: Vec<Told> = std::thread::scope(|scope| {
+    let parts: Vec<CaseResult> = std::thread::scope(|scope| {
         let threads = [scope.spawn(take), scope.spawn(take)];
         threads.into_iter().flat_map(|thread| thread.join().expect("a run panicked")).collect()
     });
     for height_um in HEIGHTS_UM {
-        let of: Vec<&Told> = parts.iter().filter(|part| part.case.height_um == height_um).collect();
+        let of: Vec<&CaseResult> = parts.iter().filter(|part| part.case.height_um == height_um).collect();
         println!("{height_um} um: {} of {} accepted", of.iter().filter(|part| part.accepted).count(), of.len());
     }
     let wrong: Vec<_> = parts.iter().filter(|part| !part.faults.is_empty()).collect();

@@ -24,7 +24,7 @@ fn broken(faults: WorldFaults) -> Setup {
 /// accepted; and that no further pass starts.
 fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
     let ran = run(setup);
-    let told = format!("{what}: {}", ran.told());
+    let told = format!("{what}: {}", ran.failure_text());
     println!("{told}");
     assert!(!ran.accepted(), "{told}");
     let alarms = ran.alarms();
@@ -66,7 +66,7 @@ fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
     ];
     for (what, setup, alarm, words) in cases {
         let ran = caught(what, setup, alarm, words, 0);
-        assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, ordered: false, .. }), "{what}: {}", ran.told());
+        assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, ordered: false, .. }), "{what}: {}", ran.failure_text());
         assert_eq!(ran.world.measurements_begun(), 0, "{what}");
     }
 }
@@ -203,7 +203,7 @@ fn a_part_that_lies_turned_round_is_told() {
     // person to the part.
     let words = ["check the position of the part", "turned"];
     let ran = caught("a steep part", broken(faults.clone()), AlarmId::MachineFault, &words, 1);
-    assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.told());
+    assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.failure_text());
     let setup = Setup::new("shallow-wave", 1).with(move |world| world.faults = faults.clone());
     caught("a shallow part", setup, AlarmId::PartMisplaced, &["turned", "°, limit"], 1);
 }

@@ -14,7 +14,7 @@ use regrind::cell::{Actor, Ending, Role};
 use regrind::config::CellConfig;
 use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Permit};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
-use regrind::drive::{Beside, CycleRow, Drive, Ledger, Notice, Run};
+use regrind::drive::{BlockingExecutor, CycleRow, Drive, JournalSink, Notice, RunInputs};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::formats::{self, HeightMap, MapRecord, X3pFile, read_measured, read_x3p, write_x3p};
 use regrind::geometry::{Grid, Pose};
@@ -217,22 +217,22 @@ async fn run(seed: u64) -> Ran {
     let serving = Serving::tcp("127.0.0.1:0", vec![(2, grinder)]).await.unwrap();
     let cell = cell(&shop, serving.local_addr().unwrap().port());
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
-    let (cmm, grinder) = setup::machines(&recipe, &cell, "FFM", &folder, [7, 1]).unwrap();
-    let journal: Box<dyn Ledger> = Box::new(Journal::create(&folder, header("FFM")).unwrap());
+    let (cmm, grinder) = setup::create_drivers(&recipe, &cell, "FFM", &folder, [7, 1]).unwrap();
+    let journal: Box<dyn JournalSink> = Box::new(Journal::create(&folder, header("FFM")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();
     let actor = Actor { name: "test".into(), station: "here".into() };
     let poll = [Duration::from_millis(20); 2];
-    let run = Run {
+    let run = RunInputs {
         plan,
         task,
         journal,
         job: 7,
         actor,
-        loaded: true,
-        poll,
+        load_confirmed: true,
+        poll_intervals: poll,
         notices,
         interrupted: None,
-        beside: Beside::Threads,
+        executor: BlockingExecutor::Threads,
     };
     let (over, pictures) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(0)));
     let stand_in = {

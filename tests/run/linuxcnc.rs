@@ -12,7 +12,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use regrind::cell::{AlarmId, StateName};
-use regrind::drive::{Request, ask};
+use regrind::drive::{Request, send_request};
 use serde_json::Value;
 
 use crate::namespaces::{ACCOUNT, in_namespaces};
@@ -118,12 +118,12 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
     let folder = || run_folders(&home.join("runs")).pop();
     while !running.is_over() {
         if let Some(folder) = folder()
-            && let Ok(status) = ask(&folder, &Request::Status)
+            && let Ok(status) = send_request(&folder, &Request::Status)
             && status.status.state == StateName::Held
         {
             let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
             // The run may have continued meanwhile.
-            let _ = ask(&folder, &resume);
+            let _ = send_request(&folder, &resume);
         }
         std::thread::park_timeout(Duration::from_millis(50));
     }
@@ -194,7 +194,7 @@ fn stands_after(home: &Path, go_wrong: impl FnOnce()) -> (StateName, Vec<AlarmId
     let stands =
         |state| matches!(state, StateName::Held | StateName::Suspended | StateName::Aborted | StateName::Stopped);
     while !running.is_over() {
-        if let Ok(status) = ask(&folder, &Request::Status) {
+        if let Ok(status) = send_request(&folder, &Request::Status) {
             seen = (status.status.state, status.status.alarms.iter().map(|alarm| alarm.id).collect());
             if stands(seen.0) && !seen.1.is_empty() {
                 break;

@@ -18,19 +18,19 @@ use tokio::sync::mpsc::UnboundedReceiver;
 type Says = Box<dyn FnMut(&mut Status) + Send>;
 
 /// Grinder that reports a prescribed status, and whose first answers to PREPARE are lost.
-struct Told {
+struct ScriptedGrinder {
     grinder: ModbusGrinder,
     says: Says,
     lost: u32,
 }
 
-impl Told {
+impl ScriptedGrinder {
     fn saying(grinder: ModbusGrinder, says: impl FnMut(&mut Status) + Send + 'static) -> Self {
         Self { grinder, says: Box::new(says), lost: 0 }
     }
 }
 
-impl Machine for Told {
+impl Machine for ScriptedGrinder {
     crate::through::through!(grinder: name, connect, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
@@ -53,7 +53,7 @@ impl Machine for Told {
     }
 }
 
-impl Grinder for Told {
+impl Grinder for ScriptedGrinder {
     async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> Result<(), DeviceError> {
         self.grinder.load_pass(map, pass, interrupt).await
     }
@@ -119,7 +119,7 @@ async fn resume(folder: &std::path::Path) {
 async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
-    let (drive, _orders) = Drive::new(run, cmm, Told { lost: 2, ..Told::saying(grinder, |_| ()) }).unwrap();
+    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder { lost: 2, ..ScriptedGrinder::saying(grinder, |_| ()) }).unwrap();
     let ending = tokio::time::timeout(PATIENCE, tokio::spawn(drive.run())).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
     let mut alarms = Vec::new();
@@ -144,7 +144,7 @@ async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_gr
             *status = Status { state: State::Idle, job: None, progress: Some((0, 0)), ..status.clone() };
         }
     };
-    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
     let running = tokio::spawn(drive.run());
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::JobVanished, "{what}");
@@ -188,7 +188,7 @@ async fn a_machine_that_says_held_and_gets_further_is_aborted() {
             status.state = State::Held;
         }
     };
-    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
     let running = tokio::spawn(drive.run());
     assert_eq!(alarm(&mut notices).await.0, AlarmId::MachineHeldItself);
     let (id, what) = alarm(&mut notices).await;
@@ -207,7 +207,7 @@ async fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
             status.state = State::Execute;
         }
     };
-    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "started", 1).await;
     assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
@@ -227,7 +227,7 @@ async fn a_pass_that_is_called_complete_at_40_percent_of_its_path_is_not_believe
             status.progress = Some((400, 1000));
         }
     };
-    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
     let running = tokio::spawn(drive.run());
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::PassRecord, "{what}");

@@ -1,10 +1,10 @@
 //! Whole parts, ground and measured until they are accepted: with the whole pattern, or with touches that are chosen
 //! batch by batch.
 
-use regrind::cell::PvOf;
-use regrind::compensation::told_map;
-use regrind::drive::Adaptive;
-use regrind::geometry::{Point, Sample, Vector};
+use regrind::cell::PvPoints;
+use regrind::compensation::map_from_model;
+use regrind::drive::AdaptiveOptions;
+use regrind::geometry::{Point, DeviationSample, Vector};
 use regrind::model::{self, FIRST_BATCH, Form, FormFigures, FormPoint, MIN_TOUCHES, ModelInputs, PartialMeasurement};
 use regrind::registration::Registration;
 use regrind_sim::body::Physics;
@@ -82,8 +82,8 @@ impl Bench {
     fn limits_mm(&self) -> [f64; 3] {
         let tolerance = &self.plan.tolerance;
         match tolerance.pv_of {
-            PvOf::All => [tolerance.pv_mm, f64::INFINITY, tolerance.rms_mm],
-            PvOf::MostPoints => [f64::INFINITY, tolerance.pv_mm, tolerance.rms_mm],
+            PvPoints::All => [tolerance.pv_mm, f64::INFINITY, tolerance.rms_mm],
+            PvPoints::MostPoints => [f64::INFINITY, tolerance.pv_mm, tolerance.rms_mm],
         }
     }
 
@@ -152,9 +152,9 @@ impl Line<'_> {
     fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
         let targets: &[(Point, Vector)] = &self.bench.plan_of;
         let (tolerance, max_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
-        let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles };
-        let purpose = adaptive.purpose(cycle < max_cycles);
-        let given = ModelInputs { decision_risk: adaptive.look_risk(), ..self.given() };
+        let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles };
+        let purpose = adaptive.stopping_criteria(cycle < max_cycles);
+        let given = ModelInputs { decision_risk: adaptive.decision_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];
         let (mut all, mut seconds, mut path) = (Vec::new(), 0.0, Vec::new());
         let mut next = model::short_tour(targets, model::farthest_points(targets, FIRST_BATCH));
@@ -178,9 +178,9 @@ impl Line<'_> {
             path.push(format!("{}{:?}", all.len(), look.reason));
             if look.next.is_empty() {
                 let form = &look.form;
-                let of = |p: &FormPoint| (Sample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+                let of = |p: &FormPoint| (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
                 let told: Vec<_> = form.points.iter().map(of).collect();
-                let error = told_map(&told, &self.bench.task.map, form.hyperparameters.noise_sigma_mm).unwrap();
+                let error = map_from_model(&told, &self.bench.task.map_options, form.hyperparameters.noise_sigma_mm).unwrap();
                 let why = path.join(" ");
                 return Took { touches: all.len(), seconds, why, figures: form.figures, found, error };
             }

@@ -15,7 +15,7 @@ use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
 use regrind::model::{Form, Interval, ModelError, ModelInputs, Prior, Sessions};
 use regrind::registration::{
-    MapLimits, Options, PointStatus, Registration, Start, lateral_error, register, weak_for_compensation,
+    MapLimits, Options, PointStatus, Registration, Start, lateral_error, register, map_obstacle,
 };
 use regrind::surface::{DefinedSurface, Nominal, Side};
 
@@ -133,7 +133,7 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
             assert!((v.covariance[(k, k)].sqrt() / in_plane_mm[k] - 1.0).abs() < 0.1, "{session}: axis {k}");
         }
         let lateral = lateral_error(&free, &free.quality.covariance, 2.0);
-        let why = weak_for_compensation(&free, &free.quality.covariance, &MapLimits::default());
+        let why = map_obstacle(&free, &free.quality.covariance, &MapLimits::default());
         println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
         let why = why.expect("refused");
         assert!(
@@ -148,7 +148,7 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
             held.quality.rms_mm * 1e3,
             lateral_error(&held, &held.quality.covariance, 2.0)
         );
-        assert_eq!(weak_for_compensation(&held, &held.quality.covariance, &MapLimits::default()), None);
+        assert_eq!(map_obstacle(&held, &held.quality.covariance, &MapLimits::default()), None);
     }
 }
 
@@ -185,7 +185,7 @@ fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registrat
 /// Compares the prediction from one measurement, at the positions of another one, with the deviations measured there.
 /// Returns the RMS of the difference in µm, and the share within the 95 % interval, which includes the noise of the
 /// tracker.
-fn told(by: &Registration, of: &Registration) -> (f64, f64) {
+fn compare_prediction(by: &Registration, of: &Registration) -> (f64, f64) {
     let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Inlier).collect();
     let places: Vec<(Point, Vector)> = used.iter().map(|d| (d.point, d.normal)).collect();
     let form = Form::estimate_at(by, &ModelInputs::default(), &places).unwrap();
@@ -208,8 +208,8 @@ fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
     for [a, b] in [[0, 1], [1, 0]] {
         let ((cloud, by), (_, of)) = (&sessions[a], &sessions[b]);
         let few: Vec<Point> = cloud.iter().step_by(5).copied().collect();
-        let whole = told(by, of);
-        let fifth = told(&registered(&nominal, &few, [false; 6]), of);
+        let whole = compare_prediction(by, of);
+        let fifth = compare_prediction(&registered(&nominal, &few, [false; 6]), of);
         let rms_um = 1e3 * of.quality.rms_mm;
         println!(
             "session {a} tells session {b}, {rms_um:.1} um rms, but for {:.1} um, {:.1} % within 95 %; {} points of it but for {:.1} um, {:.1} %",

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use crate::rig::{CMM, GRINDER, Ready, Rig, event, order};
 use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::Ending;
-use regrind::drive::{Drive, Orders, Request};
+use regrind::drive::{Drive, OrderSender, Request};
 use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::command::CommandFrame;
 use regrind_sim::seen::HandshakeEvent;
@@ -193,7 +193,7 @@ async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_
     let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let actor = run.actor.clone();
-    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "started", 1).await;
     let damage = "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = 'no table at all';
@@ -202,7 +202,7 @@ async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_
     // Progress is recorded, so the loop detects the failure by itself. It reports the failure once, and not again for
     // each further record.
     event(&mut notices, "record_failed", 1).await;
-    orders.give(Request::Abort { reason: "the record is gone".into() }, actor).await;
+    orders.send(Request::Abort { reason: "the record is gone".into() }, actor).await;
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     let mut told = 0;
@@ -243,11 +243,11 @@ fn all_on_record(folder: &Path, least: &[&str]) {
 async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
     let Ready { run, cmm, grinder, mut notices, folder } = ready;
     let actor = run.actor.clone();
-    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     while let Some(notice) = notices.recv().await {
         if matches!(&notice, regrind::drive::Notice::State { state, .. } if state.starts_with("Held")) {
-            orders.give(Request::Stop { reason: "seen enough".into() }, actor.clone()).await;
+            orders.send(Request::Stop { reason: "seen enough".into() }, actor.clone()).await;
         }
     }
     (tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap(), folder)
@@ -260,10 +260,10 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
     // A folder is in the place of the deviations file of the first cycle.
     std::fs::create_dir_all(folder.join("cycle-1/deviations.csv")).unwrap();
     let actor = run.actor.clone();
-    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "not_saved", 1).await;
-    orders.give(Request::Resume { reason: "the disk is well again".into(), seen: None }, actor).await;
+    orders.send(Request::Resume { reason: "the disk is well again".into(), seen: None }, actor).await;
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");
     assert!(folder.join("cycle-1/attempt-2/deviations.csv").is_file());
@@ -272,7 +272,7 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
     assert_eq!(alarms.first(), Some(&Value::from("journal_unwritable")), "{alarms:?}");
     // The report describes the failure in words, and that the resumption took it back.
     regrind::report::write_run_report(&folder).unwrap();
-    let alarms = crate::reports::Page::of(&folder).rows("alarms");
+    let alarms = crate::reports::Page::read(&folder).rows("alarms");
     assert!(alarms[0][2].starts_with("The record of the run cannot be written"), "{alarms:?}");
     assert!(alarms[0][1].ends_with("UTC"), "{alarms:?}");
 }
@@ -282,7 +282,7 @@ async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let mut ready = rig.next(true);
     // Another pass is needed, and then the remaining material is not enough.
-    ready.run.task.limits.removal_budget_mm = 1e-6;
+    ready.run.task.correction_limits.removal_budget_mm = 1e-6;
     let (ending, folder) = run_to_its_end(ready).await;
     assert!(matches!(ending, Ending::NotAccepted { .. }), "{ending:?}");
     all_on_record(&folder, &["result.json", "cycle-1/result.json", "cycle-1/attempt-2/result.json"]);
@@ -301,7 +301,7 @@ async fn every_file_of_a_run_is_on_record() {
 
     // Points that are too far apart for the filter give no map.
     let mut ready = rig.next(true);
-    ready.run.task.map.cutoff_mm = 0.5;
+    ready.run.task.map_options.cutoff_mm = 0.5;
     let (_, folder) = run_to_its_end(ready).await;
     assert!(!folder.join("cycle-1/error_map.csv").exists());
     all_on_record(&folder, &["result.json", "cycle-1/measured.csv", "cycle-1/figures.json", "cycle-1/parameters.json"]);

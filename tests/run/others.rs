@@ -1,7 +1,7 @@
 //! Two machines that differ: the state that the first one learned for a recipe, and its benefit for the second
 //! machine's first part of that recipe.
 
-use regrind::compensation::{Alike, Correction, GainRule, LearningState};
+use regrind::compensation::{MachineSimilarity, Correction, GainRule, LearningState};
 use regrind::formats::{CellRun, Learned};
 use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;
@@ -22,7 +22,7 @@ pub enum Differ {
 
 /// One world: results of the first part on the second machine, with and without the state learned on the first machine.
 #[derive(Clone, Debug)]
-pub struct Taught {
+pub struct TransferResult {
     /// Truth after each pass.
     pub with: Vec<After>,
     pub without: Vec<After>,
@@ -48,10 +48,10 @@ impl Pair<'_> {
     /// Grinds, on both machines, a part of the common recipe; on the first machine, `parts` of the other recipe; then
     /// on the second machine its first part of that recipe, with and without the state learned on the first. Each part
     /// has `passes` passes.
-    pub fn world(&self, seed: u64, differ: Differ, parts: u32, passes: u16) -> Taught {
+    pub fn world(&self, seed: u64, differ: Differ, parts: u32, passes: u16) -> TransferResult {
         let [first, second] = machines(seed, differ, &self.taught.spec.grinder);
         let [a, b] = [2 * seed + 1_000_000, 2 * seed + 1_000_001];
-        let mut alike = Alike::default();
+        let mut alike = MachineSimilarity::default();
         let of_common = [(&first, a), (&second, b)].map(|(grinder, seed)| {
             let (_, found) = self.in_common.ground(grinder, seed, None, 1, passes);
             found.expect("passes").1
@@ -64,7 +64,7 @@ impl Pair<'_> {
         let with = self.taught.ground(&second, b, Some((begun.correction, begun.known)), 1, passes).0;
         let without = self.taught.ground(&second, b, None, 1, passes).0;
         let apart_um = self.taught.apart_um([(&first, a), (&second, b)]);
-        Taught { with, without, apart_um, bands, differ: largest }
+        TransferResult { with, without, apart_um, bands, differ: largest }
     }
 }
 
@@ -112,10 +112,10 @@ impl Bench {
     }
 
     /// Returns the initial state of a run that starts from another machine's learned state.
-    fn begun_with(&self, (correction, known): (Correction, LearningState), alike: &Alike) -> Learned {
+    fn begun_with(&self, (correction, known): (Correction, LearningState), alike: &MachineSimilarity) -> Learned {
         let learned = Learned::new(true, "the first machine".into(), "run-1".into(), correction, known);
         let from = CellRun { cell: "cell-1".into(), run: "run-1".into() };
-        self.task.from_others(&[(from, learned)], alike).expect("it ground the same recipe")
+        self.task.learned_from_others(&[(from, learned)], alike).expect("it ground the same recipe")
     }
 }
 

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 
 use crate::program::{PATIENCE, Running, changed, regrind, small_recipe};
 use regrind::cell::{Actor, Ending};
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::MachineKind;
-use regrind::drive::{Beside, Drive, Run};
+use regrind::drive::{BlockingExecutor, Drive, RunInputs};
 use regrind::journal::{Header, Journal, MachineLock, verify};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -245,15 +245,15 @@ impl Production {
         let (recipe, cell) = (&self.recipe, &self.cell);
         let (task, plan) = setup::prepare(recipe, cell).unwrap();
         let folder = self.home.join("runs").join(part.to_string());
-        let take = |kind: MachineKind, link: &Link| {
+        let take = |kind: MachineKind, link: &LinkConfig| {
             let (line, unit) = link.wire.modbus_line().unwrap();
-            MachineLock::take(&format!("{kind} at {line}, unit {unit}"), &folder).unwrap()
+            MachineLock::acquire(&format!("{kind} at {line}, unit {unit}"), &folder).unwrap()
         };
         let taken = [take(MachineKind::Cmm, &cell.cmm.link), take(MachineKind::Grinder, &cell.grinder.link)];
         let job = u32::try_from(part).unwrap();
         let client = [0x5247, MachineLock::epoch(taken.iter(), job)];
         let name = format!("SN-{part}");
-        let (cmm, grinder) = setup::machines(recipe, cell, &name, &folder, client).unwrap();
+        let (cmm, grinder) = setup::create_drivers(recipe, cell, &name, &folder, client).unwrap();
         let actor = Actor { name: "production".into(), station: "here".into() };
         let header = Header {
             run: part.to_string(),
@@ -265,11 +265,11 @@ impl Production {
             content: json!({}),
         };
         let journal = Journal::create_with(&folder, header, None).unwrap();
-        let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
+        let poll = [setup::poll_interval(&cell.cmm.link), setup::poll_interval(&cell.grinder.link)];
         let (notices, mut shown) = mpsc::unbounded_channel();
         let showing = tokio::spawn(async move { while shown.recv().await.is_some() {} });
-        let (journal, beside) = (Box::new(journal), Beside::Threads);
-        let run = Run { plan, task, journal, job, actor, loaded: true, poll, notices, interrupted: None, beside };
+        let (journal, beside) = (Box::new(journal), BlockingExecutor::Threads);
+        let run = RunInputs { plan, task, journal, job, actor, load_confirmed: true, poll_intervals: poll, notices, interrupted: None, executor: beside };
         let (drive, orders) = Drive::with_cell(run, cmm, grinder).unwrap();
         let ending = drive.run().await;
         drop(orders);

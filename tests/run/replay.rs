@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use crate::rig::{PATIENCE, Ready, Rig, event, small, until};
 use crate::sample::cases;
-use regrind::cell::{CellPlan, Disposal};
-use regrind::drive::{Drive, Interrupted, Orders, ReplayError, Request, Task};
+use regrind::cell::{CellPlan, HoldOrStop};
+use regrind::drive::{Drive, InterruptedRun, OrderSender, ReplayError, Request, Task};
 use regrind::journal::{Reader, verify};
 use regrind::setup;
 
@@ -17,12 +17,12 @@ async fn finished() -> (Rig, PathBuf) {
     let Ready { mut run, cmm, grinder, mut notices, folder } = rig.next(true);
     never_content(&mut run.plan);
     let actor = run.actor.clone();
-    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "registered", 1).await;
-    orders.give(Request::Hold { reason: "tea".into() }, actor.clone()).await;
+    orders.send(Request::Hold { reason: "tea".into() }, actor.clone()).await;
     until(&folder, |words| words.starts_with("Held")).await;
-    orders.give(Request::Resume { reason: "tea is over".into(), seen: None }, actor).await;
+    orders.send(Request::Resume { reason: "tea is over".into(), seen: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(verify(&folder).unwrap().closed);
     (rig, folder)
@@ -32,15 +32,15 @@ async fn finished() -> (Rig, PathBuf) {
 /// plan allows.
 fn never_content(plan: &mut CellPlan) {
     (plan.tolerance.pv_mm, plan.max_cycles, plan.stall_share) = (1e-6, 3, -1e9);
-    (plan.on_stall, plan.on_divergence, plan.on_refusal) = (Disposal::Stop, Disposal::Stop, Disposal::Stop);
+    (plan.on_stall, plan.on_divergence, plan.on_refusal) = (HoldOrStop::Stop, HoldOrStop::Stop, HoldOrStop::Stop);
 }
 
 /// Reads the record as the program that wrote it would.
-fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)) -> Result<Interrupted, ReplayError> {
+fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)) -> Result<InterruptedRun, ReplayError> {
     let (mut task, mut plan) = setup::prepare(&rig.recipe, &rig.cell).unwrap();
     never_content(&mut plan);
     change(&mut task, &mut plan);
-    Interrupted::read(folder, plan, &task)
+    InterruptedRun::read(folder, plan, &task)
 }
 
 /// Copies the record of a run up to a record, with all files: the state of the folder if the program ended after that
@@ -77,14 +77,14 @@ async fn a_record_is_done_again_without_a_difference_wherever_it_broke_off() {
     let (rig, folder) = finished().await;
     let last = verify(&folder).unwrap().records;
     let whole = again(&rig, &folder, |_, _| ()).unwrap_or_else(|error| panic!("{error}"));
-    assert!(whole.state().starts_with("Stopped"), "{}", whole.state());
+    assert!(whole.describe_state().starts_with("Stopped"), "{}", whole.describe_state());
     assert!(!folder.join("replay").exists(), "what was computed again is taken away");
     let mut states = std::collections::BTreeSet::new();
     for at in cases((1..last).step_by(7), 2).chain([last - 1]) {
         let copy = broken_off(&folder, at);
         let found =
             again(&rig, copy.path(), |_, _| ()).unwrap_or_else(|error| panic!("cut behind record {at}: {error}"));
-        states.insert(found.state());
+        states.insert(found.describe_state());
     }
     assert!(states.len() > 15, "{states:?}");
 }
@@ -99,7 +99,7 @@ async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gon
     };
     let decided = said(|_, plan| plan.max_cycles = 2);
     assert!(decided.contains("max_cycles") && decided.contains("the record has"), "{decided}");
-    let computed = said(|task, _| task.map.cutoff_mm *= 1.01);
+    let computed = said(|task, _| task.map_options.cutoff_mm *= 1.01);
     assert!(computed.contains("repeated computation"), "{computed}");
     // No figure depends on this value. Only the plan that the machine received contains it.
     let planned = said(|task, _| task.probing.safe_height_mm += 1.0);

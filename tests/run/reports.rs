@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::program::{Running, only_run, records_with, regrind, root, run, small_recipe};
 use regrind::cell::{
-    Actor, AlarmId, Command, Ending, Event, Figures, Gate, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
-    samples,
+    Actor, AlarmId, Command, Ending, Event, Figures, GateResult, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
+    sample_events,
 };
 use regrind::journal::{Entry, Header, Journal, Kind, Reader};
 use regrind::report::{run_report, write_run_report};
@@ -20,7 +20,7 @@ pub struct Page {
 
 impl Page {
     /// Returns the report in the folder of a run, after a check that it equals the one generated from the record.
-    pub fn of(folder: &Path) -> Self {
+    pub fn read(folder: &Path) -> Self {
         let html = fs::read_to_string(folder.join("report.html")).unwrap();
         assert_eq!(html, run_report(folder).unwrap());
         Self { html }
@@ -108,7 +108,7 @@ fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
     assert_eq!(code, 0, "{out}{errors}");
     let folder = the_run(home.path());
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let result = json_in(&folder, "result.json");
     let reason = result["ending"]["reason"].as_str().unwrap();
     assert_eq!(page.verdict(), (format!("ACCEPTED: {reason}"), true));
@@ -197,7 +197,7 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
     assert_eq!(code, 0, "{out}{errors}");
     let folder = the_run(home.path());
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let last = json_in(&folder, "result.json")["ending"]["cycle"].clone();
     let figures = json_in(&folder, &format!("cycle-{last}/result.json"))["figures"].clone();
     let um = |key: &str| 1e3 * figures[key].as_f64().unwrap();
@@ -255,7 +255,7 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
     let (mut running, folder) = grinding(home.path());
     running.signal("TERM");
     assert_eq!(running.end().0, 1);
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();
     assert_eq!(ending["ending"], "stopped");
     assert_eq!(page.verdict(), (format!("STOPPED: {}", ending["reason"].as_str().unwrap()), false));
@@ -284,7 +284,7 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     // The terminal of the run shows the refusal, and does not show that the cell went on.
     let said = running.said.join("\n");
     assert!(said.contains("refused: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();
     assert_eq!((&ending["ending"], &ending["confirmed"]), (&json!("aborted"), &json!(true)));
     assert_eq!(page.verdict(), (format!("ABORTED: {}", ending["reason"].as_str().unwrap()), false));
@@ -329,7 +329,7 @@ impl Written {
         self.journal.append(Entry { actor, station, ..entry }).unwrap();
     }
 
-    pub fn told(&mut self, command: Command) {
+    pub fn command(&mut self, command: Command) {
         let entry = self.entry(Kind::Note, serde_json::to_value(command).unwrap());
         self.journal.append(entry).unwrap();
     }
@@ -367,14 +367,14 @@ pub fn aborted() -> Ending {
 fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
     let mut written = Written::new(Value::Null);
     written.event(Event::Start { actor: ada() });
-    written.told(raised("link_lost", "The link to a machine is lost: grinder."));
-    written.told(Command::Withdraw { alarm: AlarmId::LinkLost });
-    written.told(raised("link_lost", "The link to a machine is lost: CMM."));
-    written.told(raised("machine_fault", "A machine is in fault: grinder."));
-    written.told(Command::Withdraw { alarm: AlarmId::LinkLost });
-    written.told(Command::Finish(aborted()));
+    written.command(raised("link_lost", "The link to a machine is lost: grinder."));
+    written.command(Command::Withdraw { alarm: AlarmId::LinkLost });
+    written.command(raised("link_lost", "The link to a machine is lost: CMM."));
+    written.command(raised("machine_fault", "A machine is in fault: grinder."));
+    written.command(Command::Withdraw { alarm: AlarmId::LinkLost });
+    written.command(Command::Finish(aborted()));
     let (_home, folder) = written.ended(&aborted());
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let alarms = page.rows("alarms");
     let [grinder, cmm, fault] = alarms.as_slice() else { panic!("{alarms:?}") };
     for (row, words) in [(grinder, "lost: grinder."), (cmm, "lost: CMM."), (fault, "in fault: grinder.")] {
@@ -396,17 +396,17 @@ fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
 fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
     let mut written = Written::new(Value::Null);
     written.event(Event::Start { actor: ada() });
-    let failed = |words: &str| Gate::Failed(GateFailure::Coverage(words.into()));
+    let failed = |words: &str| GateResult::Failed(GateFailure::Coverage(words.into()));
     written.event(Event::Collected { cycle: 1, targets: 100, found: 12, gate: failed("12 % found, 95 % are needed") });
-    written.event(Event::Collected { cycle: 1, targets: 100, found: 100, gate: Gate::Passed });
+    written.event(Event::Collected { cycle: 1, targets: 100, found: 100, gate: GateResult::Passed });
     written.event(Event::Registered { cycle: 1, figures: figures() });
     let judged = |verdict, reason: &str| Command::Announce(Judgement { cycle: 1, verdict, reason: reason.into() });
-    written.told(judged(Verdict::Continue, "not yet in tolerance"));
-    written.told(judged(Verdict::BudgetSpent, "no material is left"));
-    written.event(Event::Collected { cycle: 2, targets: 100, found: 100, gate: Gate::Passed });
+    written.command(judged(Verdict::Continue, "not yet in tolerance"));
+    written.command(judged(Verdict::BudgetSpent, "no material is left"));
+    written.event(Event::Collected { cycle: 2, targets: 100, found: 100, gate: GateResult::Passed });
     written.event(Event::RegistrationFailed { cycle: 2, why: "it did not converge".into() });
     let (_home, folder) = written.ended(&Ending::NotAccepted { cycle: 2, reason: "no material is left".into() });
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     let rows: Vec<String> = page.cycles().iter().map(|row| row.join("|")).collect();
     assert_eq!(rows.len(), 3, "{rows:?}");
     assert!(rows[0].contains("12 % found, 95 % are needed") && rows[2].contains("it did not converge"), "{rows:?}");
@@ -417,7 +417,7 @@ fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
 }
 
 pub fn figures() -> Figures {
-    let found = samples(1).into_iter().find_map(|event| match event {
+    let found = sample_events(1).into_iter().find_map(|event| match event {
         Event::Registered { figures, .. } => Some(figures),
         _ => None,
     });
@@ -427,12 +427,12 @@ pub fn figures() -> Figures {
 #[test]
 fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
     let mut written = Written::new(Value::Null);
-    samples(1).into_iter().for_each(|event| written.event(event));
+    sample_events(1).into_iter().for_each(|event| written.event(event));
     let refused = Event::Resume { actor: ada(), reason: "go".into() };
     let state = State::Execute(Phase::Load);
-    written.told(Command::Refuse { event: Box::new(refused), state, why: "it is not held".into() });
+    written.command(Command::Refuse { event: Box::new(refused), state, why: "it is not held".into() });
     for command in [raised("link_lost", "Lost."), Command::Withdraw { alarm: AlarmId::LinkLost }] {
-        written.told(command);
+        written.command(command);
     }
     for payload in [
         json!({ "pass_record": { "path_mm": 1250.0, "removed_mm3": 12.5, "deepest_mm": 0.02, "idle_share": 0.25,
@@ -462,7 +462,7 @@ fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
     said("grinder: to be brought home by CLEAR, its state is FAULTED");
     said("answered: IDLE");
     // A person's confirmation about a machine is an order like any other. The report shows why an order was refused.
-    let orders: Vec<String> = Page::of(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
+    let orders: Vec<String> = Page::read(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
     for words in ["grinder: done, map 3fa9c210", "grinder: to be brought home by CLEAR"] {
         assert!(orders.iter().any(|row| row.contains(words)), "{words}: {orders:#?}");
     }
@@ -477,21 +477,21 @@ fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
         written.ended(&aborted())
     };
     let (_home, folder) = of(json!({ "plan": { "tolerance": tolerance } }));
-    let judged = Page::of(&folder).rows("judged");
+    let judged = Page::read(&folder).rows("judged");
     assert!(judged[0][4] == "no limit" && judged[0][5].is_empty(), "{judged:?}");
     assert!(judged[1][4] == "1.00" && !judged[1][5].is_empty(), "{judged:?}");
     let (_home, folder) = of(Value::Null);
-    let page = Page::of(&folder);
+    let page = Page::read(&folder);
     assert!(page.rows("judged").is_empty() && page.cycles().len() == 1);
 }
 
 pub fn tolerance() -> Tolerance {
-    use regrind::cell::PvOf;
+    use regrind::cell::PvPoints;
     Tolerance {
         pv_mm: 0.007,
         rms_mm: 0.001,
         with_uncertainty: true,
-        probability: Tolerance::USUAL,
-        pv_of: PvOf::MostPoints,
+        probability: Tolerance::DEFAULT_PROBABILITY,
+        pv_of: PvPoints::MostPoints,
     }
 }

@@ -8,7 +8,7 @@ use std::process::Command;
 use crate::data::data;
 use crate::program::{root, run, small_recipe};
 use crate::reports::{Written, aborted, ada, arguments, figures, json_in, the_run, tolerance};
-use regrind::cell::{Command as CellCommand, Event, Figures, Gate, GateFailure, Judgement, Verdict};
+use regrind::cell::{Command as CellCommand, Event, Figures, GateResult, GateFailure, Judgement, Verdict};
 use regrind::report::{ResultsFormat, run_results};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -44,18 +44,18 @@ fn hostile() -> (TempDir, std::path::PathBuf) {
         ..figures()
     };
     let mut measured = |cycle: u32, figures: Figures, judged: Option<Verdict>| {
-        written.event(Event::Collected { cycle, targets: 100, found: 100, gate: Gate::Passed });
+        written.event(Event::Collected { cycle, targets: 100, found: 100, gate: GateResult::Passed });
         written.event(Event::Registered { cycle, figures });
         if let Some(verdict) = judged {
             let reason = "as it is\r\nK2111/1 9".into();
-            written.told(CellCommand::Announce(Judgement { cycle, verdict, reason }));
+            written.command(CellCommand::Announce(Judgement { cycle, verdict, reason }));
         }
     };
     measured(1, of(0.009, 0.0004), Some(Verdict::Continue));
     measured(2, of(0.0068, 0.0004), Some(Verdict::Continue));
     measured(3, of(0.0060, 0.0004), None);
     measured(4, of(0.0060, 0.0004), Some(Verdict::Accept));
-    let gate = Gate::Failed(GateFailure::Coverage("12 % found".into()));
+    let gate = GateResult::Failed(GateFailure::Coverage("12 % found".into()));
     written.event(Event::Collected { cycle: 5, targets: 100, found: 12, gate });
     written.ended(&aborted())
 }

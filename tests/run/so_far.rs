@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use crate::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
 use regrind::cell::Ending;
-use regrind::drive::{Drive, Request, Snapshot, SoFar};
+use regrind::drive::{Drive, Request, Snapshot, PreviewStatistics};
 use regrind_sim::registers::SimulatedMachine;
 
 fn cmm(rig: &Rig, what: impl FnOnce(&mut SimulatedMachine)) {
@@ -47,7 +47,7 @@ async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
     cmm(&rig, half);
     // Eight full pages of seven points, including those on the reference sphere. The first pages are enough.
     let told = seen(&folder, |status| status.so_far.filter(|told| told.touched >= 14)).await;
-    let SoFar { touched, rms_um, least_um, most_um } = told;
+    let PreviewStatistics { touched, rms_um, least_um, most_um } = told;
     assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
     // After a hold, the points stay visible. Orders are obeyed as usual.
     let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;

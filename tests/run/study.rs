@@ -13,12 +13,12 @@ use std::path::Path;
 
 use regrind::cell::CellPlan;
 use regrind::compensation::{
-    Contact, Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind, Parameters, Seen,
-    Set, Smoother, error_map, parameters, response, smooth_of,
+    SurfacePoint, Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind, ParameterEstimation, PassObservation,
+    ParameterCorrections, ParameterExplainer, error_map, parameters, response, explained_by_parameters,
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
-use regrind::geometry::{Grid, Point, Sample, Vector};
+use regrind::geometry::{Grid, Point, DeviationSample, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
@@ -125,7 +125,7 @@ struct Line<'a> {
     before: Option<(Correction, ErrorMap)>,
     forecast: Option<[f64; 2]>,
     /// Parameters that were estimated after the first pass.
-    told: Option<Parameters>,
+    told: Option<ParameterEstimation>,
 }
 
 impl<'a> Line<'a> {
@@ -139,15 +139,15 @@ impl<'a> Line<'a> {
     ) -> Self {
         let task = &bench.task;
         let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
-        let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
+        let grid = Grid::over(corners.into_iter(), task.map_options.spacing_mm).unwrap();
         let size_mm = [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]];
         let rule = if let Way::Regrind(rule) = way { rule } else { GainRule::Fixed(1.0) };
-        let none = Correction::zero(grid, task.limits.allowance_mm);
+        let none = Correction::zero(grid, task.correction_limits.allowance_mm);
         let (correction, known) = match learned {
             Some((correction, known)) => {
                 (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
             }
-            None => (none, LearningState::new(rule, &task.map, size_mm, task.repeatability_mm)),
+            None => (none, LearningState::new(rule, &task.map_options, size_mm, task.repeatability_mm)),
         };
         if job > 1 {
             world.load_blank();
@@ -253,11 +253,11 @@ impl<'a> Line<'a> {
     fn error(&self, found: &Registration) -> ErrorMap {
         let task = &self.bench.task;
         let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
-        let readings: Vec<Sample> =
-            used().map(|d| Sample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+        let readings: Vec<DeviationSample> =
+            used().map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
         match self.way {
-            Way::Regrind(_) => error_map(&readings, &task.map).unwrap(),
-            Way::Plain => unfiltered(&readings, &task.map),
+            Way::Regrind(_) => error_map(&readings, &task.map_options).unwrap(),
+            Way::Plain => unfiltered(&readings, &task.map_options),
         }
     }
 
@@ -267,28 +267,28 @@ impl<'a> Line<'a> {
         let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
         let answer = self.before.as_ref().map(|(correction, earlier)| {
             let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
-            response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
+            estimate_response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
         });
         let answer = answer.filter(|_| self.way != Way::Plain);
-        let (contacts, set) = self.tell(found);
+        let (contacts, set) = self.estimate_parameters(found);
         let options = task.parameter_options(self.correction.set.as_ref());
         let grid = self.correction.grid;
         let smoother = task
-            .parameters
+            .parameter_compensation
             .as_ref()
-            .map(|taken| move |values: &[f64]| smooth_of(values, &grid, [&contacts, &taken.nodes], &options));
-        let smooth = smoother.as_ref().map(|smoother| smoother as Smoother<'_>);
-        let seen = Seen { correction: &self.correction, error: &error, response: answer, explained: smooth };
+            .map(|taken| move |values: &[f64]| explained_by_parameters(values, &grid, [&contacts, &taken.node_points], &options));
+        let smooth = smoother.as_ref().map(|smoother| smoother as ParameterExplainer<'_>);
+        let seen = PassObservation { correction: &self.correction, error: &error, response: answer, explained: smooth };
         self.known = self.known.updated(&seen);
         let forecast = self.known.forecast(&error, 0.0);
         self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
-        let next = match self.correction.next_pass(&error, &self.known, set.as_ref(), &task.limits) {
+        let next = match self.correction.next_pass(&error, &self.known, set.as_ref(), &task.correction_limits) {
             Ok(step) => step.correction,
             // The study goes on where the material budget of a recipe would be spent. Here only the form counts.
             Err(NextPassError::BudgetSpent { .. }) => {
                 let changed = self.correction.compensating(&self.known, set.as_ref());
                 Correction {
-                    level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
+                    level_mm: changed.level_mm - task.correction_limits.depth_of_cut_mm,
                     cycle: changed.cycle + 1,
                     ..changed
                 }
@@ -300,18 +300,18 @@ impl<'a> Line<'a> {
 
     /// Estimates the parameters after the first pass, as a run does. Returns the contacts, and the parameter
     /// corrections that the next pass uses.
-    fn tell(&mut self, found: &Registration) -> (Vec<Contact>, Option<Set>) {
+    fn estimate_parameters(&mut self, found: &Registration) -> (Vec<SurfacePoint>, Option<ParameterCorrections>) {
         let task = &self.bench.task;
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
-        let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
-        let contacts: Vec<Contact> = used.map(contact).collect();
+        let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
+        let contacts: Vec<SurfacePoint> = used.map(contact).collect();
         let before = self.correction.set.clone();
-        let Some(taken) = task.parameters.as_ref().filter(|_| self.before.is_none()) else { return (contacts, before) };
+        let Some(taken) = task.parameter_compensation.as_ref().filter(|_| self.before.is_none()) else { return (contacts, before) };
         let options = task.parameter_options(before.as_ref());
-        let told = parameters(&contacts, None, &options).unwrap();
+        let told = estimate_parameters(&contacts, None, &options).unwrap();
         let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
         values.iter_mut().zip(&told.estimates).for_each(|(value, of)| *value += of.compensated);
-        let set = Set::from_values(values, self.correction.cycle + 1, [&contacts, &taken.nodes], &options);
+        let set = ParameterCorrections::from_values(values, self.correction.cycle + 1, [&contacts, &taken.node_points], &options);
         self.told = Some(told);
         (contacts, set)
     }
@@ -327,7 +327,7 @@ impl<'a> Line<'a> {
         let row = |(p, n): &(Point, Vector)| {
             let turn = p.coords.cross(n) / size;
             let row = nalgebra::Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z);
-            row.map_with_location(|k, _, v| if self.bench.task.registration.locked[k] { 0.0 } else { v })
+            row.map_with_location(|k, _, v| if self.bench.task.registration_options.locked[k] { 0.0 } else { v })
         };
         let rows: Vec<_> = self.bench.plan_of.iter().map(row).collect();
         let gram: nalgebra::Matrix6<f64> = rows.iter().map(|row| row * row.transpose()).sum();
@@ -392,10 +392,10 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
 }
 
 /// Returns the measured deviations as a map, by the nearest point.
-fn unfiltered(readings: &[Sample], options: &MapOptions) -> ErrorMap {
+fn unfiltered(readings: &[DeviationSample], options: &MapOptions) -> ErrorMap {
     let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm).unwrap();
     let nearest = |[x, y]: [f64; 2]| {
-        let distance = |r: &&Sample| (r.place_mm[0] - x).powi(2) + (r.place_mm[1] - y).powi(2);
+        let distance = |r: &&DeviationSample| (r.place_mm[0] - x).powi(2) + (r.place_mm[1] - y).powi(2);
         readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
     };
     let values_mm = (0..grid.len()).map(|k| nearest(grid.place_mm(k))).collect();

@@ -1,8 +1,8 @@
 //! Machine parameters in many worlds: estimated, compensated, and compared with the map alone, by the truth.
 
-use regrind::compensation::path::height_of;
-use regrind::compensation::{Contact, GainRule, ParameterKind, WheelTerm};
-use regrind::drive::TakenBack;
+use regrind::compensation::path::nominal_height_field;
+use regrind::compensation::{SurfacePoint, GainRule, ParameterKind, WheelTerm};
+use regrind::drive::ParameterCompensation;
 use regrind::geometry::Grid;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
@@ -36,7 +36,7 @@ pub struct Compared {
     /// Estimates of the parameters. Each has its kind, the error of the estimate (estimate minus truth) divided by the
     /// expanded uncertainty, the expanded uncertainty, the true value, the value that was compensated, and a flag for a
     /// compensated value that exceeds its tolerance.
-    pub told: Vec<Told>,
+    pub parameters: Vec<ParameterResult>,
     /// Truth after every pass, with parameters and by the map alone.
     pub with: Vec<After>,
     pub alone: Vec<After>,
@@ -44,7 +44,7 @@ pub struct Compared {
 
 /// Estimate of one parameter.
 #[derive(Clone, Copy, Debug)]
-pub struct Told {
+pub struct ParameterResult {
     pub kind: ParameterKind,
     pub off: f64,
     pub expanded: f64,
@@ -57,10 +57,10 @@ impl Bench {
     /// Returns the same bench with the given pose directions locked. If any is locked, a datum locates the part in the
     /// grinder in every direction in which the part can be off.
     pub fn held(mut self, held: [bool; 6]) -> Self {
-        self.task.registration.locked = held;
+        self.task.registration_options.locked = held;
         if held.contains(&true) {
             self.task.start_at_fixture = true;
-            self.task.datum = Some(self.datum());
+            self.task.locked_sigmas = Some(self.datum());
         }
         self
     }
@@ -93,7 +93,7 @@ impl Bench {
         grinder.setting_error_um = [draw(SETTING_UM), draw(SETTING_UM)];
         grinder.setting_error_z_um = draw(SETTING_UM);
         grinder.part_tilt_urad = [draw(TILT_URAD), draw(TILT_URAD)];
-        if self.task.datum.is_some() {
+        if self.task.locked_sigmas.is_some() {
             let [shift_mm, turn_rad] = self.datum();
             spec.cmm.translation_mm = [0.0; 3];
             spec.cmm.rotation_deg = [0.0; 3];
@@ -108,10 +108,10 @@ impl Bench {
         let spec = self.off(seed);
         let (told, with) = self.with_parameters().line_of(&spec, passes);
         let (_, alone) = self.without_parameters().line_of(&spec, passes);
-        Compared { told, with, alone }
+        Compared { parameters: told, with, alone }
     }
 
-    fn line_of(&self, spec: &WorldSpec, passes: u16) -> (Vec<Told>, Vec<After>) {
+    fn line_of(&self, spec: &WorldSpec, passes: u16) -> (Vec<ParameterResult>, Vec<After>) {
         let of = &spec.grinder;
         let alone = GrinderSpec {
             repeatability_um: of.repeatability_um,
@@ -131,7 +131,7 @@ impl Bench {
             let drift_um = if p.kind == ParameterKind::SettingZ { self.drift_um(spec) } else { 0.0 };
             let truth = (truth(of, p.kind) + drift_um) / p.kind.display_units_per_unit();
             let units = p.kind.display_units_per_unit();
-            Told {
+            ParameterResult {
                 kind: p.kind,
                 off: (p.value - truth) / (2.0 * p.sigma),
                 expanded: 2.0 * units * p.sigma,
@@ -172,20 +172,20 @@ impl Bench {
         let mut bench = self.without_parameters();
         let task = &mut bench.task;
         let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
-        let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
-        let nodes = Contact::under_nodes(&height_of(&task.nominal).unwrap().0, &grid);
+        let grid = Grid::over(corners.into_iter(), task.map_options.spacing_mm).unwrap();
+        let nodes = SurfacePoint::under_nodes(&nominal_height_field(&task.nominal).unwrap().0, &grid);
         let [mm, rad] = [1e-3, 1e-6];
         let [radius, setting, tilt] = [mm * RADIUS_UM, mm * SETTING_UM, rad * TILT_URAD].map(Some);
-        task.parameters = Some(TakenBack {
+        task.parameter_compensation = Some(ParameterCompensation {
             tolerances: [radius, setting, setting, setting, tilt, tilt, None],
             wheel_term: WheelTerm::InHeight,
-            nodes,
+            node_points: nodes,
         });
         bench
     }
 
     fn again(&self) -> Self {
-        let mut bench = Self::new(&self.name).held(self.task.registration.locked).on(self.machine);
+        let mut bench = Self::new(&self.name).held(self.task.registration_options.locked).on(self.machine);
         bench.spec = self.spec.clone();
         bench
     }

@@ -35,7 +35,7 @@ fn batches(folder: &Path) -> Vec<u64> {
 fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
     for (recipe, seed) in cases([("freeform-mirror", 1), ("biconic", 2)], 2) {
         let ran = run(chosen(recipe, seed));
-        assert!(ran.accepted(), "{recipe}: {}", ran.told());
+        assert!(ran.accepted(), "{recipe}: {}", ran.failure_text());
         let told = document(&ran.folder.join("result.json"));
         let [taken, whole] = ["taken", "whole_patterns"].map(|key| told["touches"][key].as_u64().unwrap());
         println!("{recipe}: {taken} touches of {whole}, batch by batch up to {:?}", batches(&ran.folder));
@@ -108,7 +108,7 @@ fn what_is_wrong_is_seen_at_the_first_ten_touches() {
     ];
     for (what, setup, alarm) in cases {
         let ran = run(setup);
-        let told = format!("{what}: {}", ran.told());
+        let told = format!("{what}: {}", ran.failure_text());
         println!("{told}");
         assert_eq!(ran.alarms().first().map(|alarm| alarm.id), Some(alarm), "{told}");
         assert_eq!((ran.world.measurements_begun(), ran.world.history().len()), (1, 1), "{told}");
@@ -121,8 +121,8 @@ fn what_is_wrong_is_seen_at_the_first_ten_touches() {
 fn a_part_that_lies_elsewhere_is_seen_at_the_first_ten_touches() {
     let setup = chosen("freeform-mirror", 1).with(|world| world.faults.no_part = true);
     let ran = run(setup);
-    assert_eq!(ran.alarms().first().map(|alarm| alarm.id), Some(AlarmId::NoPart), "{}", ran.told());
-    assert_eq!(ran.world.measurements_begun(), 1, "{}", ran.told());
+    assert_eq!(ran.alarms().first().map(|alarm| alarm.id), Some(AlarmId::NoPart), "{}", ran.failure_text());
+    assert_eq!(ran.world.measurements_begun(), 1, "{}", ran.failure_text());
 }
 
 #[test]

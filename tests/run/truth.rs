@@ -12,7 +12,7 @@ use regrind_sim::Vec3;
 use regrind_sim::probe::Placement;
 use regrind_sim::world::World;
 
-use crate::worlds::{Snapshot, foot};
+use crate::worlds::{Snapshot, project_onto_nominal};
 
 /// Best fit to the true surface.
 pub struct Truth {
@@ -48,7 +48,7 @@ pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, leve
         let mut deviations_mm = Vec::with_capacity(centres.len());
         for (c, used) in centres.iter().zip(used) {
             let q: Vec3 = pose.inverse().transform_point(&(*c).into()).into();
-            let (_, n, distance) = foot(world, q);
+            let (_, n, distance) = project_onto_nominal(world, q);
             let deviation = distance - radius_mm - level_mm;
             let row = -Vector6::new(
                 n[0],

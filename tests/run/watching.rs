@@ -26,7 +26,7 @@ async fn grinding(rig: &mut Rig) -> (Watched, JoinHandle<Ending>) {
 struct Watched {
     notices: UnboundedReceiver<Notice>,
     folder: std::path::PathBuf,
-    _orders: regrind::drive::Orders,
+    _orders: regrind::drive::OrderSender,
 }
 
 impl Watched {

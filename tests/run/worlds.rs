@@ -13,9 +13,9 @@ use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role, StateName};
 use regrind::config::CellConfig;
 use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
-use regrind::drive::{Beside, CycleRow, Drive, Ledger, Notice, Request, Run, ask};
+use regrind::drive::{BlockingExecutor, CycleRow, Drive, JournalSink, Notice, Request, RunInputs, send_request};
 use regrind::journal::{Header, Journal};
-use regrind::recipe::{Mode, Recipe};
+use regrind::recipe::{SelectionMode, Recipe};
 use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
@@ -145,7 +145,7 @@ impl Ran {
     }
 
     /// Returns all the text that a failed test should show.
-    pub fn told(&self) -> String {
+    pub fn failure_text(&self) -> String {
         let alarms: Vec<_> = self.alarms().iter().map(|a| format!("{:?}: {}", a.id, a.what)).collect();
         let rows: Vec<_> = self
             .rows()
@@ -206,7 +206,7 @@ struct Eye {
 
 impl Eye {
     /// Records the state of the world at the newest measured cycle, once.
-    fn look(&self) {
+    fn record_state(&self) {
         let Self { world, folder, radius_mm, .. } = self;
         let mut taken = self.taken.lock().unwrap();
         let cycles = std::fs::read_dir(folder).unwrap().filter_map(|entry| {
@@ -220,7 +220,7 @@ impl Eye {
         }
         let (placement, measured) = (world.placement(), table(&folder.join(format!("cycle-{cycle}/measured.csv"))));
         let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
-        let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
+        let places_mm: Vec<[f64; 2]> = centres.map(|centre| project_onto_nominal(world, centre).0).collect();
         // A touch at the very edge of the part may have its projection beyond the edge.
         let touched = world.ball_heights_mm(&places_mm, *radius_mm);
         let without_ball = touched.iter().map(Option::is_none).collect();
@@ -241,7 +241,7 @@ pub fn back(placement: &Placement, p: Vec3) -> Vec3 {
 ///
 /// Each iteration moves the projection by the residual along the surface. The residual shrinks by the ratio of distance
 /// to radius of curvature.
-pub fn foot(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
+pub fn project_onto_nominal(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
     let [mut x, mut y] = [p[0], p[1]];
     for _ in 0..40 {
         let (s, n) = world.nominal(x, y);
@@ -285,7 +285,7 @@ async fn go(setup: Setup) -> Ran {
     recipe.measure.temperature_c = setup.temperature_c;
     recipe.part.expansion_um_m_k = setup.expansion_um_m_k;
     if setup.adaptive {
-        (recipe.measure.mode, recipe.measure.accepted_risk) = (Mode::Adaptive, Some(0.025));
+        (recipe.measure.mode, recipe.measure.accepted_risk) = (SelectionMode::Adaptive, Some(0.025));
     }
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
@@ -294,21 +294,21 @@ async fn go(setup: Setup) -> Ran {
     let radius_mm = recipe.measure.probe_radius_mm;
     let eye = Arc::new(Eye { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
     let (servings, [of_cmm, of_grinder]) = serve(&setup, &cell, &eye).await;
-    let journal: Box<dyn Ledger> = Box::new(Journal::create(&folder, header("test part")).unwrap());
+    let journal: Box<dyn JournalSink> = Box::new(Journal::create(&folder, header("test part")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();
     let poll = [Duration::from_millis(10); 2];
     let actor = Actor { name: "test".into(), station: "here".into() };
-    let run = Run {
+    let run = RunInputs {
         plan,
         task,
         journal,
         job: JOB,
         actor: actor.clone(),
-        loaded: true,
-        poll,
+        load_confirmed: true,
+        poll_intervals: poll,
         notices,
         interrupted: None,
-        beside: Beside::Threads,
+        executor: BlockingExecutor::Threads,
     };
     let cmm = ModbusCmm::new(of_cmm).unwrap();
     let grinder = ModbusGrinder::new(of_grinder).unwrap();
@@ -326,13 +326,13 @@ async fn go(setup: Setup) -> Ran {
             // A held cell waits for a person. This task ends the run instead.
             tokio::spawn(async move {
                 if rests(folder).await {
-                    orders.give(Request::Stop { reason: "the test has seen enough".into() }, actor).await;
+                    orders.send(Request::Stop { reason: "the test has seen enough".into() }, actor).await;
                 }
             });
         }
     }
     let ending = driving.await.unwrap();
-    eye.look();
+    eye.record_state();
     drop(servings);
     let (snapshots, probe_radius_mm) = (std::mem::take(&mut *eye.taken.lock().unwrap()), eye.radius_mm);
     Ran { ending, notices: seen, folder, world, snapshots, tolerance_mm, probe_radius_mm, passes_at_alarm, _home: home }
@@ -342,7 +342,7 @@ async fn go(setup: Setup) -> Ran {
 async fn rests(folder: PathBuf) -> bool {
     loop {
         let folder = folder.clone();
-        let reply = tokio::task::spawn_blocking(move || ask(&folder, &Request::Status)).await.unwrap();
+        let reply = tokio::task::spawn_blocking(move || send_request(&folder, &Request::Status)).await.unwrap();
         match reply {
             Ok(reply) if reply.status.state == StateName::Held => return true,
             Ok(_) => tokio::time::sleep(Duration::from_millis(5)).await,
@@ -386,7 +386,7 @@ async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2
         ..MachineOptions::default()
     };
     let (world, eye) = (&eye.world, eye.clone());
-    let before: Box<dyn FnMut() + Send> = Box::new(move || eye.look());
+    let before: Box<dyn FnMut() + Send> = Box::new(move || eye.record_state());
     let grinder = Watched { body: world.grinder(), before };
     let cmm = SimulatedMachine::new(Box::new(world.cmm()), 0xc, options(setup.seed));
     let grinder = SimulatedMachine::new(Box::new(grinder), 0x9, options(setup.seed + 1));
@@ -405,6 +405,6 @@ async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2
         link.timing.request_timeout = Duration::from_secs(5);
         link.timing.lost_after = Duration::from_secs(60);
     }
-    let settings = links.map(|link| setup::modbus(&link, true, 0x7e57, 1).unwrap());
+    let settings = links.map(|link| setup::modbus_settings(&link, true, 0x7e57, 1).unwrap());
     ([cmm, grinder], settings)
 }

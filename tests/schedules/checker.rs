@@ -399,7 +399,7 @@ fn held_when_it_holds(evidence: &Evidence) -> Result<(), String> {
         if (before.state, now.state) != (Some(StateName::Holding), Some(StateName::Held)) {
             continue;
         }
-        let Some(device) = before.phase.and_then(Phase::moving) else { continue };
+        let Some(device) = before.phase.and_then(Phase::moving_device) else { continue };
         let at = states.partition_point(|(at, _)| *at <= now.at);
         if states[at - 1].1[device as usize] == State::Execute {
             return Err(format!("the {device} moves as it is shown to be held at {:.3} s", evidence.seconds(now.at)));

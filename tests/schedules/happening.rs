@@ -14,7 +14,7 @@ use regrind::device::{
     AnyCmm, AnyGrinder, IppdmeCmm, IppdmeSettings, IppdmeWire, Link, LinuxcncGrinder, LinuxcncSettings, LinuxcncWire,
     ModbusCmm, ModbusGrinder, ModbusSettings,
 };
-use regrind::drive::{Beside, Blocking, Drive, Interrupted, Orders, Run};
+use regrind::drive::{BlockingExecutor, BlockingWork, Drive, InterruptedRun, OrderSender, RunInputs};
 use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
 use regrind::setup;
 use regrind_sim::seen::HandshakeEvent;
@@ -167,15 +167,15 @@ impl<'s> Happening<'s> {
             let mut journal = Journal::create_with(folder, self.header(), Some(AuditKey::new())).unwrap();
             if self.schedule.rsh.is_some() {
                 // As `regrind run` does for a grinder that reads files from the folder of the run.
-                for name in task.save_first(&folder.join("cycle-0")).unwrap() {
+                for name in task.save_first_pass(&folder.join("cycle-0")).unwrap() {
                     journal.adopt(&format!("cycle-0/{name}"), 0, 0).unwrap();
                 }
             }
             (journal, None)
         } else {
-            let lock = RunLock::take(folder).unwrap();
+            let lock = RunLock::acquire(folder).unwrap();
             verify(folder).unwrap();
-            let interrupted = Interrupted::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
+            let interrupted = InterruptedRun::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
             (Journal::open_locked(lock, None).unwrap(), Some(interrupted))
         };
         let kept = Kept::new(journal, &self.disk, life, &self.written, &self.cues);
@@ -185,20 +185,20 @@ impl<'s> Happening<'s> {
         let mut computing = StdRng::seed_from_u64(self.schedule.seed ^ 0x50 ^ self.lives);
         let computing = Mutex::new(move || up_to(&mut computing, 0.8));
         let takes = move |what| match what {
-            Blocking::Record => disk.write_takes(),
+            BlockingWork::Record => disk.write_takes(),
             _ => computing.lock().unwrap()(),
         };
-        let run = Run {
+        let run = RunInputs {
             plan,
             task,
             journal: Box::new(kept),
             job: self.job,
             actor: actor(),
-            loaded: true,
-            poll: part::poll(),
+            load_confirmed: true,
+            poll_intervals: part::poll(),
             notices,
             interrupted,
-            beside: Beside::InTurn(Arc::new(takes)),
+            executor: BlockingExecutor::SimulatedTime(Arc::new(takes)),
         };
         let (cmm, grinder) = self.drivers(life, folder);
         let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
@@ -243,7 +243,7 @@ impl<'s> Happening<'s> {
     fn settings(&self, which: usize) -> ModbusSettings {
         let cell = &part::setting(Wanted::Good).cell;
         let link = if which == 0 { &cell.cmm.link } else { &cell.grinder.link };
-        setup::modbus(link, true, 7, self.lives as u32).unwrap()
+        setup::modbus_settings(link, true, 7, self.lives as u32).unwrap()
     }
 
     /// Returns the folder of programs, which the controller sees too.
@@ -452,7 +452,7 @@ fn has_events(folder: &Path) -> bool {
 }
 
 /// Records the states that the cell shows.
-async fn watch(orders: Orders, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
+async fn watch(orders: OrderSender, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
     let mut status = orders.status();
     loop {
         let (state, phase, unconfirmed) = {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::drive::Ledger;
+use regrind::drive::JournalSink;
 use regrind::journal::{Anchor, Artefact, Entry, Journal, JournalError};
 use serde_json::{Value, json};
 use tokio::time::Instant;
@@ -154,7 +154,7 @@ fn text_of(entry: &Entry) -> String {
     format!("{} {} {}", entry.kind.as_str(), entry.mono_ns, entry.payload)
 }
 
-impl Ledger for Kept {
+impl JournalSink for Kept {
     fn folder(&self) -> &Path {
         &self.folder
     }

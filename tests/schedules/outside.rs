@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use regrind::device::{Link, Machine as _, ModbusCmm, ModbusGrinder, ModbusSettings};
-use regrind::drive::{Orders, Request};
+use regrind::drive::{OrderSender, Request};
 use regrind_sim::command::{CommandFrame, Mode};
 use regrind_sim::options::RegisterLayout;
 use regrind_sim::rsh::Controller;
@@ -24,7 +24,7 @@ use crate::person::{Given, give, take_supplies};
 use crate::schedule::Act;
 
 /// Receiver of orders in the current life of the program.
-pub type Office = Arc<Mutex<Option<(Orders, Arc<Life>)>>>;
+pub type Office = Arc<Mutex<Option<(OrderSender, Arc<Life>)>>>;
 
 /// Intervals in which something obstructed requests to the machines.
 pub type Hindered = Arc<Mutex<Vec<(Instant, Instant)>>>;

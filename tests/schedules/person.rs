@@ -7,8 +7,8 @@ use std::time::Duration;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::cell::{Actor, Device, StateName};
-use regrind::drive::{Orders, Request};
-use regrind_control::Next;
+use regrind::drive::{OrderSender, Request};
+use regrind_control::NextStep;
 use regrind_sim::command::interlock;
 use regrind_sim::wire::SharedMachine;
 use tokio::time::Instant;
@@ -56,7 +56,7 @@ impl Person {
     }
 
     /// Attends to the cell in one life of the program; never returns.
-    pub async fn attend(&mut self, orders: &Orders, life: &Life) {
+    pub async fn attend(&mut self, orders: &OrderSender, life: &Life) {
         let status = orders.status();
         loop {
             let pause = Duration::from_millis(self.chance.random_range(50..1500));
@@ -65,7 +65,7 @@ impl Person {
                 let seen = status.borrow();
                 (seen.state, seen.number, seen.phase, seen.next_step.clone())
             };
-            if let Next::SeeClear { device } = next {
+            if let NextStep::SeeClear { device } = next {
                 self.see_clear(orders, life, device).await;
             }
             if state != StateName::Held {
@@ -78,7 +78,7 @@ impl Person {
             } else if self.resumes > PATIENCE {
                 self.give(orders, life, "stop", |reason| Request::Stop { reason }).await;
             } else {
-                if let Some(device) = phase.and_then(|phase| phase.moving()) {
+                if let Some(device) = phase.and_then(|phase| phase.moving_device()) {
                     self.look_at(orders, life, device).await;
                 }
                 self.give(orders, life, "resume", |reason| Request::Resume { reason, seen: Some(number) }).await;
@@ -88,7 +88,7 @@ impl Person {
 
     /// Confirms that a machine is clear of the part, if it cannot report it: the person looks, moves it away, and
     /// confirms.
-    async fn see_clear(&mut self, orders: &Orders, life: &Life, device: Device) {
+    async fn see_clear(&mut self, orders: &OrderSender, life: &Life, device: Device) {
         let plant = &self.plants[device as usize];
         if !plant.moves() {
             plant.moved_away();
@@ -98,7 +98,7 @@ impl Person {
 
     /// Confirms the end of a job that a machine cannot report: the person looks whether the machine is at a standstill,
     /// and confirms.
-    async fn look_at(&mut self, orders: &Orders, life: &Life, device: Device) {
+    async fn look_at(&mut self, orders: &OrderSender, life: &Life, device: Device) {
         if self.resumes.is_multiple_of(4) && self.plants[device as usize].is_over() {
             self.give(orders, life, "over", |evidence| Request::Over { device, evidence }).await;
         }
@@ -107,7 +107,7 @@ impl Person {
     /// Gives an order and records the answer.
     pub async fn give(
         &mut self,
-        orders: &Orders,
+        orders: &OrderSender,
         life: &Life,
         what: &'static str,
         request: impl FnOnce(String) -> Request,
@@ -119,7 +119,7 @@ impl Person {
 
 /// Gives an order and records the answer, unless the program dies during it.
 pub async fn give(
-    orders: &Orders,
+    orders: &OrderSender,
     life: &Life,
     given: &Mutex<Vec<Given>>,
     (what, reason): (&'static str, String),
@@ -128,7 +128,7 @@ pub async fn give(
 ) {
     let at = Instant::now();
     let moved = [0, 1].map(|k: usize| plants[k].moves());
-    let reply = orders.ask(request(reason.clone()), actor()).await;
+    let reply = orders.send_and_wait(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
     let accepted = reply.taken;
     let done = accepted || reply.message.contains("make the cell safe were carried out");

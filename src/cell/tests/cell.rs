@@ -5,25 +5,25 @@ use std::time::Duration;
 use proptest::prelude::*;
 use regrind_cell::*;
 
-const S: Duration = Duration::from_secs(1);
+const SECOND: Duration = Duration::from_secs(1);
 
 fn plan() -> CellPlan {
     CellPlan {
-        begin_with: Beginning::Grind,
+        begin_with: FirstStep::Grind,
         max_cycles: 4,
         tolerance: Tolerance {
             pv_mm: 0.007,
             rms_mm: 0.001,
             with_uncertainty: true,
-            probability: Tolerance::USUAL,
-            pv_of: PvOf::All,
+            probability: Tolerance::DEFAULT_PROBABILITY,
+            pv_of: PvPoints::All,
         },
         stall_share: 0.02,
         stall_mm: 0.0,
-        on_stall: Disposal::Stop,
-        on_divergence: Disposal::Hold,
-        on_refusal: Disposal::Hold,
-        gates: Gates {
+        on_stall: HoldOrStop::Stop,
+        on_divergence: HoldOrStop::Hold,
+        on_refusal: HoldOrStop::Hold,
+        gates: GateLimits {
             least_found: 0.95,
             min_coverage: 0.9,
             most_shift_mm: 1.0,
@@ -82,7 +82,7 @@ fn abort() -> Event {
 }
 
 /// Returns the answer that a good world gives to a command.
-fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<Event> {
+fn good_answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<Event> {
     Some(match command.clone() {
         Command::Connect { device } | Command::ClearMachine { device } => {
             Event::Connected { device, boot_id: 7, simulated: true, found: Occupation::Idle }
@@ -99,7 +99,7 @@ fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<
         Command::StopMachine { device } => Event::Ended { device, cycle: u32::MAX, result: JobResult::Stopped },
         Command::AbortMachine { device } => Event::AbortConfirmed { device },
         Command::Reconcile { device, cycle } => Event::Reconciled { device, cycle, outcome: Reconciliation::Running },
-        Command::Collect { cycle } => Event::Collected { cycle, targets: 1000, found: 999, gate: Gate::Passed },
+        Command::Collect { cycle } => Event::Collected { cycle, targets: 1000, found: 999, gate: GateResult::Passed },
         Command::Qualify { cycle } => Event::Qualified { cycle, radius_error_mm: 0.0003 },
         Command::Acknowledge { device } => Event::Acknowledged { device },
         Command::Register { cycle } => Event::Registered { cycle, figures: figures(cycle) },
@@ -118,38 +118,38 @@ fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<
 }
 
 /// A cell and a good world around it.
-struct Run<'f> {
+struct TestRun<'f> {
     cell: Cell,
     now: Duration,
-    all: Vec<Command>,
-    waiting: Vec<Command>,
+    commands: Vec<Command>,
+    open_commands: Vec<Command>,
     figures: Box<dyn FnMut(u32) -> Figures + 'f>,
 }
 
-impl<'f> Run<'f> {
+impl<'f> TestRun<'f> {
     fn new(plan: CellPlan, figures: impl FnMut(u32) -> Figures + 'f) -> Self {
         let cell = Cell::new(plan);
-        Self { cell, now: Duration::ZERO, all: vec![], waiting: vec![], figures: Box::new(figures) }
+        Self { cell, now: Duration::ZERO, commands: vec![], open_commands: vec![], figures: Box::new(figures) }
     }
 
     /// A run that is ground twice and then accepted.
-    fn good() -> Self {
+    fn accepted_after_two_passes() -> Self {
         Self::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) })
     }
 
     fn send(&mut self, event: Event) -> Vec<Command> {
-        self.now += S / 100;
+        self.now += SECOND / 100;
         let commands = self.cell.handle(self.now, event);
-        self.all.extend(commands.clone());
-        self.waiting.extend(commands.clone());
+        self.commands.extend(commands.clone());
+        self.open_commands.extend(commands.clone());
         commands
     }
 
     /// Answers the oldest open command, or lets a running job end; false if nothing is left to do.
     fn step(&mut self) -> bool {
-        while !self.waiting.is_empty() {
-            let command = self.waiting.remove(0);
-            if let Some(mut event) = answer(&command, &mut self.figures) {
+        while !self.open_commands.is_empty() {
+            let command = self.open_commands.remove(0);
+            if let Some(mut event) = good_answer(&command, &mut self.figures) {
                 if let Event::Ended { cycle, .. } = &mut event {
                     *cycle = self.cell.cycle();
                 }
@@ -166,7 +166,7 @@ impl<'f> Run<'f> {
         running.map(|device| self.send(Event::Ended { device, cycle, result: JobResult::Complete })).is_some()
     }
 
-    fn go_on(&mut self) -> &mut Self {
+    fn run_to_rest(&mut self) -> &mut Self {
         for _ in 0..2000 {
             if !self.step() {
                 return self;
@@ -175,7 +175,7 @@ impl<'f> Run<'f> {
         panic!("the run does not come to rest: {}", self.cell.state());
     }
 
-    fn until(&mut self, state: State) -> &mut Self {
+    fn run_until(&mut self, state: State) -> &mut Self {
         for _ in 0..2000 {
             if self.cell.state() == state {
                 return self;
@@ -191,15 +191,15 @@ impl<'f> Run<'f> {
     }
 
     fn ending(&self) -> Option<&Ending> {
-        self.all.iter().find_map(|c| if let Command::Finish(ending) = c { Some(ending) } else { None })
+        self.commands.iter().find_map(|c| if let Command::Finish(ending) = c { Some(ending) } else { None })
     }
 
     fn alarms(&self) -> Vec<AlarmId> {
-        self.all.iter().filter_map(|c| if let Command::Raise(alarm) = c { Some(alarm.id) } else { None }).collect()
+        self.commands.iter().filter_map(|c| if let Command::Raise(alarm) = c { Some(alarm.id) } else { None }).collect()
     }
 
     fn judgements(&self) -> impl Iterator<Item = &Judgement> {
-        self.all.iter().filter_map(|c| if let Command::Announce(judgement) = c { Some(judgement) } else { None })
+        self.commands.iter().filter_map(|c| if let Command::Announce(judgement) = c { Some(judgement) } else { None })
     }
 
     fn verdicts(&self) -> Vec<Verdict> {
@@ -209,29 +209,29 @@ impl<'f> Run<'f> {
     fn starts(&self) -> Vec<(Device, u32)> {
         let start =
             |c: &Command| if let Command::StartMachine { device, cycle } = c { Some((*device, *cycle)) } else { None };
-        self.all.iter().filter_map(start).collect()
+        self.commands.iter().filter_map(start).collect()
     }
 }
 
 #[test]
 fn a_whole_run_grinds_twice_and_is_accepted() {
-    let mut run = Run::good();
-    run.start().go_on();
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_to_rest();
     assert_eq!(run.cell.state(), State::Complete);
     assert!(matches!(run.ending(), Some(Ending::Accepted { cycle: 2, .. })), "{:?}", run.ending());
     use Device::{Cmm, Grinder};
     assert_eq!(run.starts(), [(Grinder, 1), (Cmm, 1), (Grinder, 2), (Cmm, 2)]);
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Accept]);
     assert_eq!(run.alarms(), []);
-    assert!(!run.all.iter().any(|c| matches!(c, Command::Refuse { .. })));
+    assert!(!run.commands.iter().any(|c| matches!(c, Command::Refuse { .. })));
     assert_eq!(run.cell.next_deadline(), None);
 }
 
 #[test]
 fn a_run_may_begin_with_a_measurement() {
-    let begin_with = Beginning::Measure;
-    let mut run = Run::new(CellPlan { begin_with, ..plan() }, |_| figures(5.0, 0.5));
-    run.start().go_on();
+    let begin_with = FirstStep::Measure;
+    let mut run = TestRun::new(CellPlan { begin_with, ..plan() }, |_| figures(5.0, 0.5));
+    run.start().run_to_rest();
     assert_eq!(run.starts(), [(Device::Cmm, 1)]);
     assert_eq!(run.cell.state(), State::Complete);
 }
@@ -240,8 +240,8 @@ fn a_run_may_begin_with_a_measurement() {
 fn the_uncertainty_counts_only_where_the_plan_says_so() {
     for (with_uncertainty, accepted) in [(true, false), (false, true)] {
         let tolerance = Tolerance { with_uncertainty, ..plan().tolerance };
-        let mut run = Run::new(CellPlan { tolerance, max_cycles: 1, ..plan() }, |_| figures(7.0, 1.0));
-        run.start().go_on();
+        let mut run = TestRun::new(CellPlan { tolerance, max_cycles: 1, ..plan() }, |_| figures(7.0, 1.0));
+        run.start().run_to_rest();
         assert_eq!(run.cell.state() == State::Complete, accepted);
     }
 }
@@ -262,25 +262,25 @@ fn every_judgement_has_its_end() {
             State::Held(Phase::Compensate),
         ),
         (
-            |k| Figures { response: (k > 1).then_some(Response::SignFlipped), ..figures(20.0 * f64::from(k), 6.0) },
+            |k| Figures { response: (k > 1).then_some(PartResponse::SignFlipped), ..figures(20.0 * f64::from(k), 6.0) },
             &[Verdict::Continue, Verdict::WrongResponse],
             State::Held(Phase::Compensate),
         ),
         (
-            |k| Figures { response: (k > 1).then_some(Response::Mirrored), ..figures(20.0, 6.0) },
+            |k| Figures { response: (k > 1).then_some(PartResponse::Mirrored), ..figures(20.0, 6.0) },
             &[Verdict::Continue, Verdict::WrongResponse],
             State::Held(Phase::Compensate),
         ),
         (
-            |k| Figures { response: (k > 1).then_some(Response::NoEffect), ..figures(20.0, 6.0) },
+            |k| Figures { response: (k > 1).then_some(PartResponse::NoEffect), ..figures(20.0, 6.0) },
             &[Verdict::Continue, Verdict::WrongResponse],
             State::Held(Phase::Compensate),
         ),
         (|_| Figures { removed_mm: Some(0.499), ..figures(30.0, 6.0) }, &[Verdict::BudgetSpent], State::Stopped),
     ];
     for (i, (figures, verdicts, state)) in sequences.into_iter().enumerate() {
-        let mut run = Run::new(plan(), figures);
-        run.start().go_on();
+        let mut run = TestRun::new(plan(), figures);
+        run.start().run_to_rest();
         assert_eq!((run.verdicts().as_slice(), run.cell.state()), (verdicts, state), "sequence {i}");
         assert!(!run.alarms().is_empty(), "sequence {i} raises an alarm");
         assert!(state != State::Stopped || matches!(run.ending(), Some(Ending::NotAccepted { .. })));
@@ -289,8 +289,8 @@ fn every_judgement_has_its_end() {
 
 #[test]
 fn a_parameter_beyond_its_tolerance_is_asked_for_and_confirmed_by_resuming() {
-    let mut run = Run::new(plan(), |_| figures(30.0, 6.0));
-    run.start().until(State::Execute(Phase::Compensate));
+    let mut run = TestRun::new(plan(), |_| figures(30.0, 6.0));
+    run.start().run_until(State::Execute(Phase::Compensate));
     let asks = vec!["wheel radius is off by 249.00 um".to_owned()];
     let summary = CompensationSummary { asks, ..CompensationSummary::default() };
     run.send(Event::Compensated { cycle: 1, summary });
@@ -298,7 +298,7 @@ fn a_parameter_beyond_its_tolerance_is_asked_for_and_confirmed_by_resuming() {
     let alarms = run.alarms();
     assert!(alarms.contains(&AlarmId::ParameterBeyond), "{alarms:?}");
     run.send(resume());
-    run.until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Execute(Phase::Grind(JobStep::Run)));
     assert_eq!(run.starts().iter().filter(|(device, _)| *device == Device::Grinder).count(), 2);
 }
 
@@ -307,11 +307,11 @@ fn a_gain_below_what_the_recipe_calls_one_is_none() {
     // From 6.0 to 5.5 um is 8 %, and half a micrometre.
     let judged = |stall_um: f64, forecast_um: Option<f64>| {
         let forecast = forecast_um.map(|um| Forecast { rms_mm: 1e-3 * um, sigma_mm: 1e-5, floor_mm: None });
-        let mut run = Run::new(CellPlan { stall_mm: 1e-3 * stall_um, ..plan() }, move |k| match k {
+        let mut run = TestRun::new(CellPlan { stall_mm: 1e-3 * stall_um, ..plan() }, move |k| match k {
             1 => figures(30.0, 6.0),
             _ => Figures { forecast, ..figures(30.0, 5.5) },
         });
-        run.start().go_on();
+        run.start().run_to_rest();
         run.verdicts()[1]
     };
     assert_eq!(judged(0.0, None), Verdict::Continue);
@@ -323,10 +323,10 @@ fn a_gain_below_what_the_recipe_calls_one_is_none() {
 
 #[test]
 fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
-    let most = Tolerance { pv_of: PvOf::MostPoints, ..plan().tolerance };
+    let most = Tolerance { pv_of: PvPoints::MostPoints, ..plan().tolerance };
     let found = Figures { pv_robust_mm: Some(0.0069), ..figures(8.0, 0.5) };
     let [pv, rms] = most.compare(&found);
-    assert_eq!((pv.name, pv.found_mm, pv.limit_mm, pv.conformity), ("PV 99.8 %", 0.0069, 0.007, Conformity::Undecided));
+    assert_eq!((pv.name, pv.median_mm, pv.limit_mm, pv.conformity), ("PV 99.8 %", 0.0069, 0.007, Conformity::Undecided));
     assert_eq!((rms.name, rms.conformity), ("RMS", Conformity::Within));
     assert!((rms.expanded_mm - 0.00005).abs() < 1e-15, "{rms:?}");
     let [alone, _] = Tolerance { with_uncertainty: false, ..most }.compare(&found);
@@ -334,7 +334,7 @@ fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
     // Of all points, also where the others are known; and of all points where they are not.
     for (tolerance, found) in [(plan().tolerance, &found), (most, &figures(8.0, 0.5))] {
         let [pv, _] = tolerance.compare(found);
-        assert_eq!((pv.name, pv.found_mm, pv.conformity), ("PV", 0.008, Conformity::Beyond));
+        assert_eq!((pv.name, pv.median_mm, pv.conformity), ("PV", 0.008, Conformity::Beyond));
     }
 }
 
@@ -342,10 +342,10 @@ fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
 fn a_part_is_accepted_with_the_probability_that_the_recipe_asks_for() {
     // u = 0.1 um below a limit of 1 um.
     let below = |deviates: f64| {
-        let rms = Interval::about(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
-        let form = FormFigures {
-            pv: Interval::about(1e-3, 1e-4),
-            pv_robust: Interval::about(1e-3, 1e-4),
+        let rms = RecordedInterval::from_expanded(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
+        let form = RecordedFormFigures {
+            pv: RecordedInterval::from_expanded(1e-3, 1e-4),
+            pv_robust: RecordedInterval::from_expanded(1e-3, 1e-4),
             rms,
             scatter_mm: 3e-4,
         };
@@ -363,11 +363,11 @@ fn a_part_is_accepted_with_the_probability_that_the_recipe_asks_for() {
         assert_eq!(judged(probability, deviate - 1e-3), near, "{probability}");
     }
     let [pv, rms] = plan().tolerance.compare(&below(1.0));
-    assert!((rms.within.unwrap() - 0.841_345).abs() < 1e-5, "{rms:?}");
-    assert_eq!(rms.within_in_words().unwrap(), "P(in tolerance) = 84.1 %");
-    assert_eq!(pv.within_in_words().unwrap(), "P(in tolerance) > 99.9 %");
+    assert!((rms.probability_within.unwrap() - 0.841_345).abs() < 1e-5, "{rms:?}");
+    assert_eq!(rms.probability_in_words().unwrap(), "P(in tolerance) = 84.1 %");
+    assert_eq!(pv.probability_in_words().unwrap(), "P(in tolerance) > 99.9 %");
     let open = Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance };
-    assert_eq!(open.compare(&below(1.0))[0].within, None);
+    assert_eq!(open.compare(&below(1.0))[0].probability_within, None);
     // Whoever has no number accepts nothing.
     assert_eq!(judged(f64::NAN, 5.0), Conformity::Beyond);
     // A plan of an earlier record asks for what was always asked for, and one that asks for that is recorded as it was.
@@ -378,13 +378,13 @@ fn a_part_is_accepted_with_the_probability_that_the_recipe_asks_for() {
     assert_eq!(serde_json::from_value::<CellPlan>(serde_json::to_value(&other).unwrap()).unwrap(), other);
 }
 
-fn with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
-    let of = |[low, median, high]: [f64; 3]| Interval {
+fn figures_with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
+    let of = |[low, median, high]: [f64; 3]| RecordedInterval {
         low_mm: low / 1e3,
         high_mm: high / 1e3,
-        ..Interval::about(median / 1e3, 0.0)
+        ..RecordedInterval::from_expanded(median / 1e3, 0.0)
     };
-    let form = FormFigures { pv: of(pv_um), pv_robust: of(pv_um), rms: of(rms_um), scatter_mm: 3e-4 };
+    let form = RecordedFormFigures { pv: of(pv_um), pv_robust: of(pv_um), rms: of(rms_um), scatter_mm: 3e-4 };
     Figures { form: Some(form), ..figures(9.0, 1.2) }
 }
 
@@ -392,21 +392,21 @@ fn with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
 fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
     // Nine micrometres of points, of which the probe made two.
     let judged =
-        |pv_um: [f64; 3], rms_um: [f64; 3]| plan().tolerance.compare(&with_form(pv_um, rms_um)).map(|of| of.conformity);
+        |pv_um: [f64; 3], rms_um: [f64; 3]| plan().tolerance.compare(&figures_with_form(pv_um, rms_um)).map(|of| of.conformity);
     let good = [0.4, 0.5, 0.6];
     assert_eq!(judged([6.0, 6.4, 7.0], good), [Conformity::Within; 2], "the most that it may be is the limit");
     assert_eq!(judged([6.0, 6.4, 7.01], good)[0], Conformity::Undecided);
     assert_eq!(judged([7.0, 7.9, 8.4], good)[0], Conformity::Undecided);
     assert_eq!(judged([7.01, 7.9, 8.4], good)[0], Conformity::Beyond);
     assert_eq!(judged([0.0, 0.1, 0.2], [0.0, 0.02, 0.04]), [Conformity::Within; 2], "known from above alone");
-    let [pv, rms] = plan().tolerance.compare(&with_form([6.0, 6.4, 7.0], good));
-    assert_eq!((pv.found_mm, pv.between_mm, rms.found_mm), (0.0064, [0.006, 0.007], 0.0005));
+    let [pv, rms] = plan().tolerance.compare(&figures_with_form([6.0, 6.4, 7.0], good));
+    assert_eq!((pv.median_mm, pv.interval_mm, rms.median_mm), (0.0064, [0.006, 0.007], 0.0005));
     let alone = Tolerance { with_uncertainty: false, ..plan().tolerance };
-    assert_eq!(alone.compare(&with_form([6.0, 6.9, 8.0], good))[0].conformity, Conformity::Within);
+    assert_eq!(alone.compare(&figures_with_form([6.0, 6.9, 8.0], good))[0].conformity, Conformity::Within);
     // A median outside of its own interval is none.
     for broken in [[2.0, 1.0, 3.0], [0.5, f64::NAN, 1.0], [1.0, 4.0, 3.0]] {
-        let mut run = Run::new(plan(), move |_| with_form(broken, good));
-        run.start().go_on();
+        let mut run = TestRun::new(plan(), move |_| figures_with_form(broken, good));
+        run.start().run_to_rest();
         assert!(run.verdicts().is_empty(), "{broken:?}");
     }
 }
@@ -414,8 +414,8 @@ fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
 #[test]
 fn a_figure_without_a_limit_is_told_without_one() {
     let open = CellPlan { tolerance: Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance }, ..plan() };
-    let mut run = Run::new(open, |_| with_form([6.0, 6.4, 7.0], [0.4, 0.5, 0.6]));
-    run.start().go_on();
+    let mut run = TestRun::new(open, |_| figures_with_form([6.0, 6.4, 7.0], [0.4, 0.5, 0.6]));
+    run.start().run_to_rest();
     let told = run.judgements().last().unwrap().reason.clone();
     assert!(
         told.contains("PV: 6.40 µm ± ") && told.contains(" µm; RMS: 0.50 µm ± ") && !told.contains("inf"),
@@ -428,11 +428,11 @@ fn at_the_floor_no_further_pass_is_ground() {
     // 1.2 um are found, give or take 0.15; another pass is expected to leave 1.05, and none can leave less than the floor.
     let with_floor = |floor_um: f64| {
         let forecast = Some(Forecast { rms_mm: 1.05e-3, sigma_mm: 2e-5, floor_mm: Some(floor_um / 1e3) });
-        let mut run = Run::new(plan(), move |k| match k {
+        let mut run = TestRun::new(plan(), move |k| match k {
             1 => figures(30.0, 6.0),
-            _ => Figures { forecast, ..with_form([5.0, 5.5, 6.0], [1.05, 1.2, 1.35]) },
+            _ => Figures { forecast, ..figures_with_form([5.0, 5.5, 6.0], [1.05, 1.2, 1.35]) },
         });
-        run.start().go_on();
+        run.start().run_to_rest();
         run.verdicts()[1]
     };
     assert_eq!(with_floor(1.0), Verdict::Continue);
@@ -441,12 +441,12 @@ fn at_the_floor_no_further_pass_is_ground() {
 
 #[test]
 fn a_run_that_ends_above_its_best_pass_names_it() {
-    let mut run = Run::new(CellPlan { max_cycles: 3, ..plan() }, |k| match k {
+    let mut run = TestRun::new(CellPlan { max_cycles: 3, ..plan() }, |k| match k {
         1 => figures(30.0, 6.0),
         2 => figures(9.0, 1.5),
         _ => figures(9.3, 1.52),
     });
-    run.start().go_on();
+    run.start().run_to_rest();
     let Some(Ending::NotAccepted { reason, .. }) = run.ending() else { panic!("{:?}", run.ending()) };
     assert!(reason.contains("best cycle 2: PV 9.00 µm, RMS 1.50 µm") && reason.contains("cycle-2"), "{reason}");
 }
@@ -465,11 +465,11 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
     // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the figure without it.
     let expecting = |rms_um: f64| Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: Some(rms_um / 1.2e3) };
     let judged = |pv_um: f64, rms_um: f64, next_rms_um: f64| {
-        let mut run = Run::new(plan(), |k| match k {
+        let mut run = TestRun::new(plan(), |k| match k {
             1 => figures(30.0, 6.0),
             _ => Figures { forecast: Some(expecting(next_rms_um)), ..figures(pv_um, rms_um) },
         });
-        run.start().go_on();
+        run.start().run_to_rest();
         run.verdicts()[1]
     };
     assert_eq!(judged(6.7, 0.95, 0.9), Verdict::Accept);
@@ -483,16 +483,16 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
     );
     assert_eq!(judged(6.71, 0.96, 0.5), Verdict::Continue, "what is undecided is ground again where that is worth it");
     // A contribution that is not stated counts as 0, and the verdict says so.
-    let mut run = Run::new(plan(), |_| Figures { unstated: Some([4, 8]), ..figures(5.0, 0.5) });
-    run.start().go_on();
+    let mut run = TestRun::new(plan(), |_| Figures { unstated: Some([4, 8]), ..figures(5.0, 0.5) });
+    run.start().run_to_rest();
     let said = |words: &str| {
-        run.all.iter().any(|c| matches!(c, Command::Announce(judgement) if judgement.reason.contains(words)))
+        run.commands.iter().any(|c| matches!(c, Command::Announce(judgement) if judgement.reason.contains(words)))
     };
     assert!(said("4 of 8 contributions to the uncertainty are not stated and count as 0"));
     // By the figure alone, where the recipe says so.
     let alone = CellPlan { tolerance: Tolerance { with_uncertainty: false, ..plan().tolerance }, ..plan() };
-    let mut run = Run::new(alone, |_| figures(6.99, 0.99));
-    run.start().go_on();
+    let mut run = TestRun::new(alone, |_| figures(6.99, 0.99));
+    run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Accept]);
 }
 
@@ -500,47 +500,47 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
 fn what_was_left_out_counts_until_it_is_touched_again() {
     let left_out = |pv_um: f64, rms_um: f64| {
         let places = "point 17 at (1.0, 2.0) mm by -50.0 um".to_owned();
-        Some(Box::new(LeftOut { pv_mm: pv_um / 1e3, rms_mm: rms_um / 1e3, places, again: false }))
+        Some(Box::new(OutlierFigures { pv_mm: pv_um / 1e3, rms_mm: rms_um / 1e3, places, again: false }))
     };
-    let again = |of: Option<Box<LeftOut>>| of.map(|of| Box::new(LeftOut { again: true, ..*of }));
+    let again = |of: Option<Box<OutlierFigures>>| of.map(|of| Box::new(OutlierFigures { again: true, ..*of }));
     // Limits of 7 and 1 um: beyond one of them with the point, so the part is measured again, and accepted without it.
     for (pv_um, rms_um) in [(50.0, 0.9), (6.9, 1.2), (50.0, 1.2)] {
-        let mut run = Run::new(plan(), |k| Figures {
+        let mut run = TestRun::new(plan(), |k| Figures {
             left_out: if k == 1 { left_out(pv_um, rms_um) } else { None },
             ..figures(5.0, 0.5)
         });
-        run.start().go_on();
+        run.start().run_to_rest();
         assert_eq!((run.alarms(), run.verdicts()), (vec![AlarmId::LeftOut], vec![Verdict::LeftOut]));
         assert_eq!(run.cell.state(), State::Held(Phase::Measure(JobStep::Send)));
         assert!(
-            run.all
+            run.commands
                 .iter()
                 .any(|c| matches!(c, Command::Raise(alarm) if alarm.what.contains("point 17 at (1.0, 2.0) mm")))
         );
         run.send(resume());
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.verdicts(), [Verdict::LeftOut, Verdict::Accept]);
         assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
     }
     // The same measurement goes on with the places that can be touched again by themselves, as often as somebody resumes.
-    let mut run = Run::new(plan(), |_| Figures { left_out: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
-    run.start().go_on();
+    let mut run = TestRun::new(plan(), |_| Figures { left_out: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
+    run.start().run_to_rest();
     for times in 1..=3 {
         assert_eq!(run.verdicts(), vec![Verdict::LeftOut; times]);
         assert_eq!(run.cell.state(), State::Held(Phase::Measure(JobStep::Send)));
         assert_eq!(run.cell.cycle(), 1);
         run.send(resume());
-        run.go_on();
+        run.run_to_rest();
     }
     // Where the limits are kept with it too, nothing is open; and where they are not kept without it, another pass is.
-    let mut run = Run::new(plan(), |_| Figures { left_out: left_out(6.9, 0.9), ..figures(5.0, 0.5) });
-    run.start().go_on();
+    let mut run = TestRun::new(plan(), |_| Figures { left_out: left_out(6.9, 0.9), ..figures(5.0, 0.5) });
+    run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Accept]);
-    let mut run = Run::new(plan(), |k| match k {
+    let mut run = TestRun::new(plan(), |k| match k {
         1 => Figures { left_out: left_out(50.0, 6.5), ..figures(30.0, 6.0) },
         _ => figures(5.0, 0.5),
     });
-    run.start().go_on();
+    run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Accept]);
 }
 
@@ -548,11 +548,11 @@ fn what_was_left_out_counts_until_it_is_touched_again() {
 fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
     let expecting = |rms_um: f64| Some(Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: None });
     // The first pass goes on whatever is forecast: nobody knows yet what a correction can do.
-    let mut run = Run::new(plan(), |k| Figures {
+    let mut run = TestRun::new(plan(), |k| Figures {
         forecast: expecting(6.0),
         ..figures(30.0 - 10.0 * f64::from(k), 6.0 - 2.0 * f64::from(k - 1))
     });
-    run.start().go_on();
+    run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Stalled]);
     assert!(matches!(run.ending(), Some(Ending::NotAccepted { .. })) && run.cell.state() == State::Stopped);
     let told = &run.judgements().last().unwrap().reason;
@@ -562,14 +562,14 @@ fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
 #[test]
 fn one_worse_cycle_is_forgiven() {
     let mut run =
-        Run::new(plan(), |k| [figures(20.0, 4.0), figures(22.0, 4.0), figures(6.0, 0.9)][k as usize - 1].clone());
-    run.start().go_on();
+        TestRun::new(plan(), |k| [figures(20.0, 4.0), figures(22.0, 4.0), figures(6.0, 0.9)][k as usize - 1].clone());
+    run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Diverging, Verdict::Accept]);
 }
 
 /// The states through which an undisturbed run goes.
-fn way() -> Vec<State> {
-    let mut run = Run::good();
+fn undisturbed_states() -> Vec<State> {
+    let mut run = TestRun::accepted_after_two_passes();
     run.start();
     let mut way = vec![run.cell.state()];
     while run.step() {
@@ -582,14 +582,14 @@ fn way() -> Vec<State> {
 }
 
 /// Interrupts a run at every step, and resumes it from where it is held then: it comes to the same end by the same starts.
-fn held_at_every_step(what: &str, interrupt: fn(&mut Run)) {
-    for state in way().into_iter().filter(|state| *state != State::Completing) {
-        let mut run = Run::good();
-        run.start().until(state);
+fn hold_at_every_step(what: &str, interrupt: fn(&mut TestRun)) {
+    for state in undisturbed_states().into_iter().filter(|state| *state != State::Completing) {
+        let mut run = TestRun::accepted_after_two_passes();
+        run.start().run_until(state);
         interrupt(&mut run);
         assert!(matches!(run.cell.state(), State::Held(_)), "{what} at {state}: {}", run.cell.state());
         run.send(resume());
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.cell.state(), State::Complete, "{what} at {state}");
         let mut starts = run.starts();
         starts.dedup();
@@ -599,52 +599,52 @@ fn held_at_every_step(what: &str, interrupt: fn(&mut Run)) {
 
 #[test]
 fn hold_and_resume_at_every_step_lead_to_the_same_end() {
-    held_at_every_step("held", |run| {
+    hold_at_every_step("held", |run| {
         run.send(hold());
-        run.go_on();
-        let before = run.all.len();
+        run.run_to_rest();
+        let before = run.commands.len();
         run.send(hold());
-        assert_eq!(run.all.len(), before, "a second hold changes nothing");
+        assert_eq!(run.commands.len(), before, "a second hold changes nothing");
     });
 }
 
 #[test]
 fn a_running_machine_is_told_to_hold_and_to_resume() {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(hold()), [Command::HoldMachine { device: Device::Grinder }]);
-    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(resume()), [Command::ResumeMachine { device: Device::Grinder }]);
 }
 
 #[test]
 fn stop_at_every_step_ends_in_order() {
-    for state in way() {
-        let mut run = Run::good();
-        run.start().until(state);
-        run.waiting.clear();
+    for state in undisturbed_states() {
+        let mut run = TestRun::accepted_after_two_passes();
+        run.start().run_until(state);
+        run.open_commands.clear();
         run.send(stop());
-        run.go_on();
+        run.run_to_rest();
         let expected = if state == State::Completing { State::Completing } else { State::Stopped };
         assert_eq!(run.cell.state(), expected, "stopped at {state}");
         assert!(!matches!(run.ending(), Some(Ending::Stopped { ordered: false, .. })), "a person ordered it");
-        assert!(!run.all.iter().any(|c| matches!(c, Command::AbortMachine { .. })));
+        assert!(!run.commands.iter().any(|c| matches!(c, Command::AbortMachine { .. })));
     }
 }
 
 #[test]
 fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
     let fault = Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() };
-    for state in way() {
+    for state in undisturbed_states() {
         for event in [abort(), fault.clone()] {
-            let mut run = Run::good();
-            run.start().until(state);
-            run.waiting.clear();
-            let before = run.all.len();
+            let mut run = TestRun::accepted_after_two_passes();
+            run.start().run_until(state);
+            run.open_commands.clear();
+            let before = run.commands.len();
             run.send(event);
-            run.go_on();
+            run.run_to_rest();
             assert_eq!(run.cell.state(), State::Aborted, "aborted at {state}");
-            for command in &run.all[before..] {
+            for command in &run.commands[before..] {
                 let safe = matches!(
                     command,
                     Command::AbortMachine { .. } | Command::VerifyClear { .. } | Command::Raise(_) | Command::Finish(_)
@@ -658,22 +658,22 @@ fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
 
 #[test]
 fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
     for _ in 0..2 {
         let due = run.cell.next_deadline().unwrap();
-        assert!(due <= run.now + 2 * S);
+        assert!(due <= run.now + 2 * SECOND);
         run.now = due;
         run.send(Event::Deadline);
     }
     assert_eq!(run.cell.state(), State::Aborted);
     assert_eq!(run.cell.in_words(), "Aborted: neither machine has confirmed that it is at rest");
     assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: false, .. })));
-    let alarm = run.all.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
+    let alarm = run.commands.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
     assert!(alarm.remedy[0].contains("the machine's own emergency circuit"), "{alarm:?}");
     // One of them has.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
     run.send(Event::AbortConfirmed { device: Device::Cmm });
     for _ in 0..2 {
         run.now = run.cell.next_deadline().unwrap();
@@ -682,9 +682,9 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
     assert_eq!(run.cell.unconfirmed(), [Device::Grinder]);
     assert_eq!(run.cell.in_words(), "Aborted: the grinder has not confirmed that it is at rest");
     // Both have, and neither was seen clear.
-    let mut run = Run::good();
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
-    run.go_on();
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
+    run.run_to_rest();
     assert_eq!((run.cell.in_words(), run.cell.unconfirmed()), ("Aborted".to_owned(), vec![]));
 }
 
@@ -699,8 +699,8 @@ fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
         (Reconciliation::Unknown("no memory".into()), State::Held(Phase::Grind(JobStep::Reconcile))),
     ];
     for (outcome, state) in cases {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
         let device = Device::Grinder;
         run.send(Event::LinkLost { device, why: "silent".into() });
         assert_eq!(run.cell.state(), State::Suspended(Phase::Grind(JobStep::Reconcile)));
@@ -717,8 +717,8 @@ fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
     let device = Device::Grinder;
     let reconcile = State::Execute(Phase::Grind(JobStep::Reconcile));
     // START was lost on its way: proven not to have begun, and asked for once more.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Start)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
     run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
     assert_eq!(run.cell.state(), reconcile);
     run.send(not_started(device));
@@ -729,10 +729,10 @@ fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
         Event::MachineHeld { device },
         Event::Started { device, cycle: 1 },
     ] {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(JobStep::Start)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
         run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
-        run.waiting.clear();
+        run.open_commands.clear();
         run.send(seen.clone());
         run.send(Event::LinkLost { device, why: "silent".into() });
         run.send(Event::LinkBack { device, boot_id: 7 });
@@ -741,22 +741,22 @@ fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
         }
         let starts = run.starts();
         run.send(not_started(device));
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.starts(), starts, "{seen:?}");
     }
     // Its answer was lost and it was found at work; then it forgets, with this program started anew in between or not.
     for is_restarted in [false, true] {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(JobStep::Start)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
         run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
         run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
         if is_restarted {
-            run.waiting.clear();
+            run.open_commands.clear();
             run.send(Event::Restarted { actor: actor() });
-            while !run.waiting.contains(&Command::Reconcile { device, cycle: 1 }) {
+            while !run.open_commands.contains(&Command::Reconcile { device, cycle: 1 }) {
                 assert!(run.step());
             }
-            run.waiting.clear();
+            run.open_commands.clear();
         } else {
             run.send(Event::LinkLost { device, why: "silent".into() });
             run.send(Event::LinkBack { device, boot_id: 7 });
@@ -769,43 +769,43 @@ fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
         run.send(not_started(device));
         assert_eq!(run.starts(), starts, "a person may ask again, and nothing is started by that");
         // A person ends it: the part is measured as it is.
-        run.waiting.clear();
+        run.open_commands.clear();
         run.send(Event::DeclaredOver { actor: actor(), device, evidence: "stands at the park position".into() });
-        run.until(State::Held(Phase::Transfer));
+        run.run_until(State::Held(Phase::Transfer));
     }
 }
 
 #[test]
 fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     let device = Device::Grinder;
     run.send(Event::LinkLost { device, why: "silent".into() });
     run.send(Event::LinkBack { device, boot_id: 8 });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
-    run.waiting.clear();
+    run.open_commands.clear();
     run.send(Event::DeclaredOver { actor: actor(), device, evidence: "stands at the park position".into() });
-    run.until(State::Held(Phase::Transfer));
+    run.run_until(State::Held(Phase::Transfer));
     run.send(resume());
-    run.go_on();
+    run.run_to_rest();
     assert_eq!(run.cell.state(), State::Complete);
     assert_eq!(run.starts(), [(device, 1), (Device::Cmm, 1)], "the pass is not repeated");
 }
 
 #[test]
 fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Measure(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Run)));
     let condition = Condition::Signals;
     // What is missing at one machine is not back because the other one has it.
     for device in Device::BOTH {
         run.send(Event::ConditionLost { device, condition, message: "22.3 of at most 21 degrees".into() });
     }
-    run.until(State::Suspended(Phase::Measure(JobStep::Run)));
+    run.run_until(State::Suspended(Phase::Measure(JobStep::Run)));
     run.send(Event::ConditionBack { device: Device::Cmm, condition });
     assert_eq!(run.cell.state(), State::Suspended(Phase::Measure(JobStep::Run)));
     run.send(Event::ConditionBack { device: Device::Grinder, condition });
-    run.go_on();
+    run.run_to_rest();
     assert_eq!(run.cell.state(), State::Complete);
 }
 
@@ -819,15 +819,15 @@ fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next
         (GateFailure::Moved("3 points".into()), AlarmId::PartMoved),
     ];
     for (why, alarm) in failures {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Measure(JobStep::Collect)));
-        run.waiting.clear();
-        run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: Gate::Failed(why) });
-        run.go_on();
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect)));
+        run.open_commands.clear();
+        run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: GateResult::Failed(why) });
+        run.run_to_rest();
         assert_eq!((run.alarms(), run.cell.state()), (vec![alarm], State::Held(Phase::Measure(JobStep::Send))));
-        assert!(!run.all.iter().any(|c| matches!(c, Command::Register { .. })));
+        assert!(!run.commands.iter().any(|c| matches!(c, Command::Register { .. })));
         run.send(resume());
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
     }
 }
@@ -842,26 +842,26 @@ fn figures_outside_their_gates_are_never_judged() {
         (Figures { rms_mm: -1.0, ..figures(1.0, 0.1) }, AlarmId::RegistrationFailed),
     ];
     for (figures, alarm) in bad {
-        let mut run = Run::new(plan(), |_| figures.clone());
-        run.start().go_on();
+        let mut run = TestRun::new(plan(), |_| figures.clone());
+        run.start().run_to_rest();
         assert_eq!((run.alarms(), run.verdicts()), (vec![alarm], vec![]));
         assert!(matches!(run.cell.state(), State::Held(_)));
     }
     for radius_error_mm in [0.010, -0.010, f64::NAN] {
-        let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-        run.start().until(State::Execute(Phase::Measure(JobStep::Qualify)));
-        run.waiting.clear();
+        let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
+        run.start().run_until(State::Execute(Phase::Measure(JobStep::Qualify)));
+        run.open_commands.clear();
         run.send(Event::Qualified { cycle: 1, radius_error_mm });
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.alarms(), [AlarmId::ProbeRadius]);
     }
 }
 
 #[test]
 fn a_machine_starts_only_while_the_other_is_clear() {
-    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
-    run.waiting.clear();
+    let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
+    run.open_commands.clear();
     run.send(Event::Obstructed { device: Device::Cmm, message: "moved by hand".into() });
     run.send(Event::Prepared { device: Device::Grinder, cycle: 1 });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
@@ -870,24 +870,24 @@ fn a_machine_starts_only_while_the_other_is_clear() {
 
 #[test]
 fn a_restarted_program_asks_before_it_goes_on() {
-    held_at_every_step("restarted", |run| {
-        run.waiting.clear();
+    hold_at_every_step("restarted", |run| {
+        run.open_commands.clear();
         run.send(Event::Restarted { actor: actor() });
-        run.go_on();
+        run.run_to_rest();
     });
     // Where the part is accepted already there is nothing to go on with.
-    let mut run = Run::good();
-    run.start().until(State::Completing).waiting.clear();
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Completing).open_commands.clear();
     run.send(Event::Restarted { actor: actor() });
     assert_eq!(run.cell.state(), State::Complete);
 }
 
 #[test]
 fn a_machine_at_another_runs_job_is_left_alone_also_by_an_abort() {
-    let mut run = Run::good();
-    run.start().until(State::Execute(Phase::Measure(JobStep::Run))).waiting.clear();
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Run))).open_commands.clear();
     run.send(Event::Restarted { actor: actor() });
-    let why = Mismatch::AtAnotherJob("EXECUTE with job 9, cycle 1".into());
+    let why = ConnectionRefusal::AtAnotherJob("EXECUTE with job 9, cycle 1".into());
     run.send(Event::NotConnected { device: Device::Grinder, why });
     assert!(run.alarms().contains(&AlarmId::NotIdle));
     let commands = run.send(Event::Abort { actor: actor(), reason: String::new() });
@@ -897,14 +897,14 @@ fn a_machine_at_another_runs_job_is_left_alone_also_by_an_abort() {
 
 #[test]
 fn a_result_that_is_gone_is_measured_once_more_by_a_persons_word() {
-    let mut run = Run::good();
-    run.start().until(State::Execute(Phase::Measure(JobStep::Collect))).waiting.clear();
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect))).open_commands.clear();
     run.send(hold());
-    let (device, what) = (Device::Cmm, Asked::Collect);
+    let (device, what) = (Device::Cmm, MachineRequest::Collect);
     run.send(Event::Refused { device, what, why: "it holds no result".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Measure(JobStep::Collect)));
     run.send(Event::DeclaredOver { actor: actor(), device, evidence: "it was switched off".into() });
-    run.until(State::Held(Phase::Measure(JobStep::Send)));
+    run.run_until(State::Held(Phase::Measure(JobStep::Send)));
     assert_eq!(run.cell.cycle(), 2);
 }
 
@@ -915,13 +915,13 @@ fn a_job_that_a_person_declares_over_is_given_back_before_the_next() {
         [(Device::Grinder, State::Held(Phase::Transfer)), (Device::Cmm, State::Held(Phase::Measure(JobStep::Send)))]
     {
         let job = |step| if device == Device::Cmm { Phase::Measure(step) } else { Phase::Grind(step) };
-        let lost = |run: &mut Run| {
-            run.start().until(State::Execute(job(JobStep::Run)));
+        let lost = |run: &mut TestRun| {
+            run.start().run_until(State::Execute(job(JobStep::Run)));
             run.send(Event::LinkLost { device, why: "silent".into() });
             run.send(hold());
         };
         // The machine may stand there with its result, and would refuse to be prepared for ever.
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         lost(&mut run);
         run.send(Event::LinkBack { device, boot_id: 7 });
         let outcome = Reconciliation::Unknown("no memory".into());
@@ -932,18 +932,18 @@ fn a_job_that_a_person_declares_over_is_given_back_before_the_next() {
         run.send(Event::Acknowledged { device });
         assert_eq!(run.cell.state(), next);
         // It says no: a person sees to it, and it is asked once more.
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         lost(&mut run);
         run.send(Event::LinkBack { device, boot_id: 8 });
         run.send(over(device));
-        run.send(Event::Refused { device, what: Asked::Acknowledge, why: "HELD with job 9".into() });
+        run.send(Event::Refused { device, what: MachineRequest::Acknowledge, why: "HELD with job 9".into() });
         assert_eq!(run.cell.state(), State::Held(job(JobStep::Discard)));
         assert!(run.alarms().contains(&AlarmId::MachineRefused));
         assert_eq!(run.send(resume()).last(), Some(&Command::Acknowledge { device }));
         run.send(Event::Acknowledged { device });
         assert_eq!(run.cell.state(), next);
         // It cannot be reached yet: it is asked when it is back, also if it was switched off.
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         lost(&mut run);
         run.now += Duration::from_secs(3600);
         run.send(Event::Deadline);
@@ -960,10 +960,10 @@ fn a_job_that_a_person_declares_over_is_given_back_before_the_next() {
 fn a_machine_that_goes_astray_again_is_told_to_hold_again() {
     let device = Device::Cmm;
     let progress = |done| Event::Progressed { device, done, total: 10 };
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Send)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Send)));
     run.send(hold());
-    run.until(State::Held(Phase::Grind(JobStep::Send)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Send)));
     for _ in 0..2 {
         assert_eq!(run.send(progress(3)).last(), Some(&Command::HoldMachine { device }));
         assert_eq!(run.send(progress(4)), [], "it is on its way");
@@ -974,57 +974,57 @@ fn a_machine_that_goes_astray_again_is_told_to_hold_again() {
 
 #[test]
 fn what_cannot_be_recorded_is_not_begun() {
-    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
+    let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
-    run.go_on();
+    run.run_to_rest();
     assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(JobStep::Send)), vec![]));
     assert_eq!(run.alarms(), [AlarmId::DiskFull]);
 }
 
 #[test]
 fn a_command_that_does_not_come_on_record_leaves_the_cell_held_and_not_waiting() {
-    for state in way() {
-        let mut run = Run::good();
-        run.start().until(state).waiting.clear();
-        let commands = run.all.len();
+    for state in undisturbed_states() {
+        let mut run = TestRun::accepted_after_two_passes();
+        run.start().run_until(state).open_commands.clear();
+        let commands = run.commands.len();
         run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
         run.send(match state.phase().and_then(Phase::job) {
             Some((device, JobStep::Start)) => {
-                Event::Refused { device, what: Asked::Start, why: "it is not on record".into() }
+                Event::Refused { device, what: MachineRequest::Start, why: "it is not on record".into() }
             }
             _ => Event::NotOnRecord { command: "the one that was under way".into() },
         });
         match state {
             // They hold, and end, whether that is on record or not.
             State::Execute(Phase::Grind(JobStep::Run) | Phase::Measure(JobStep::Run)) => {
-                assert!(matches!(run.all.last(), Some(Command::HoldMachine { .. })), "{state}");
+                assert!(matches!(run.commands.last(), Some(Command::HoldMachine { .. })), "{state}");
             }
             State::Idle | State::Completing => assert_eq!(run.cell.state(), state),
             _ => {
                 assert!(matches!(run.cell.state(), State::Held(_)), "{state}: {}", run.cell.state());
-                run.waiting.clear();
+                run.open_commands.clear();
                 run.send(resume());
-                assert!(run.all.len() > commands, "{state}");
-                run.go_on();
+                assert!(run.commands.len() > commands, "{state}");
+                run.run_to_rest();
                 assert_eq!(run.cell.state(), State::Complete, "{state}");
             }
         }
     }
     // The order to go on does not come on record: the cell is held as before, and may be told once more.
-    let mut run = Run::good();
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
-    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Run)));
     run.send(resume());
-    run.waiting.clear();
+    run.open_commands.clear();
     run.send(Event::NotOnRecord { command: "resume_machine grinder".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
     // Nor does what gives a result back at the end.
-    let mut run = Run::good();
-    run.start().until(State::Execute(Phase::Measure(JobStep::Collect)));
+    let mut run = TestRun::accepted_after_two_passes();
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect)));
     run.send(stop());
-    run.waiting.clear();
+    run.open_commands.clear();
     assert_eq!(run.cell.state(), State::Stopping);
     run.send(Event::NotOnRecord { command: "acknowledge cmm".into() });
     assert_eq!(run.cell.state(), State::Stopped);
@@ -1035,42 +1035,42 @@ fn what_fails_again_and_again_holds_the_cell_after_five_times() {
     let device = Device::Grinder;
     let lost = || Event::LinkLost { device, why: "the check number is wrong".into() };
     let back = || Event::LinkBack { device, boot_id: 7 };
-    let raised = |run: &Run, id| run.alarms().iter().filter(|alarm| **alarm == id).count();
+    let raised = |run: &TestRun, id| run.alarms().iter().filter(|alarm| **alarm == id).count();
     let send = Phase::Grind(JobStep::Send);
     // A payload that never arrives whole.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(send));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(send));
     for k in 1..=50 {
-        run.waiting.clear();
+        run.open_commands.clear();
         run.send(lost());
         assert_eq!(run.cell.state(), if k < 5 { State::Suspended(send) } else { State::Held(send) }, "{k}");
         run.send(back());
     }
     assert_eq!((raised(&run, AlarmId::LinkLost), raised(&run, AlarmId::FailsAgain)), (5, 1));
     // A person lets it try again, and it works.
-    run.waiting.clear();
+    run.open_commands.clear();
     run.send(resume());
-    run.go_on();
+    run.run_to_rest();
     assert_eq!(run.cell.state(), State::Complete);
     // A START that is never heard.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start();
     for _ in 0..50 {
         if run.cell.state() == State::Held(send) {
             break;
         }
-        run.until(State::Execute(Phase::Grind(JobStep::Start))).waiting.clear();
+        run.run_until(State::Execute(Phase::Grind(JobStep::Start))).open_commands.clear();
         run.send(Event::StartUnknown { device, cycle: 1, why: "not acknowledged".into() });
-        run.waiting.clear();
+        run.open_commands.clear();
         run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::NotStarted });
     }
     assert_eq!((run.cell.state(), run.starts().len(), run.alarms().len()), (State::Held(send), 5, 1));
     // Slowly: three times are enough where a minute has passed; what is long ago does not count.
-    for (pause, state) in [(31 * S, State::Held(send)), (121 * S, State::Suspended(send))] {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(send));
+    for (pause, state) in [(31 * SECOND, State::Held(send)), (121 * SECOND, State::Suspended(send))] {
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(send));
         for _ in 0..3 {
-            run.waiting.clear();
+            run.open_commands.clear();
             run.send(lost());
             assert!(matches!(run.cell.state(), State::Suspended(_) | State::Held(_)));
             if run.cell.state() == State::Suspended(send) && state == run.cell.state()
@@ -1084,19 +1084,19 @@ fn what_fails_again_and_again_holds_the_cell_after_five_times() {
     }
     // A job that gets on between two failures is not in vain.
     let run_step = Phase::Grind(JobStep::Run);
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(run_step));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(run_step));
     for done in 1..20 {
         run.send(Event::Progressed { device, done, total: 100 });
         run.send(lost());
         run.send(back());
-        run.waiting.clear();
+        run.open_commands.clear();
         run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
         assert_eq!(run.cell.state(), State::Execute(run_step), "{done}");
     }
     // The other machine does not keep the one that works from its job, and is not told for ever.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(run_step));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(run_step));
     let other = Device::Cmm;
     for _ in 0..50 {
         run.send(Event::LinkLost { device: other, why: "silent".into() });
@@ -1120,10 +1120,10 @@ fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborte
     let back = || Event::LinkBack { device, boot_id: 7 };
     let running = || Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running };
     let in_vain = || {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(run_step));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(run_step));
         for _ in 0..5 {
-            run.waiting.clear();
+            run.open_commands.clear();
             run.send(lost());
             if run.cell.state() != State::Holding(asked) {
                 run.send(back());
@@ -1147,8 +1147,8 @@ fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborte
     // However often the line comes back, what does not come to a stand is aborted.
     let mut run = in_vain();
     let began = run.now;
-    while run.cell.state() == State::Holding(asked) && run.now - began < 120 * S {
-        run.now += S;
+    while run.cell.state() == State::Holding(asked) && run.now - began < 120 * SECOND {
+        run.now += SECOND;
         run.send(Event::Deadline);
         if run.cell.state() == State::Holding(asked) {
             run.send(back());
@@ -1166,9 +1166,9 @@ fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborte
 #[test]
 fn a_stop_that_overtakes_the_preparation_of_a_cycle_ends_with_the_job_of_the_one_before() {
     let device = Device::Grinder;
-    let mut run = Run::new(plan(), |_| figures(30.0, 6.0));
-    run.start().until(State::Execute(Phase::Measure(JobStep::Run)));
-    run.until(State::Execute(Phase::Grind(JobStep::Prepare))).waiting.clear();
+    let mut run = TestRun::new(plan(), |_| figures(30.0, 6.0));
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Run)));
+    run.run_until(State::Execute(Phase::Grind(JobStep::Prepare))).open_commands.clear();
     let cycle = run.cell.cycle();
     assert!(cycle > 1);
     assert_eq!(run.send(stop()).last(), Some(&Command::StopMachine { device }));
@@ -1184,8 +1184,8 @@ fn a_stop_that_overtakes_the_preparation_of_a_cycle_ends_with_the_job_of_the_one
 
 #[test]
 fn a_command_that_was_withdrawn_before_the_stop_does_not_end_it() {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(stop());
     for command in ["resume_machine grinder", "reconcile grinder"] {
         run.send(Event::NotOnRecord { command: command.into() });
@@ -1198,8 +1198,8 @@ fn a_job_at_which_the_machine_still_is_does_not_end_by_a_persons_word() {
     let device = Device::Grinder;
     let over = || Event::DeclaredOver { actor: actor(), device, evidence: "it stands".into() };
     let (asked, discard) = (Phase::Grind(JobStep::Reconcile), Phase::Grind(JobStep::Discard));
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
     run.send(Event::LinkLost { device, why: "silent".into() });
     run.send(Event::MachineHeld { device });
@@ -1211,7 +1211,7 @@ fn a_job_at_which_the_machine_still_is_does_not_end_by_a_persons_word() {
     }
     run.send(Event::LinkBack { device, boot_id: 7 });
     assert_eq!(run.send(over()), [Command::Acknowledge { device }]);
-    run.send(Event::Refused { device, what: Asked::Discard, why: "HELD with job 7".into() });
+    run.send(Event::Refused { device, what: MachineRequest::Discard, why: "HELD with job 7".into() });
     assert_eq!(run.cell.state(), State::Held(asked), "it is found out what it does before anything else moves");
     run.send(resume());
     run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Held });
@@ -1225,14 +1225,14 @@ fn a_job_that_vanishes_is_asked_about_and_ends_by_a_persons_word() {
     {
         let job = |step| if device == Device::Cmm { Phase::Measure(step) } else { Phase::Grind(step) };
         let vanished = || Event::JobVanished { device, why: "it is IDLE".into() };
-        type Comes = fn(&mut Run);
+        type Comes = fn(&mut TestRun);
         let ways: [(&str, Comes, State); 3] = [
             ("at work", |_| {}, State::Execute(job(JobStep::Reconcile))),
             (
                 "held",
                 |run| {
                     run.send(hold());
-                    run.go_on();
+                    run.run_to_rest();
                 },
                 State::Holding(job(JobStep::Reconcile)),
             ),
@@ -1240,29 +1240,29 @@ fn a_job_that_vanishes_is_asked_about_and_ends_by_a_persons_word() {
                 "being resumed",
                 |run| {
                     run.send(hold());
-                    run.go_on();
+                    run.run_to_rest();
                     run.send(resume());
-                    run.waiting.clear();
+                    run.open_commands.clear();
                 },
                 State::Execute(job(JobStep::Reconcile)),
             ),
         ];
         for (what, comes, asks) in ways {
-            let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-            run.start().until(State::Execute(job(JobStep::Run)));
+            let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+            run.start().run_until(State::Execute(job(JobStep::Run)));
             comes(&mut run);
             let cycle = run.cell.cycle();
             let commands = run.send(vanished());
             assert_eq!(commands.last(), Some(&Command::Reconcile { device, cycle }), "{what}");
             assert_eq!(run.cell.state(), asks, "{what}");
             assert_eq!(run.send(vanished()), [], "it is asked already");
-            run.waiting.clear();
+            run.open_commands.clear();
             let starts = run.starts();
             run.send(Event::Reconciled { device, cycle, outcome: Reconciliation::NotStarted });
             assert_eq!(run.cell.state(), State::Held(job(JobStep::Reconcile)), "{what}");
             assert!(run.cell.alarms().any(|alarm| alarm.id == AlarmId::JobVanished));
             run.send(Event::DeclaredOver { actor: actor(), device, evidence: "it stands".into() });
-            run.until(next);
+            run.run_until(next);
             assert_eq!(run.starts(), starts, "{what}: nothing is started by that");
         }
     }
@@ -1275,11 +1275,11 @@ fn a_result_that_a_machine_will_not_forget_is_given_up_by_a_persons_word() {
         (Phase::Measure(JobStep::Acknowledge), Device::Cmm, State::Held(Phase::Register)),
     ];
     for (phase, device, next) in cases {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(phase)).waiting.clear();
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(phase)).open_commands.clear();
         let over = Event::DeclaredOver { actor: actor(), device, evidence: "its panel shows none".into() };
         assert!(matches!(run.send(over.clone())[..], [Command::Refuse { .. }]), "nobody is asked yet");
-        run.send(Event::Refused { device, what: Asked::Acknowledge, why: "another result".into() });
+        run.send(Event::Refused { device, what: MachineRequest::Acknowledge, why: "another result".into() });
         assert_eq!(run.cell.state(), State::Held(phase));
         run.send(over);
         assert_eq!(run.cell.state(), next);
@@ -1290,12 +1290,12 @@ fn a_result_that_a_machine_will_not_forget_is_given_up_by_a_persons_word() {
 fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
     let device = Device::Grinder;
     for is_told in [true, false] {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
         run.send(stop());
         assert_eq!(run.cell.state(), State::Stopping);
         if is_told {
-            run.send(Event::Refused { device, what: Asked::Stop, why: "it is EXECUTE 5 s later".into() });
+            run.send(Event::Refused { device, what: MachineRequest::Stop, why: "it is EXECUTE 5 s later".into() });
         } else {
             run.now += Duration::from_secs(3600);
             run.send(Event::Deadline);
@@ -1307,22 +1307,22 @@ fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
 
 #[test]
 fn that_orders_cannot_come_in_is_an_alarm_until_they_can() {
-    for state in way() {
-        let mut run = Run::good();
-        run.start().until(state);
+    for state in undisturbed_states() {
+        let mut run = TestRun::accepted_after_two_passes();
+        run.start().run_until(state);
         run.send(Event::ControlLost { why: String::new() });
         assert_eq!(run.cell.state(), state);
         assert!(run.cell.alarms().any(|alarm| alarm.id == AlarmId::ControlLost));
         run.send(Event::ControlBack);
         assert!(!run.cell.alarms().any(|alarm| alarm.id == AlarmId::ControlLost));
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.cell.state(), State::Complete);
     }
 }
 
 #[test]
 fn every_event_has_an_answer_in_every_state() {
-    let rows = table();
+    let rows = transition_table();
     let states: std::collections::BTreeSet<_> = rows.iter().map(|row| row.state).collect();
     let events: std::collections::BTreeSet<_> = rows.iter().map(|row| row.event.clone()).collect();
     assert_eq!(rows.len(), states.len() * events.len());
@@ -1360,7 +1360,7 @@ fn every_event_has_an_answer_in_every_state() {
 #[test]
 fn decisions_are_compared_without_their_texts() {
     let raised = |id: AlarmId, what: &str| {
-        let mut alarm = id.in_general();
+        let mut alarm = id.generic_alarm();
         alarm.what = what.to_owned();
         (alarm.consequence, alarm.remedy) = (format!("{what}."), vec![what.to_owned()]);
         Command::Raise(alarm)
@@ -1397,7 +1397,7 @@ fn fingerprint(rows: &[Row]) -> u64 {
 
 #[test]
 fn events_and_commands_are_named_as_they_are_recorded() {
-    for event in samples(1) {
+    for event in sample_events(1) {
         assert_eq!(serde_json::to_value(&event).unwrap()["event"], event.name());
     }
     for device in Device::BOTH {
@@ -1412,10 +1412,10 @@ fn events_and_commands_are_named_as_they_are_recorded() {
 
 #[test]
 fn every_alarm_says_what_to_do() {
-    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() });
-    let Some(Command::Raise(alarm)) = run.all.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
+    let Some(Command::Raise(alarm)) = run.commands.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
     assert_eq!(alarm.what, "A machine is in fault: grinder, fault 5, drive.");
     assert!(AlarmId::ALL.len() > 30);
 }
@@ -1424,14 +1424,14 @@ fn every_alarm_says_what_to_do() {
 fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next_start() {
     let asked = |commands: &[Command]| commands.iter().any(|c| matches!(c, Command::AskWhetherClear { .. }));
     let word = |device| Event::ClearConfirmed { actor: actor(), device };
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     // Who loaded the part has seen both machines clear of it: nobody is asked before the first start.
-    run.start().until(State::Execute(Phase::Grind(JobStep::Clear)));
-    run.waiting.clear();
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Clear)));
+    run.open_commands.clear();
     assert!(!asked(&run.send(Event::ClearUnknown { device: Device::Cmm })));
-    run.until(State::Execute(Phase::Transfer));
+    run.run_until(State::Execute(Phase::Transfer));
     // The grinder was started since: nothing opens the gate but a word, and that is waited for without end.
-    run.waiting.clear();
+    run.open_commands.clear();
     assert!(asked(&run.send(Event::ClearUnknown { device: Device::Grinder })));
     assert_eq!((run.cell.state(), run.cell.next_deadline()), (State::Execute(Phase::Transfer), None));
     run.send(word(Device::Cmm));
@@ -1439,15 +1439,15 @@ fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next
     // A hold while a person is asked takes no answer.
     run.send(Event::Hold { actor: actor(), reason: String::new() });
     assert_eq!(run.cell.state(), State::Held(Phase::Transfer));
-    run.waiting.clear();
+    run.open_commands.clear();
     // An early word counts: the fresh look that follows asks nobody.
     run.send(word(Device::Grinder));
     run.send(Event::Resume { actor: actor(), reason: String::new() });
-    run.waiting.clear();
+    run.open_commands.clear();
     assert!(!asked(&run.send(Event::ClearUnknown { device: Device::Grinder })));
     assert_eq!(run.cell.state(), State::Execute(Phase::Measure(JobStep::Send)));
     // Nobody has to look once more when the part is accepted.
-    run.until(State::Completing).waiting.clear();
+    run.run_until(State::Completing).open_commands.clear();
     for device in Device::BOTH {
         assert!(!asked(&run.send(Event::ClearUnknown { device })));
     }
@@ -1455,12 +1455,12 @@ fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next
 }
 
 /// A pass that was told to hold, and the link lost before the machine said that it stands.
-fn lost_while_holding<'f>() -> Run<'f> {
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+fn lost_while_holding<'f>() -> TestRun<'f> {
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     let commands = run.send(hold());
     assert!(commands.contains(&Command::HoldMachine { device: Device::Grinder }), "{commands:?}");
-    run.waiting.clear();
+    run.open_commands.clear();
     run.send(Event::LinkLost { device: Device::Grinder, why: "silent".into() });
     run
 }
@@ -1502,8 +1502,8 @@ fn a_machine_that_stays_out_of_sight_while_it_should_hold_ends_in_the_safe_seque
 fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
     // Suspended by the lost link, then held by a person: the machine may still grind.
     let device = Device::Grinder;
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(Event::LinkLost { device, why: "silent".into() });
     run.send(hold());
     assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Reconcile)));
@@ -1523,10 +1523,10 @@ fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
 #[test]
 fn a_machine_that_is_seen_held_once_more_as_it_is_told_to_go_on_is_no_news() {
     let device = Device::Grinder;
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
-    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(resume()), [Command::ResumeMachine { device }]);
     // The first look after its link has come back, while RESUME is on its way: Held would not be true for long.
     assert_eq!(run.send(Event::MachineHeld { device }), []);
@@ -1543,23 +1543,23 @@ fn a_machine_that_is_seen_held_once_more_as_it_is_told_to_go_on_is_no_news() {
 fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_told() {
     let device = Device::Grinder;
     let moves = Event::Progressed { device, done: 17, total: 1000 };
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
-    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Run)));
     let commands = run.send(moves.clone());
     assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
     assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)), "what moves is not held");
     assert!(run.alarms().contains(&AlarmId::MovesUnasked));
     // It says no: only the safe sequence is left.
-    let commands = run.send(Event::Refused { device, what: Asked::Hold, why: "local".into() });
+    let commands = run.send(Event::Refused { device, what: MachineRequest::Hold, why: "local".into() });
     assert!(commands.contains(&Command::AbortMachine { device }), "{commands:?}");
     // The machine that has no job of this phase.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Measure(JobStep::Send)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Measure(JobStep::Send)));
     run.send(hold());
-    run.until(State::Held(Phase::Measure(JobStep::Send)));
-    run.waiting.clear();
+    run.run_until(State::Held(Phase::Measure(JobStep::Send)));
+    run.open_commands.clear();
     assert_eq!(run.send(moves.clone()).last(), Some(&Command::HoldMachine { device }));
     assert_eq!(run.send(moves), [], "told once");
 }
@@ -1568,53 +1568,53 @@ fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_t
 fn a_machine_in_manual_mode_holds_what_moves_and_nothing_is_started_beside_it() {
     let by_hand = |device| Event::NotAutomatic { device, message: "it is in manual mode".into() };
     for device in Device::BOTH {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
         let commands = run.send(by_hand(device));
         let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
         assert_eq!(alarm.id, AlarmId::NotAutomatic);
         assert!(alarm.what.contains(&format!("{device}, it is in manual mode")), "{}", alarm.what);
         assert_eq!(alarm.what.contains("while the grinder runs its job"), device == Device::Cmm, "{}", alarm.what);
         assert_eq!(commands.last(), Some(&Command::HoldMachine { device: Device::Grinder }));
-        run.until(State::Held(Phase::Grind(JobStep::Run)));
+        run.run_until(State::Held(Phase::Grind(JobStep::Run)));
         // Nobody goes on beside it.
         let commands = run.send(resume());
         assert!(matches!(&commands[..], [Command::Refuse { why, .. }] if why.contains("manual mode")), "{commands:?}");
         run.send(Event::AutomaticAgain { device });
         assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)), "the key resumes nothing");
         run.send(resume());
-        run.until(State::Complete);
+        run.run_until(State::Complete);
     }
     // Found before a START: the machine is not even prepared.
     for (device, at) in
         [(Device::Cmm, JobStep::Send), (Device::Grinder, JobStep::Prepare), (Device::Cmm, JobStep::Prepare)]
     {
-        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(at)));
+        let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+        run.start().run_until(State::Execute(Phase::Grind(at)));
         run.send(by_hand(device));
-        run.go_on();
+        run.run_to_rest();
         assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)), "{device} at {at:?}");
         assert_eq!((run.starts(), run.alarms()), (vec![], vec![AlarmId::NotAutomatic]));
         run.send(Event::AutomaticAgain { device });
         run.send(resume());
-        run.until(State::Complete);
+        run.run_until(State::Complete);
         assert_eq!(run.starts().len(), 2);
     }
     // While nothing moves a person may have it.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Load));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Load));
     assert_eq!(run.send(by_hand(Device::Cmm)), []);
     assert_eq!(run.send(Event::AutomaticAgain { device: Device::Cmm }), []);
-    run.until(State::Complete);
+    run.run_until(State::Complete);
 }
 
 #[test]
 fn a_suspended_machine_in_manual_mode_does_not_go_on_by_itself() {
     let (device, condition) = (Device::Grinder, Condition::Supplies);
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(Event::ConditionLost { device, condition, message: "no air".into() });
-    run.until(State::Suspended(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Suspended(Phase::Grind(JobStep::Run)));
     run.send(Event::NotAutomatic { device, message: "it is in manual mode".into() });
     run.send(Event::ConditionBack { device, condition });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
@@ -1624,8 +1624,8 @@ fn a_suspended_machine_in_manual_mode_does_not_go_on_by_itself() {
 fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
     let (moves, strays) = (Device::Grinder, Device::Cmm);
     let progress = Event::Progressed { device: strays, done: 3, total: 10 };
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     let commands = run.send(progress.clone());
     assert_eq!(run.alarms(), [AlarmId::MovesUnasked]);
     assert_eq!(commands[1..], [Command::HoldMachine { device: strays }, Command::HoldMachine { device: moves }]);
@@ -1637,13 +1637,13 @@ fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
     // It does not hold: only the safe sequence is left.
     let why = "local".to_owned();
-    let commands = run.send(Event::Refused { device: strays, what: Asked::Hold, why });
+    let commands = run.send(Event::Refused { device: strays, what: MachineRequest::Hold, why });
     assert!(commands.contains(&Command::AbortMachine { device: strays }), "{commands:?}");
     // Before the START of the other one.
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.send(progress);
-    run.go_on();
+    run.run_to_rest();
     assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(JobStep::Send)), vec![]));
 }
 
@@ -1651,68 +1651,68 @@ fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
 fn a_job_without_progress_is_told_and_then_held() {
     let device = Device::Grinder;
     let run_state = State::Execute(Phase::Grind(JobStep::Run));
-    let due = |run: &Run<'_>| run.cell.next_deadline().unwrap() - run.now;
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(run_state);
-    assert_eq!(due(&run), 30 * S);
-    run.now += 30 * S;
+    let due = |run: &TestRun<'_>| run.cell.next_deadline().unwrap() - run.now;
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(run_state);
+    assert_eq!(due(&run), 30 * SECOND);
+    run.now += 30 * SECOND;
     let commands = run.send(Event::Deadline);
     let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
     assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
     assert!(alarm.what.contains("grinder, for 30 s; the cell holds it after 30 s more"), "{}", alarm.what);
-    assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * S));
+    assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * SECOND));
     // It goes on: the alarm goes away by itself.
     let progressed = |done| Event::Progressed { device, done, total: 1000 };
     assert_eq!(run.send(progressed(1)), [Command::Withdraw { alarm: AlarmId::ProgressStands }]);
     // A slow job is not slow again and again: three times its own pace is waited.
-    run.now += 15 * S;
+    run.now += 15 * SECOND;
     run.send(progressed(2));
     assert!((due(&run).as_secs_f64() - 45.0).abs() < 0.1, "{:?}", due(&run));
-    run.now += 46 * S;
+    run.now += 46 * SECOND;
     assert_eq!(run.send(Event::Deadline).len(), 1);
-    run.now += 15 * S;
+    run.now += 15 * SECOND;
     let commands = run.send(Event::Deadline);
     assert_eq!(run.alarms()[1..], [AlarmId::ProgressStands, AlarmId::NoAnswer]);
     assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
     // A machine that a person serves gives no signs.
     let deadlines = Deadlines { progress_notice: [None; 2], ..Deadlines::default() };
-    let mut run = Run::new(CellPlan { deadlines, ..plan() }, |_| figures(5.0, 0.5));
-    run.start().until(run_state);
-    assert_eq!(due(&run), 60 * S);
+    let mut run = TestRun::new(CellPlan { deadlines, ..plan() }, |_| figures(5.0, 0.5));
+    run.start().run_until(run_state);
+    assert_eq!(due(&run), 60 * SECOND);
 }
 
 #[test]
 fn a_command_that_has_waited_is_given_only_where_it_is_still_wanted() {
     let device = Device::Grinder;
     let start = Command::StartMachine { device, cycle: 1 };
-    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(JobStep::Start)));
-    assert!(run.cell.wants(&start) && !run.cell.wants(&Command::StartMachine { device, cycle: 2 }));
+    let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
+    run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
+    assert!(run.cell.still_requires(&start) && !run.cell.still_requires(&Command::StartMachine { device, cycle: 2 }));
     run.send(hold());
-    assert!(!run.cell.wants(&start), "held before it was given");
-    run.waiting.clear();
-    run.send(Event::Refused { device, what: Asked::Start, why: "not given".into() });
+    assert!(!run.cell.still_requires(&start), "held before it was given");
+    run.open_commands.clear();
+    run.send(Event::Refused { device, what: MachineRequest::Start, why: "not given".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
     run.send(resume());
-    run.until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
-    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    run.run_until(State::Held(Phase::Grind(JobStep::Run)));
     let go_on = Command::ResumeMachine { device };
-    assert!(!run.cell.wants(&go_on));
+    assert!(!run.cell.still_requires(&go_on));
     run.send(resume());
-    assert!(run.cell.wants(&go_on));
+    assert!(run.cell.still_requires(&go_on));
     run.send(hold());
-    assert!(!run.cell.wants(&go_on));
+    assert!(!run.cell.still_requires(&go_on));
     run.send(abort());
     for command in [start, go_on, Command::Prepare { device, cycle: 1 }, Command::LoadPass { cycle: 1 }] {
-        assert!(!run.cell.wants(&command), "{command:?} after an abort");
+        assert!(!run.cell.still_requires(&command), "{command:?} after an abort");
     }
-    assert!(run.cell.wants(&Command::VerifyClear { device }));
+    assert!(run.cell.still_requires(&Command::VerifyClear { device }));
 }
 
 /// Plays events chosen by chance, half of them the right answers, and returns the commands with what came before.
-fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
-    let mut run = Run::new(plan(), |cycle| figures(30.0 / f64::from(cycle), 6.0 / f64::from(cycle)));
+fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
+    let mut run = TestRun::new(plan(), |cycle| figures(30.0 / f64::from(cycle), 6.0 / f64::from(cycle)));
     run.start();
     let mut excused = std::collections::BTreeMap::<Device, u32>::new();
     let mut seen = 0;
@@ -1726,11 +1726,11 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
     for (choice, good, wait) in choices {
         let before = run.cell.state();
         run.now += Duration::from_secs(u64::from(*wait));
-        let event = if *good && !run.waiting.is_empty() {
-            let command = run.waiting.remove(0);
-            answer(&command, &mut run.figures)
+        let event = if *good && !run.open_commands.is_empty() {
+            let command = run.open_commands.remove(0);
+            good_answer(&command, &mut run.figures)
         } else {
-            let all = samples(run.cell.cycle());
+            let all = sample_events(run.cell.cycle());
             Some(all[usize::from(*choice) % all.len()].clone())
         };
         let Some(event) = event else { continue };
@@ -1741,7 +1741,7 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
             Event::ClearConfirmed { device, .. } => said[*device as usize] = true,
             Event::LoadConfirmed { .. } if before == State::Execute(Phase::Load) => said = [true; 2],
             Event::Reconciled { device, outcome: Reconciliation::NotStarted, .. }
-            | Event::Refused { device, what: Asked::Start, .. }
+            | Event::Refused { device, what: MachineRequest::Start, .. }
                 if !begun[*device as usize] =>
             {
                 *excused.entry(*device).or_default() += 1;
@@ -1755,7 +1755,7 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
         if !commands.iter().any(|command| matches!(command, Command::Refuse { .. })) {
             match told {
                 // One that no order of the cell has set going is told to hold, with an alarm; the cell is held all the same.
-                Event::Progressed { device, .. } if before.phase().and_then(Phase::moving) != Some(device) => {}
+                Event::Progressed { device, .. } if before.phase().and_then(Phase::moving_device) != Some(device) => {}
                 Event::Started { device, .. }
                 | Event::Progressed { device, .. }
                 | Event::MachineResumed { device }
@@ -1765,7 +1765,7 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
                 Event::MachineHeld { device }
                 | Event::Ended { device, .. }
                 | Event::DeclaredOver { device, .. }
-                | Event::Refused { device, what: Asked::Start, .. }
+                | Event::Refused { device, what: MachineRequest::Start, .. }
                 | Event::Reconciled { device, .. } => stands[device as usize] = true,
                 _ => {}
             }
@@ -1824,6 +1824,6 @@ proptest! {
 
     #[test]
     fn whatever_comes_the_promises_hold(choices in prop::collection::vec((any::<u16>(), prop::bool::weighted(0.8), 0_u8..3), 0..120)) {
-        play(&choices)?;
+        play_random_events(&choices)?;
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use regrind::compensation::Alike;
+use regrind::compensation::MachineSimilarity;
 use regrind::drive::Task;
 use regrind::formats::Learned;
 use regrind_plant::Knowledge;
@@ -15,7 +15,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Result of the query.
 #[derive(Default)]
-pub(in super::super) struct Told {
+pub(in super::super) struct PlantKnowledge {
     /// Knowledge with which the task can begin, if other cells have any.
     pub(in super::super) learned: Option<Learned>,
     /// Messages about it.
@@ -23,11 +23,11 @@ pub(in super::super) struct Told {
 }
 
 /// Queries the knowledge of other cells about similar parts. An unreachable plant does not prevent the run.
-pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> {
+pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
     let config = super::read(plant)?;
     // A plant file for live values only has no database to query.
     if config.database.is_none() {
-        return Ok(Told::default());
+        return Ok(PlantKnowledge::default());
     }
     let (to, answer) = std::sync::mpsc::channel();
     let (kind, simulation) = (task.kind.clone(), task.simulation);
@@ -38,7 +38,7 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
             runtime.block_on(async {
                 let link = super::open(&config).await?;
                 let of_this = (kind.as_str(), simulation);
-                let knowledge = Knowledge::ask(&link, config.artefacts.as_ref(), of_this).await?;
+                let knowledge = Knowledge::query(&link, config.artefacts.as_ref(), of_this).await?;
                 let alike = alike(&knowledge, config.machines_differ);
                 Ok::<_, Failure>((knowledge, alike))
             })
@@ -52,14 +52,14 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
         Err(_) => return Ok(without(&format!("nothing came within {} s", PATIENCE.as_secs()))),
     };
     let words = knowledge.left_alone;
-    Ok(Told { learned: task.from_others(&knowledge.lessons, &alike), words })
+    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.lessons, &alike), words })
 }
 
 /// Returns the similarity of machines, from a stated value or from the recipes that two machines share.
-fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> Alike {
-    let mut alike = Alike::default();
+fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilarity {
+    let mut alike = MachineSimilarity::default();
     if let Some(share) = machines_differ {
-        alike.state(share);
+        alike.add_statement(share);
     }
     for ([one, other], is_own) in &knowledge.pairs {
         alike.compare([&one.known, &other.known], *is_own);
@@ -67,6 +67,6 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> Alike {
     alike
 }
 
-fn without(why: &str) -> Told {
-    Told { learned: None, words: vec![format!("the plant does not tell what other cells have learned: {why}")] }
+fn without(why: &str) -> PlantKnowledge {
+    PlantKnowledge { learned: None, words: vec![format!("the plant does not tell what other cells have learned: {why}")] }
 }

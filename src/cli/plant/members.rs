@@ -163,7 +163,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT cell, coalesce(words, 'never heard of'), coalesce(to_char(told_at, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, '')
             FROM cell_now ORDER BY cell";
-        let found = link.ask(text, &[]).await?;
+        let found = link.query(text, &[]).await?;
         let cells: Vec<[String; 4]> = found.iter().map(|row| [0, 1, 2, 3].map(|k| row.get(k))).collect();
         if arguments.json {
             let told = cells.iter().map(|[cell, words, at, run]| json!({ "cell": cell, "words": words, "told_at": at, "run": run }));

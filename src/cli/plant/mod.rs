@@ -35,11 +35,11 @@ Exit codes: 0 done; 1 a check failed, or something does not exist; 2 bad argumen
 database refuses it; 3 it cannot be reached.")]
 pub(super) struct Arguments {
     #[command(subcommand)]
-    what: What,
+    what: PlantCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum PlantCommand {
     Init(members::ToInit),
     Enrol(members::ToEnrol),
     Retire(members::ToRetire),
@@ -59,21 +59,21 @@ enum What {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
-        What::Init(of) => members::init(of),
-        What::Enrol(of) => members::enrol(of),
-        What::Retire(of) => members::retire(of),
-        What::Cells(of) => members::list(of),
-        What::Runs(of) => runs::list(of),
-        What::Fetch(of) => runs::fetch(of),
-        What::Incidents(of) => runs::incidents(of),
-        What::Propose(of) => recipes::propose(of),
-        What::Approve(of) => recipes::approve(of),
-        What::Withdraw(of) => recipes::withdraw(of),
-        What::Recipes(of) => recipes::list(of),
-        What::Queue(of) => queue::queue(of),
-        What::Unqueue(of) => queue::unqueue(of),
-        What::Work(of) => queue::list(of),
-        What::Serve(of) => serve::serve(of),
+        PlantCommand::Init(of) => members::init(of),
+        PlantCommand::Enrol(of) => members::enrol(of),
+        PlantCommand::Retire(of) => members::retire(of),
+        PlantCommand::Cells(of) => members::list(of),
+        PlantCommand::Runs(of) => runs::list(of),
+        PlantCommand::Fetch(of) => runs::fetch(of),
+        PlantCommand::Incidents(of) => runs::incidents(of),
+        PlantCommand::Propose(of) => recipes::propose(of),
+        PlantCommand::Approve(of) => recipes::approve(of),
+        PlantCommand::Withdraw(of) => recipes::withdraw(of),
+        PlantCommand::Recipes(of) => recipes::list(of),
+        PlantCommand::Queue(of) => queue::queue(of),
+        PlantCommand::Unqueue(of) => queue::unqueue(of),
+        PlantCommand::Work(of) => queue::list(of),
+        PlantCommand::Serve(of) => serve::serve(of),
     }
 }
 
@@ -117,11 +117,11 @@ pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
 /// Programs that replicate and publish a run for the plant while it is active. They are separate processes, so they can
 /// neither slow the run down nor stop it. They end shortly after the program that holds this value, because then their
 /// standard input ends.
-pub(super) struct Beside {
+pub(super) struct PlantProcesses {
     _programs: Vec<Child>,
 }
 
-impl Beside {
+impl PlantProcesses {
     /// Starts the replication of the runs in a folder if the plant file names a database, and the publication of live
     /// values if it names a receiver.
     pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {

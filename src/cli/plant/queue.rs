@@ -80,7 +80,7 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
         let (sha256, due) = (recipe.sha256(), arguments.due.map(|due| due.to_string()));
         let text = "SELECT queue_work(s, decode($2, 'hex'), $3, $4::text::date) FROM unnest($1::text[]) AS s";
         // All parts are queued, or none.
-        let made = link.ask(text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
+        let made = link.query(text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
         let numbers: Vec<i64> = made.iter().map(|row| row.get(0)).collect();
         let lines = numbers.iter().zip(&arguments.serials).map(|(number, serial)| {
             format!("{number:>6}  {serial}  by version {} of {}\n", recipe.version, recipe.name)
@@ -95,7 +95,7 @@ pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
     let ToUnqueue { work, why, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.ask("SELECT withdraw_work($1, $2)", &[work, why]).await?;
+        let done = link.query("SELECT withdraw_work($1, $2)", &[work, why]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("part {work} is taken out of the queue\n"))?;
             return Ok(Outcome::Accepted);
@@ -111,7 +111,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT id, serial, recipe, version, coalesce(due::text, ''), state, coalesce(cell, for_cell, ''), coalesce(run, '')
             FROM work_now ORDER BY due NULLS LAST, id";
-        let found = link.ask(text, &[]).await?;
+        let found = link.query(text, &[]).await?;
         let mut told = Vec::new();
         let mut lines = String::new();
         for row in &found {

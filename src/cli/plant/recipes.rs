@@ -178,7 +178,7 @@ pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
     let ToWithdraw { name, version, why, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.ask("SELECT withdraw_recipe($1, $2, $3)", &[name, version, why]).await?;
+        let done = link.query("SELECT withdraw_recipe($1, $2, $3)", &[name, version, why]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("version {version} of {name} is withdrawn\n"))?;
             return Ok(Outcome::Accepted);
@@ -195,7 +195,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let text = "SELECT name, version, encode(sha256, 'hex'), to_char(proposed_at, 'YYYY-MM-DD HH24:MI:SS'), proposed_by::text,
                 array(SELECT person FROM approval a WHERE a.recipe = r.sha256 ORDER BY at), withdrawn_why
             FROM recipe r ORDER BY name, version DESC";
-        let found = link.ask(text, &[]).await?;
+        let found = link.query(text, &[]).await?;
         let mut told = Vec::new();
         let mut lines = String::new();
         for row in &found {

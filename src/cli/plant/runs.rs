@@ -80,7 +80,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records
             FROM part_run WHERE $1::text IS NULL OR starts_with(serial, $1) ORDER BY began DESC LIMIT $2";
-        let found = link.ask(text, &[&arguments.part, &i64::from(arguments.most)]).await?;
+        let found = link.query(text, &[&arguments.part, &i64::from(arguments.most)]).await?;
         let told = found.iter().map(|row| ([0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)), row.get::<_, i32>(5)));
         if arguments.json {
             let told = told.map(|([cell, run, serial, result, began], records)| {
@@ -122,7 +122,7 @@ pub(super) fn incidents(arguments: &ToTell) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT to_char(i.at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(c.name, i.role), coalesce(i.run, ''), i.what, i.words
             FROM incident i LEFT JOIN cell c ON c.id = i.cell ORDER BY i.id DESC LIMIT $1";
-        let found = link.ask(text, &[&i64::from(arguments.most)]).await?;
+        let found = link.query(text, &[&i64::from(arguments.most)]).await?;
         let told = found.iter().map(|row| [0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)));
         if arguments.json {
             let told = told.map(|[at, by, run, what, words]| {

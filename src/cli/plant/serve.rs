@@ -3,12 +3,12 @@
 use std::net::SocketAddr;
 
 use clap::Args;
-use regrind_page::{Door as PageDoor, PageOf};
+use regrind_page::{Door as PageDoor, PageSubject};
 use regrind_plant::PlantPage;
 
 use super::super::Outcome;
 use super::super::failure::Failure;
-use super::super::serve::Door;
+use super::super::serve::PageAccess;
 use super::Where;
 
 /// Default address of the page. Its port follows that of a cell's page.
@@ -33,7 +33,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
     #[command(flatten)]
-    door: Door,
+    door: PageAccess,
     #[command(flatten)]
     plant: Where,
 }
@@ -51,7 +51,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
         let (listener, entrance) = door.open(*listen).await?;
         let log = Box::new(|what: &str| eprintln!("page: {what}"));
         let door =
-            PageDoor::new(entrance, PageOf::Plant, log).map_err(|source| Failure::Page { address: *listen, source })?;
+            PageDoor::new(entrance, PageSubject::Plant, log).map_err(|source| Failure::Page { address: *listen, source })?;
         super::super::print(&format!("page     {}\n", door.url()))?;
         tokio::select! {
             () = door.serve(listener, PlantPage::new(settings, config.artefacts.clone()).routes()) => {}

@@ -39,11 +39,11 @@ Examples:
 Exit codes: 0 done; 1 there is no such study; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
 pub(in super::super) struct Arguments {
     #[command(subcommand)]
-    what: What,
+    what: StudyCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum StudyCommand {
     Begin(ToBegin),
     Work(ToWork),
     Show(ToShow),
@@ -132,10 +132,10 @@ struct ToStop {
 
 pub(in super::super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
-        What::Begin(of) => begin(of),
-        What::Work(of) => work(of),
-        What::Show(of) => show(of),
-        What::Stop(of) => stop(of),
+        StudyCommand::Begin(of) => begin(of),
+        StudyCommand::Work(of) => work(of),
+        StudyCommand::Show(of) => show(of),
+        StudyCommand::Stop(of) => stop(of),
     }
 }
 
@@ -245,14 +245,14 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
                 let mut made = 0_usize;
                 loop {
                     let link = open(&config).await?;
-                    let Some(job) = Job::take(&link).await? else {
+                    let Some(job) = Job::lease_next(&link).await? else {
                         if !wait {
                             return Ok::<_, Failure>(made);
                         }
                         tokio::time::sleep(ROUND).await;
                         continue;
                     };
-                    let study = Study::of(&link, &job).await?;
+                    let study = Study::read(&link, &job).await?;
                     // A run takes longer than a connection should stay idle.
                     drop(link);
                     let of = job.clone();
@@ -312,7 +312,7 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT j.job, j.varied::text, j.seed, j.state, j.result::text FROM study s JOIN study_job j ON j.study = s.id
             WHERE s.name = $1 ORDER BY j.job";
-        let found = link.ask(text, &[&arguments.name]).await?;
+        let found = link.query(text, &[&arguments.name]).await?;
         if found.is_empty() {
             super::super::print(&format!("there is no study {:?}\n", arguments.name))?;
             return Ok(Outcome::NotInTolerance);
@@ -409,7 +409,7 @@ fn stop(arguments: &ToStop) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.ask("SELECT stop_study($1)", &[&arguments.name]).await?;
+        let done = link.query("SELECT stop_study($1)", &[&arguments.name]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("{} gives out no more jobs\n", arguments.name))?;
             return Ok(Outcome::Accepted);

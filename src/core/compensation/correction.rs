@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
-use super::parameters::Set;
+use super::parameters::ParameterCorrections;
 use crate::geometry::Grid;
 
 /// Displacement of the surface that the grinder is to apply, with the parameter corrections of its machine.
@@ -24,7 +24,7 @@ pub struct Correction {
     pub level_mm: f64,
     /// Parameter corrections of the machine, in addition to `values_mm`; `None` if the map alone corrects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub set: Option<Set>,
+    pub set: Option<ParameterCorrections>,
 }
 
 impl Correction {
@@ -59,7 +59,7 @@ impl Correction {
         self.add_parameter_effect(|set| &set.setting_mm)
     }
 
-    fn add_parameter_effect(&self, of: impl Fn(&Set) -> &Vec<f64>) -> Cow<'_, [f64]> {
+    fn add_parameter_effect(&self, of: impl Fn(&ParameterCorrections) -> &Vec<f64>) -> Cow<'_, [f64]> {
         match &self.set {
             None => Cow::Borrowed(&self.values_mm),
             Some(set) => self.values_mm.iter().zip(of(set)).map(|(value, of)| value + of).collect(),

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use super::filter::{LEAST_READINGS, MOST_WORKED};
+use super::filter::{MIN_READINGS, MAX_FILTER_NODES};
 use super::spline::SplineError;
 use crate::geometry::GridError;
 

@@ -28,26 +28,26 @@ const SPREAD: f64 = 0.75;
 /// Number of nodes to either side that a reading is spread over; beyond them the weight is 2e-5 of the largest.
 const SPREAD_REACH: usize = 3;
 /// Widest step of the grid, in standard deviations of the weights.
-const WIDEST_STEP: f64 = 0.55;
+const MAX_STEP: f64 = 0.55;
 /// Reach of the weights, in standard deviations; beyond it they are below 1e-6 of the largest.
 const REACH: f64 = 5.3;
 /// Minimum number of readings within the cut-off of a node, along x and along y; fewer are no evidence for a surface.
-pub(super) const LEAST_READINGS: u32 = 6;
+pub(super) const MIN_READINGS: u32 = 6;
 /// Maximum number of nodes that a filter may work on; a short cut-off on a wide grid needs more nodes than the grid
 /// has.
-pub(super) const MOST_WORKED: f64 = 2e7;
+pub(super) const MAX_FILTER_NODES: f64 = 2e7;
 /// Maximum variance of a value, over that of one reading; a value above it is a guess.
-const MOST_VARIANCE: f64 = 2.0;
+const MAX_VARIANCE: f64 = 2.0;
 
 /// Maximum mean square distance of the weighted readings, in variances of the weights: it is 2 in the open, 3.6
 /// between four readings half a cut-off apart, and more in a hole.
-const MOST_SPREAD: f64 = 4.5;
+const MAX_SPREAD: f64 = 4.5;
 
 /// Order of the polynomial that the filter lets pass unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
-pub enum Order {
+pub enum FilterOrder {
     /// Constants pass: the plain weighted mean, which is biased at edges with a slope.
     Constant,
     /// Planes pass.
@@ -57,7 +57,7 @@ pub enum Order {
     Quadric,
 }
 
-impl Order {
+impl FilterOrder {
     /// Returns alpha, the width of the weights over the cut-off, with which one half passes at the cut-off.
     ///
     /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u).
@@ -100,14 +100,14 @@ const fn terms(degree: usize) -> usize {
 
 /// Gaussian filter of a cut-off and an order.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Gaussian {
+pub(super) struct GaussianFilter {
     pub cutoff_mm: f64,
-    pub order: Order,
+    pub order: FilterOrder,
 }
 
 /// Result of a filter at every node of its grid.
 #[derive(Clone, Debug)]
-pub(super) struct Filtered {
+pub(super) struct FilterResult {
     pub grid: Grid,
     /// Filtered values; 0 at nodes that are not supported.
     pub values: Vec<f64>,
@@ -121,12 +121,12 @@ pub(super) struct Filtered {
     pub supported: Vec<bool>,
 }
 
-impl Gaussian {
+impl GaussianFilter {
     /// Returns the product of leverage and density in the open: the share of a reading in the value at its place,
     /// times the number of readings per square millimetre.
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
-        if self.order == Order::Quadric { 2.0 / weight } else { 1.0 / weight }
+        if self.order == FilterOrder::Quadric { 2.0 / weight } else { 1.0 / weight }
     }
 
     /// Returns the standard deviation of the weights, in millimetres.
@@ -136,34 +136,34 @@ impl Gaussian {
 
     /// Returns the number of steps into which a grid's spacing must be divided along x and y for this filter.
     pub fn division(&self, grid: &Grid) -> [usize; 2] {
-        let widest_mm = WIDEST_STEP * self.sigma_mm();
+        let widest_mm = MAX_STEP * self.sigma_mm();
         grid.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
     }
 
     /// Filters values at arbitrary places and returns the result on a grid; `weights` holds a factor from 0 to 1 for
     /// each value.
-    pub fn filter_scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> Filtered {
+    pub fn filter_scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> FilterResult {
         let degree = self.order.degree();
         let trend = Trend::fit(places, values, degree);
         let sigma_mm = self.sigma_mm();
         let spread = grid.spacing_mm.map(|step| SPREAD * step / sigma_mm);
         let taps = self.taps(grid);
         let rest: Vec<f64> = places.iter().zip(values).map(|(p, v)| v - trend.at(*p)).collect();
-        let channels = spread_out(places, &rest, weights, grid, taps);
-        let counts = Counts::new(places, grid);
+        let channels = spread_readings(places, &rest, weights, grid, taps);
+        let counts = ReadingCounts::new(places, grid);
         let mut filtered = self.solve(&channels, spread, taps, grid, &counts);
         filtered.add_trend(&trend);
         filtered
     }
 
     /// Filters values at the nodes of a grid; uses only the nodes with a weight above 0.
-    pub fn filter_nodes(&self, values: &[f64], weights: &[f64], grid: &Grid) -> Filtered {
+    pub fn filter_nodes(&self, values: &[f64], weights: &[f64], grid: &Grid) -> FilterResult {
         let degree = self.order.degree();
         let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
             (0..grid.len()).filter(|&k| weights[k] > 0.0).map(|k| (grid.place_mm(k), values[k])).unzip();
         let trend = Trend::fit(&places, &known, degree);
         let taps = self.taps(grid);
-        let mut channels = Channels::new(grid, taps, true);
+        let mut channels = GridSums::new(grid, taps, true);
         for k in (0..grid.len()).filter(|&k| weights[k] > 0.0) {
             let slot = channels.slot(k % grid.columns, k / grid.columns);
             let weight = weights[k];
@@ -171,7 +171,7 @@ impl Gaussian {
             channels.value[slot] = weight * (values[k] - trend.at(grid.place_mm(k)));
             channels.weight2[slot] = weight * weight;
         }
-        let counts = Counts::new(&places, grid);
+        let counts = ReadingCounts::new(&places, grid);
         let mut filtered = self.solve(&channels, [0.0; 2], taps, grid, &counts);
         filtered.add_trend(&trend);
         filtered
@@ -185,7 +185,7 @@ impl Gaussian {
         })
     }
 
-    fn solve(&self, channels: &Channels, spread: [f64; 2], taps: [usize; 2], grid: &Grid, counts: &Counts) -> Filtered {
+    fn solve(&self, channels: &GridSums, spread: [f64; 2], taps: [usize; 2], grid: &Grid, counts: &ReadingCounts) -> FilterResult {
         let degree = self.order.degree();
         let sigma_mm = self.sigma_mm();
         let kernels = |scale: f64, most: usize| {
@@ -194,16 +194,16 @@ impl Gaussian {
         // The check for one-sided readings needs the second moments, whatever the order.
         let most = (2 * degree).max(2);
         let ([wx, wy], [qx, qy]) = (kernels(1.0, most), kernels(2f64.sqrt(), 2 * degree));
-        let weight = Summed::along_x(channels, &channels.weight, &wx);
-        let value = Summed::along_x(channels, &channels.value, &wx[..=degree]);
-        let weight2 = Summed::along_x(channels, channels.squares(), &qx);
-        let rows: Vec<Vec<Node>> = (0..grid.rows)
+        let weight = RowSums::along_x(channels, &channels.weight, &wx);
+        let value = RowSums::along_x(channels, &channels.value, &wx[..=degree]);
+        let weight2 = RowSums::along_x(channels, channels.squares(), &qx);
+        let rows: Vec<Vec<NodeFit>> = (0..grid.rows)
             .into_par_iter()
             .map(|j| {
                 let weight = weight.along_y(&wy, most, j);
                 let sums = [weight, value.along_y(&wy, degree, j), weight2.along_y(&qy, 2 * degree, j)];
-                let enough = |i: usize| counts.within(i, j, self.cutoff_mm) >= LEAST_READINGS;
-                (0..grid.columns).map(|i| if enough(i) { node(self.order, &sums, i) } else { None }).collect()
+                let enough = |i: usize| counts.within(i, j, self.cutoff_mm) >= MIN_READINGS;
+                (0..grid.columns).map(|i| if enough(i) { fit_node(self.order, &sums, i) } else { None }).collect()
             })
             .collect();
         gathered(grid, sigma_mm, rows.into_iter().flatten())
@@ -211,11 +211,11 @@ impl Gaussian {
 }
 
 /// Value, slopes per standard deviation, leverage and variance at a node that is supported.
-type Node = Option<[f64; 5]>;
+type NodeFit = Option<[f64; 5]>;
 
-fn gathered(grid: &Grid, sigma_mm: f64, nodes: impl Iterator<Item = Node>) -> Filtered {
+fn gathered(grid: &Grid, sigma_mm: f64, nodes: impl Iterator<Item = NodeFit>) -> FilterResult {
     let count = grid.len();
-    let mut all = Filtered {
+    let mut all = FilterResult {
         grid: *grid,
         values: Vec::with_capacity(count),
         slopes: Vec::with_capacity(count),
@@ -234,7 +234,7 @@ fn gathered(grid: &Grid, sigma_mm: f64, nodes: impl Iterator<Item = Node>) -> Fi
     all
 }
 
-fn node(order: Order, sums: &[Vec<Vec<f64>>; 3], i: usize) -> Node {
+fn fit_node(order: FilterOrder, sums: &[Vec<Vec<f64>>; 3], i: usize) -> NodeFit {
     let at = |sums: &[Vec<f64>]| {
         let mut m = [0.0; MOMENTS];
         sums.iter().zip(&mut m).for_each(|(sum, m)| *m = sum[i]);
@@ -242,15 +242,15 @@ fn node(order: Order, sums: &[Vec<Vec<f64>>; 3], i: usize) -> Node {
     };
     let (weight, value, weight2) = (at(&sums[0]), at(&sums[1]), at(&sums[2]));
     match order {
-        Order::Constant => fit::<1>(&weight, &value, &weight2),
-        Order::Plane => fit::<3>(&weight, &value, &weight2),
-        Order::Quadric => fit::<6>(&weight, &value, &weight2),
+        FilterOrder::Constant => fit::<1>(&weight, &value, &weight2),
+        FilterOrder::Plane => fit::<3>(&weight, &value, &weight2),
+        FilterOrder::Quadric => fit::<6>(&weight, &value, &weight2),
     }
 }
 
 /// Solves the normal equations of a polynomial of P terms about a node; returns `None` if the node is not supported.
-fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> Node {
-    if one_sided(weight) {
+fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> NodeFit {
+    if is_one_sided(weight) {
         return None;
     }
     let gram = |m: &[f64; MOMENTS]| {
@@ -263,25 +263,25 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     let variance = share.dot(&(gram(weight2) * share));
     let slope = |k: usize| if P > 1 { terms[k.min(P - 1)] } else { 0.0 };
     let node = [terms[0], slope(1), slope(2), share[0], variance];
-    (variance <= MOST_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
+    (variance <= MAX_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
 }
 
 /// Returns true if the readings lie on a line, farther to one side than their own spread, or all far away, as around
 /// a hole.
 ///
 /// There a polynomial would extrapolate, or bridge an area without any reading.
-fn one_sided(m: &[f64; MOMENTS]) -> bool {
+fn is_one_sided(m: &[f64; MOMENTS]) -> bool {
     let (mx, my) = (m[1] / m[0], m[2] / m[0]);
     let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
     let spread = cxx + cyy;
     // At the corner of a dense square the squared offset of the mean is 1.8 of the spread; one standard deviation
     // outside a straight edge it is 1.9.
     let inside = cxx * cyy - cxy * cxy > 1e-4 * spread * spread && mx * mx + my * my <= 2.0 * spread;
-    !inside || spread > MOST_SPREAD
+    !inside || spread > MAX_SPREAD
 }
 
 /// Sampled sums on a grid with a border that is as wide as the reach.
-struct Channels {
+struct GridSums {
     columns: usize,
     rows: usize,
     border: [usize; 2],
@@ -291,7 +291,7 @@ struct Channels {
     weight2: Vec<f64>,
 }
 
-impl Channels {
+impl GridSums {
     fn new(grid: &Grid, border: [usize; 2], squares: bool) -> Self {
         let (columns, rows) = (grid.columns + 2 * border[0], grid.rows + 2 * border[1]);
         let empty = || vec![0.0; columns * rows];
@@ -317,38 +317,38 @@ impl Channels {
 }
 
 /// Spreads readings over the nodes around them.
-fn spread_out(
+fn spread_readings(
     places: &[[f64; 2]],
     values: &[f64],
     weights: Option<&[f64]>,
     grid: &Grid,
     border: [usize; 2],
-) -> Channels {
+) -> GridSums {
     // The number of parts depends on the sizes alone, so that the sums are the same on every machine.
     let nodes = (grid.columns + 2 * border[0]) * (grid.rows + 2 * border[1]);
     let parts = if nodes < 4 * places.len() { 4 } else { 1 };
     let size = places.len().div_ceil(parts).max(1);
     let peaks = std::array::from_fn(|n| (-0.5 * (n as f64 / SPREAD).powi(2)).exp() / (SPREAD * (2.0 * PI).sqrt()));
-    let chunks: Vec<Channels> = places
+    let chunks: Vec<GridSums> = places
         .par_chunks(size)
         .enumerate()
         .map(|(part, chunk)| {
-            let mut channels = Channels::new(grid, border, weights.is_some());
+            let mut channels = GridSums::new(grid, border, weights.is_some());
             for (k, place) in chunk.iter().enumerate() {
                 let index = part * size + k;
-                spread_one(&mut channels, grid, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
+                spread_reading(&mut channels, grid, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
             }
             channels
         })
         .collect();
     let mut chunks = chunks.into_iter();
-    let mut all = chunks.next().unwrap_or_else(|| Channels::new(grid, border, weights.is_some()));
+    let mut all = chunks.next().unwrap_or_else(|| GridSums::new(grid, border, weights.is_some()));
     chunks.for_each(|chunk| all.add(&chunk));
     all
 }
 
-fn spread_one(
-    channels: &mut Channels,
+fn spread_reading(
+    channels: &mut GridSums,
     grid: &Grid,
     peaks: &[f64; SPREAD_REACH + 1],
     place: [f64; 2],
@@ -419,13 +419,13 @@ fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<
 }
 
 /// Sums of one channel along x, for each power of x.
-struct Summed {
+struct RowSums {
     columns: usize,
     powers: Vec<Vec<f64>>,
 }
 
-impl Summed {
-    fn along_x(channels: &Channels, channel: &[f64], kernels: &[Vec<f64>]) -> Self {
+impl RowSums {
+    fn along_x(channels: &GridSums, channel: &[f64], kernels: &[Vec<f64>]) -> Self {
         let columns = channels.columns - 2 * channels.border[0];
         let powers = kernels
             .iter()
@@ -463,12 +463,12 @@ impl Summed {
 }
 
 /// Cumulative sums of readings to the left and below, which give the number of readings in any rectangle of nodes.
-struct Counts {
+struct ReadingCounts {
     grid: Grid,
     sums: Vec<u32>,
 }
 
-impl Counts {
+impl ReadingCounts {
     fn new(places: &[[f64; 2]], grid: &Grid) -> Self {
         let columns = grid.columns + 1;
         let mut sums = vec![0u32; columns * (grid.rows + 1)];
@@ -565,7 +565,7 @@ impl Trend {
     }
 }
 
-impl Filtered {
+impl FilterResult {
     fn add_trend(&mut self, trend: &Trend) {
         let supported = &self.supported;
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);

@@ -28,21 +28,21 @@
 use serde::{Deserialize, Serialize};
 
 use super::correction::Correction;
-use super::filter::Order;
+use super::filter::FilterOrder;
 use super::map::{ErrorMap, MapOptions, filter_grid};
-use super::response::{Response, Sense};
+use super::response::{Response, ResponseKind};
 use crate::geometry::Grid;
 
 /// Process noise: variance that one pass adds to that of the estimate of R, over the variance of N.
-const DRIFT: f64 = 0.02;
+const PROCESS_NOISE: f64 = 0.02;
 /// Process noise from one part to the next: another blank, a newly dressed wheel, a machine that has cooled.
-const DRIFT_TO_NEXT_PART: f64 = 0.3;
+const PROCESS_NOISE_TO_NEXT_PART: f64 = 0.3;
 /// Threshold for a change of the machine: number of standard deviations by which the mean square of the innovation
 /// exceeds its expectation. Below it the innovation counts as noise.
 const CHANGED_SIGMAS: f64 = 6.0;
 /// Number of values of the noise that make one independent value: noise is correlated over longer distances than the
 /// shortest waves.
-pub(super) const CORRELATED: f64 = 4.0;
+pub(super) const VALUES_PER_INDEPENDENT_VALUE: f64 = 4.0;
 /// Standard uncertainty of s before any pass has answered.
 const RESPONSE_SIGMA: f64 = 0.1;
 /// Standard uncertainty that another part adds to s.
@@ -87,14 +87,14 @@ pub(super) struct Band {
 
 /// Weighted mean of the observations of R, on the grid of the correction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Mean {
+pub(super) struct MeanError {
     #[serde(rename = "net")]
     pub(super) grid: Grid,
     pub(super) values_mm: Vec<f64>,
 }
 
 /// Error on the grid of a correction.
-pub(super) struct ErrorOnGrid {
+pub(super) struct ResampledError {
     pub(super) grid: Grid,
     pub(super) error_mm: Vec<f64>,
     pub(super) valid: Vec<bool>,
@@ -117,7 +117,7 @@ pub struct LearningState {
     /// Number of passes that this state was learned from.
     passes: u32,
     /// Estimate of R, on the grid of the correction.
-    pub(super) mean: Option<Mean>,
+    pub(super) mean: Option<MeanError>,
     /// Correction of the pass after the last one processed, in millimetres, on the grid of the correction.
     #[serde(skip)]
     pub(super) wanted_mm: Option<Vec<f64>>,
@@ -137,7 +137,7 @@ pub struct Forecast {
 
 /// One measured pass.
 #[derive(Clone, Copy)]
-pub struct Seen<'a> {
+pub struct PassObservation<'a> {
     /// Correction that the pass was ground with.
     pub correction: &'a Correction,
     /// Error that the pass left.
@@ -146,12 +146,12 @@ pub struct Seen<'a> {
     pub response: Option<Response>,
     /// Function that extracts the part of a repeatable error that parameters and slides of the machine explain;
     /// `None` if these are not estimated.
-    pub explained: Option<Smoother<'a>>,
+    pub explained: Option<ParameterExplainer<'a>>,
 }
 
 /// Function of values at the nodes of the correction, in millimetres, that returns the part of them that parameters
 /// and slides of the machine explain, at the same nodes.
-pub type Smoother<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
+pub type ParameterExplainer<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
     /// Creates a state without knowledge of any pass.
@@ -174,7 +174,7 @@ impl LearningState {
         // Its division between several bands is unknown, so in each band it weighs as one of the many values of a
         // pass.
         let stated = |from_mm: f64| match rule {
-            GainRule::Wavelength => (CORRELATED * independent_values(size_mm[0] * size_mm[1], from_mm)).recip(),
+            GainRule::Wavelength => (VALUES_PER_INDEPENDENT_VALUE * independent_values(size_mm[0] * size_mm[1], from_mm)).recip(),
             GainRule::Fixed(_) | GainRule::Adaptive => 1.0,
         };
         let bands = edges.into_iter().map(|from_mm| band(from_mm, 1.0 / count, stated(from_mm)));
@@ -192,18 +192,18 @@ impl LearningState {
     /// Updates the state with the error of a pass; afterwards [`Self::wanted_mm`] returns the next correction.
     ///
     /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
-    pub fn updated(&self, seen: &Seen) -> Self {
+    pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
-        if seen.response.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
+        if seen.response.is_some_and(|answer| !matches!(answer.sense, ResponseKind::AsCommanded | ResponseKind::Unclear)) {
             known.wanted_mm = Some(seen.correction.apparent_mm().into_owned());
             return known;
         }
-        let told = ErrorOnGrid::resampled(seen.error, seen.correction.grid);
-        if let Some(answer) = seen.response.filter(|answer| answer.sense == Sense::AsCommanded) {
-            known.response = combined(self.response, &answer, self.bands[0].independent(&told));
+        let told = ResampledError::resampled(seen.error, seen.correction.grid);
+        if let Some(answer) = seen.response.filter(|answer| answer.sense == ResponseKind::AsCommanded) {
+            known.response = combine_responses(self.response, &answer, self.bands[0].independent(&told));
         }
         let response = known.response[0];
-        let mut mean = Mean::resampled(self.mean.as_ref(), told.grid, response / self.response[0]);
+        let mut mean = MeanError::resampled(self.mean.as_ref(), told.grid, response / self.response[0]);
         let u = seen.correction.apparent_mm();
         let news: Vec<f64> =
             told.error_mm.iter().zip(u.iter()).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
@@ -242,7 +242,7 @@ impl LearningState {
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
-            band.belief = band.belief.map(|belief| belief + DRIFT_TO_NEXT_PART);
+            band.belief = band.belief.map(|belief| belief + PROCESS_NOISE_TO_NEXT_PART);
             band.changed = false;
         }
         known.response[1] = known.response[1].hypot(RESPONSE_SIGMA_OF_NEXT_PART);
@@ -258,7 +258,7 @@ impl LearningState {
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
-        let told = ErrorOnGrid::resampled(error, error.grid);
+        let told = ResampledError::resampled(error, error.grid);
         let noise = self.band_noise_mm2(told.noise_mm2);
         for ((band, values), noise_mm2) in self.bands.iter().zip(self.split_bands(&told, told.error_mm.clone())).zip(noise) {
             let seen2 = told.mean_square(&values);
@@ -324,7 +324,7 @@ impl LearningState {
                 && number(b.share)
                 && (0.0..=1.0).contains(&b.borrowed)
         };
-        let of_mean = |m: &Mean| {
+        let of_mean = |m: &MeanError| {
             m.grid.is_valid() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
         };
         (least..=most).contains(&self.response[0])
@@ -336,7 +336,7 @@ impl LearningState {
     }
 
     /// Splits values on the grid of an error into their parts in each band; the parts add up to the values.
-    pub(super) fn split_bands(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
+    pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
         for longer in &self.bands[1..] {
@@ -363,7 +363,7 @@ impl LearningState {
     }
 }
 
-impl Mean {
+impl MeanError {
     /// Returns the mean times a factor on a grid: unchanged on its own grid, interpolated on another one, 0 if there
     /// is no mean.
     fn resampled(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
@@ -373,7 +373,7 @@ impl Mean {
     }
 }
 
-impl ErrorOnGrid {
+impl ResampledError {
     /// Returns an error on another grid, that of the correction.
     ///
     /// All learned values are on the grid of the correction, so that only the error, which becomes small, is ever
@@ -390,7 +390,7 @@ impl ErrorOnGrid {
 
     /// Returns values without the waves that are shorter than `cutoff_mm`.
     fn low_pass(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
-        match filter_grid(&self.grid, values, &self.valid, cutoff_mm, Order::default(), false) {
+        match filter_grid(&self.grid, values, &self.valid, cutoff_mm, FilterOrder::default(), false) {
             Ok(smooth) => smooth.values,
             // A map too small for this wavelength contains no longer waves.
             Err(_) => vec![0.0; self.grid.len()],
@@ -433,7 +433,7 @@ impl Band {
         }
         self.changed = stands_out && !self.changed;
         self.gain = self.belief.map_or(1.0, |p| p / (1.0 + p));
-        self.belief = Some(self.gain + DRIFT);
+        self.belief = Some(self.gain + PROCESS_NOISE);
         self.borrowed *= 1.0 - self.gain;
     }
 
@@ -448,7 +448,7 @@ impl Band {
     }
 
     /// Returns the number of independent values that a map has in this band.
-    pub(super) fn independent(&self, told: &ErrorOnGrid) -> f64 {
+    pub(super) fn independent(&self, told: &ResampledError) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
         independent_values(area_mm2, self.from_mm)
@@ -458,11 +458,11 @@ impl Band {
 /// Returns the number of independent values on an area for waves longer than `from_mm`: [`CORRELATED`] squares with
 /// sides of twice this wavelength make one.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
-    (area_mm2 / (2.0 * from_mm).powi(2) / CORRELATED).max(1.0)
+    (area_mm2 / (2.0 * from_mm).powi(2) / VALUES_PER_INDEPENDENT_VALUE).max(1.0)
 }
 
 /// Returns the response and its standard uncertainty after a new answer, as a mean weighted by inverse variance.
-fn combined([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
+fn combine_responses([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
     let [least, most] = RESPONSE_LIMITS;
     if !(least..=most).contains(&answer.slope) {
         return [before, sigma];
@@ -508,7 +508,7 @@ mod tests {
     }
 
     fn after(known: &LearningState, correction: &Correction, error: &ErrorMap) -> LearningState {
-        known.updated(&Seen { correction, error, response: None, explained: None })
+        known.updated(&PassObservation { correction, error, response: None, explained: None })
     }
 
     fn rms(values: &[f64]) -> f64 {
@@ -517,13 +517,13 @@ mod tests {
 
     /// Noise that no two passes share: each of up to ten passes has its own wave, with a whole number of periods on
     /// the part.
-    fn scatter(pass: u32, rms_mm: f64) -> Vec<f64> {
+    fn noise_wave(pass: u32, rms_mm: f64) -> Vec<f64> {
         let number = f64::from(pass + 2) * std::f64::consts::TAU / 41.0;
         let at = |[x, _]: [f64; 2]| (number * x + f64::from(pass)).sin();
         (0..GRID.len()).map(|k| at(GRID.place_mm(k)) * rms_mm * 2f64.sqrt()).collect()
     }
 
-    fn of(values_mm: Vec<f64>) -> ErrorMap {
+    fn error_map_of(values_mm: Vec<f64>) -> ErrorMap {
         ErrorMap { values_mm, ..map(|_| 0.0) }
     }
 
@@ -533,8 +533,8 @@ mod tests {
         // machine that may drift.
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=4 {
-            let error = scatter(pass, 0.01).iter().map(|n| n + 1.0).collect();
-            known = after(&known, &none(), &of(error));
+            let error = noise_wave(pass, 0.01).iter().map(|n| n + 1.0).collect();
+            known = after(&known, &none(), &error_map_of(error));
             let [[from_mm, gain]] = known.gains()[..] else { panic!("one band") };
             assert_eq!(from_mm, CUTOFF_MM);
             assert!((gain - 1.0 / f64::from(pass)).abs() < 0.03, "pass {pass}: {gain}");
@@ -545,7 +545,7 @@ mod tests {
     fn where_nothing_stands_out_of_the_scatter_nothing_is_taken_back() {
         // Known noise of 1 um in one band: of 2 um rms Wiener's share is 1 - 1.02 / 4, of 0.5 um it is 0.
         let gain = |rms_mm: f64| after(&begin(GainRule::Adaptive, Some(1e-3)), &none(), &map(|_| rms_mm)).gains()[0][1];
-        assert!((gain(2e-3) - (1.0 - (1.0 + DRIFT) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
+        assert!((gain(2e-3) - (1.0 - (1.0 + PROCESS_NOISE) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
         assert_eq!(gain(0.5e-3), 0.0);
         // Without a second pass only the noise of the points is known: nearly all of it is in the shortest waves, so
         // that these are not compensated.
@@ -585,14 +585,14 @@ mod tests {
     fn a_machine_that_has_changed_is_believed_at_once() {
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=4 {
-            known = after(&known, &none(), &of(scatter(pass, 1e-3)));
+            known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
         }
         let before = known.bands[0].gain;
         let changed = after(&known, &none(), &map(|_| 0.02));
         assert!(before < 0.35 && changed.bands[0].gain > 0.95, "{before} then {}", changed.bands[0].gain);
         assert_eq!(changed.repeatability_mm(), known.repeatability_mm(), "a change is no scatter");
         let next_part = known.for_next_part();
-        let first = after(&next_part, &none(), &of(scatter(5, 1e-3)));
+        let first = after(&next_part, &none(), &error_map_of(noise_wave(5, 1e-3)));
         assert!(first.bands[0].gain > before, "another part is believed more than another pass");
     }
 
@@ -620,15 +620,15 @@ mod tests {
     fn a_response_below_one_is_made_up_for() {
         let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
         let answer =
-            Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: Sense::AsCommanded };
-        let known = known.updated(&Seen { correction: &none(), error: &form, response: Some(answer), explained: None });
+            Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: ResponseKind::AsCommanded };
+        let known = known.updated(&PassObservation { correction: &none(), error: &form, response: Some(answer), explained: None });
         assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
         for (u, e) in known.next_correction_mm().unwrap().iter().zip(&form.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
         }
         // Four times the commanded change is no answer to it.
         let wild = Response { slope: 4.0, ..answer };
-        let known = begin(GainRule::Adaptive, None).updated(&Seen {
+        let known = begin(GainRule::Adaptive, None).updated(&PassObservation {
             correction: &none(),
             error: &form,
             response: Some(wild),
@@ -643,10 +643,10 @@ mod tests {
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
         let asked = none().compensating(&first, None);
         for sense in
-            [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned, Sense::Doubled]
+            [ResponseKind::NoEffect, ResponseKind::Flipped, ResponseKind::MirroredX, ResponseKind::MirroredY, ResponseKind::Turned, ResponseKind::Doubled]
         {
             let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
-            let twice = first.updated(&Seen { correction: &asked, error: &form, response: Some(answer), explained: None });
+            let twice = first.updated(&PassObservation { correction: &asked, error: &form, response: Some(answer), explained: None });
             assert_eq!((twice.next_correction_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
             assert_eq!(twice.repeatability_mm(), None);
         }
@@ -679,9 +679,9 @@ mod tests {
                 correlation: 1.0,
                 asked_mm: 1.0,
                 unexplained_mm: 0.0,
-                sense: Sense::AsCommanded,
+                sense: ResponseKind::AsCommanded,
             });
-            known = known.updated(&Seen { correction: &correction, error: &error, response: answer, explained: None });
+            known = known.updated(&PassObservation { correction: &correction, error: &error, response: answer, explained: None });
             correction = correction.compensating(&known, None);
         }
         for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.5525, 0.634]) {
@@ -693,7 +693,7 @@ mod tests {
     fn a_scatter_that_was_stated_too_small_is_found_out() {
         let mut known = begin(GainRule::Adaptive, Some(1e-4));
         for pass in 1..=5 {
-            known = after(&known, &none(), &of(scatter(pass, 1e-3)));
+            known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
         }
         let told = known.repeatability_mm().unwrap();
         assert!((0.6e-3..1.5e-3).contains(&told), "{told}");
@@ -705,14 +705,14 @@ mod tests {
         let known = begin(GainRule::Wavelength, None);
         assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
-        let parts = known.split_bands(&ErrorOnGrid::resampled(&error, GRID), error.values_mm.clone());
+        let parts = known.split_bands(&ResampledError::resampled(&error, GRID), error.values_mm.clone());
         for (k, value) in error.values_mm.iter().enumerate() {
             assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
         }
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split_bands(&ErrorOnGrid::resampled(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+            rms(&known.split_bands(&ResampledError::resampled(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -726,8 +726,8 @@ mod tests {
             let mut point = vec![0.0; GRID.len()];
             point[node] = 1.0;
             let smooth =
-                filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, Order::default(), false).unwrap();
-            let told = ErrorOnGrid::resampled(&of(smooth.values.clone()), GRID);
+                filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, FilterOrder::default(), false).unwrap();
+            let told = ResampledError::resampled(&error_map_of(smooth.values.clone()), GRID);
             let power = |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>();
             let parts = known.split_bands(&told, smooth.values.clone());
             [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth.values)]
@@ -770,10 +770,10 @@ mod tests {
     fn no_pass_goes_below_its_scallops_and_they_count_once() {
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=3 {
-            known = after(&known, &none(), &of(scatter(pass, 1e-3)));
+            known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
         }
         let found = |rest_mm: f64, scallops_mm: f64| {
-            let error = ErrorMap { residual_sigma_mm: rest_mm, ..of(scatter(4, 1e-3)) };
+            let error = ErrorMap { residual_sigma_mm: rest_mm, ..error_map_of(noise_wave(4, 1e-3)) };
             let Forecast { rms_mm, floor_mm, .. } = known.forecast(&error, scallops_mm);
             [rms_mm, floor_mm.unwrap()]
         };

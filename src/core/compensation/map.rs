@@ -7,16 +7,16 @@
 use serde::{Deserialize, Serialize};
 
 use super::MapError;
-use super::filter::{Filtered, Gaussian, MOST_WORKED, Order};
-use super::kept::Kept;
-use super::level::{Levelled, level_off};
-use super::robust::{Far, Residuals, Robust, residuals, robust};
-use super::sampling::{check_cutoff, point_spacings_mm};
-use super::spline::{Roughness, spline};
-use crate::geometry::{Grid, Sample};
+use super::filter::{FilterResult, GaussianFilter, MAX_FILTER_NODES, FilterOrder};
+use super::inliers::InlierReadings;
+use super::level_off::{Levelled, level_off};
+use super::robust_filter::{FarReadings, Residuals, RobustResult, residuals, filter_robust};
+use super::cutoff_limits::{check_cutoff, point_spacings_mm};
+use super::spline::{SplineSmoothness, fit_spline};
+use crate::geometry::{Grid, DeviationSample};
 
 /// Minimum cut-off of the surface that readings are compared with, in distances between readings.
-const WIDE: f64 = 4.0;
+const MIN_REFERENCE_CUTOFF_SPACINGS: f64 = 4.0;
 
 /// Filter that smooths the deviations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,9 +48,9 @@ pub struct MapOptions {
     /// Filter that smooths the deviations.
     pub smoothing: Smoothing,
     /// Order of the polynomial that the Gaussian filters pass unchanged.
-    pub order: Order,
+    pub order: FilterOrder,
     /// Choice of the spline's smoothness.
-    pub spline_smoothness: Roughness,
+    pub spline_smoothness: SplineSmoothness,
     /// Number of standard deviations beyond which a reading is an outlier; `None` keeps all readings.
     pub outlier_limit: Option<f64>,
 }
@@ -65,8 +65,8 @@ impl MapOptions {
             level_off_mm: 0.0,
             contact_width_mm: 0.0,
             smoothing: Smoothing::default(),
-            order: Order::default(),
-            spline_smoothness: Roughness::default(),
+            order: FilterOrder::default(),
+            spline_smoothness: SplineSmoothness::default(),
             outlier_limit: Some(5.0),
         }
     }
@@ -111,26 +111,26 @@ pub struct ErrorMap {
 ///
 /// # Errors
 /// Deviations that are not finite, too few of them for the cut-off, options out of range, and an invalid grid.
-pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, MapError> {
+pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
     let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm)?;
-    let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
-    let worked = worked_grid(&grid, &gaussian)?;
+    let gaussian = GaussianFilter { cutoff_mm: options.cutoff_mm, order: options.order };
+    let worked = refined_grid(&grid, &gaussian)?;
     let apart_mm = point_spacings_mm(readings);
-    let wide = Gaussian { cutoff_mm: options.cutoff_mm.max(WIDE * apart_mm[0].max(apart_mm[1])), ..gaussian };
-    let wide = Wide { gaussian: wide, grid: worked_grid(&grid, &wide)?, is_map_filter: wide == gaussian };
-    let mut kept = Kept::from_all(readings);
+    let wide = GaussianFilter { cutoff_mm: options.cutoff_mm.max(MIN_REFERENCE_CUTOFF_SPACINGS * apart_mm[0].max(apart_mm[1])), ..gaussian };
+    let wide = ReferenceFilter { gaussian: wide, grid: refined_grid(&grid, &wide)?, is_map_filter: wide == gaussian };
+    let mut kept = InlierReadings::from_all(readings);
     let (mut outliers, mut features, mut found, mut advice) = (Vec::new(), Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
         let all = wide.robust(&kept);
-        let far = all.far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
+        let far = all.find_far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
             advice.push(
                 "more than 10 % of the points stand out, so none is rejected; clean the part and the probe".to_owned(),
             );
-            Far::default()
+            FarReadings::default()
         });
         outliers = far.outliers;
-        kept = Kept::without_outliers(readings, &outliers);
+        kept = InlierReadings::without_outliers(readings, &outliers);
         let before = |k: usize| outliers.partition_point(|outlier| *outlier < k);
         features = far.features.into_iter().map(|k| (k - before(k), all.residuals[k])).collect();
         found = Some(all).filter(|_| outliers.is_empty());
@@ -142,10 +142,10 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     } else {
         let mut filtered = gaussian.filter_scattered(&kept.places, &kept.values, None, &worked);
         let point_sigma = wide.point_sigma(&kept, &filtered);
-        hold_features(&mut filtered, &gaussian, &kept, &features);
+        preserve_features(&mut filtered, &gaussian, &kept, &features);
         (filtered, point_sigma)
     };
-    let smooth = Smooth::from_filtered(&filtered, &grid, point_sigma);
+    let smooth = UnlevelledMap::from_filtered(&filtered, &grid, point_sigma);
     let count = smooth.valid.iter().filter(|v| **v).count();
     if count * 4 < grid.len() {
         return Err(MapError::TooSparse { valid: count, nodes: grid.len(), cutoff_mm: options.cutoff_mm });
@@ -163,7 +163,7 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
 ///
 /// `features` holds indices of readings, with their heights over the surface around. A chip that covers two targets
 /// is narrower than the filter.
-fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
+fn preserve_features(filtered: &mut FilterResult, gaussian: &GaussianFilter, kept: &InlierReadings, features: &[(usize, f64)]) {
     /// Maximum number of repetitions: enough for a feature of which an eighth passes at a time. Where readings are
     /// denser, less of it remains.
     const MAX_ROUNDS: usize = 8;
@@ -198,10 +198,10 @@ fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, feat
 ///
 /// # Errors
 /// Those of [`error_map`].
-pub fn told_map(told: &[(Sample, f64)], options: &MapOptions, scatter_mm: f64) -> Result<ErrorMap, MapError> {
+pub fn map_from_model(told: &[(DeviationSample, f64)], options: &MapOptions, scatter_mm: f64) -> Result<ErrorMap, MapError> {
     let options = MapOptions { outlier_limit: None, ..*options };
-    let form: Vec<Sample> = told.iter().map(|(sample, _)| *sample).collect();
-    let sigma = |(sample, sigma_mm): &(Sample, f64)| Sample { deviation_mm: *sigma_mm, ..*sample };
+    let form: Vec<DeviationSample> = told.iter().map(|(sample, _)| *sample).collect();
+    let sigma = |(sample, sigma_mm): &(DeviationSample, f64)| DeviationSample { deviation_mm: *sigma_mm, ..*sample };
     let (map, sigma) = (error_map(&form, &options)?, error_map(&told.iter().map(sigma).collect::<Vec<_>>(), &options)?);
     // A polynomial fitted to the uncertainties can exceed their range between two places.
     let [least, most] = told.iter().fold([f64::INFINITY, 0.0], |[a, b], (_, of)| [a.min(*of), b.max(*of)]);
@@ -212,20 +212,20 @@ pub fn told_map(told: &[(Sample, f64)], options: &MapOptions, scatter_mm: f64) -
 
 /// Filter of the surface that readings are compared with; its cut-off is at least four distances between them. With a
 /// shorter one a reading is compared mostly with itself.
-struct Wide {
-    gaussian: Gaussian,
+struct ReferenceFilter {
+    gaussian: GaussianFilter,
     grid: Grid,
     /// True if it is the filter of the map.
     is_map_filter: bool,
 }
 
-impl Wide {
-    fn robust(&self, kept: &Kept) -> Robust {
-        robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
+impl ReferenceFilter {
+    fn robust(&self, kept: &InlierReadings) -> RobustResult {
+        filter_robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
     /// Returns the standard deviation of one reading; `filtered` is the result of the map's own filter.
-    fn point_sigma(&self, kept: &Kept, filtered: &Filtered) -> f64 {
+    fn point_sigma(&self, kept: &InlierReadings, filtered: &FilterResult) -> f64 {
         if self.is_map_filter {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
         }
@@ -235,7 +235,7 @@ impl Wide {
 }
 
 /// Returns the typical number of readings per square millimetre, from their leverages.
-fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
+fn density(filtered: &FilterResult, gaussian: &GaussianFilter) -> f64 {
     let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
     let middle = shares.len() / 2;
@@ -243,7 +243,7 @@ fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
     gaussian.open_leverage() / median
 }
 
-fn check(readings: &[Sample], options: &MapOptions) -> Result<(), MapError> {
+fn check(readings: &[DeviationSample], options: &MapOptions) -> Result<(), MapError> {
     let MapOptions { cutoff_mm, level_off_mm, contact_width_mm, outlier_limit, .. } = *options;
     if !(cutoff_mm > 0.0 && cutoff_mm.is_finite()) {
         return Err(MapError::Cutoff { cutoff_mm });
@@ -268,11 +268,11 @@ fn check(readings: &[Sample], options: &MapOptions) -> Result<(), MapError> {
 
 /// Returns the grid that the filter works on: the nodes of the map, and as many nodes between them as the weights
 /// need.
-fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
+fn refined_grid(grid: &Grid, gaussian: &GaussianFilter) -> Result<Grid, MapError> {
     let division = gaussian.division(grid);
     let finer = |k: usize| (grid.counts()[k] - 1) as f64 * division[k] as f64 + 1.0;
     let nodes = finer(0) * finer(1);
-    if nodes > MOST_WORKED {
+    if nodes > MAX_FILTER_NODES {
         let [width_mm, depth_mm] = [0, 1].map(|k| (grid.counts()[k] - 1) as f64 * grid.spacing_mm[k]);
         return Err(MapError::CutoffTooShort { cutoff_mm: gaussian.cutoff_mm, width_mm, depth_mm, nodes });
     }
@@ -281,7 +281,7 @@ fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
 }
 
 /// Result at the nodes of a map, before it levels off.
-struct Smooth {
+struct UnlevelledMap {
     values: Vec<f64>,
     slopes: Vec<[f64; 2]>,
     sigma: Vec<f64>,
@@ -289,9 +289,9 @@ struct Smooth {
     point_sigma: f64,
 }
 
-impl Smooth {
+impl UnlevelledMap {
     /// Selects the nodes of the map from those that the filter worked on.
-    fn from_filtered(filtered: &Filtered, grid: &Grid, point_sigma: f64) -> Self {
+    fn from_filtered(filtered: &FilterResult, grid: &Grid, point_sigma: f64) -> Self {
         let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
         let (across, along) = (step(filtered.grid.columns, grid.columns), step(filtered.grid.rows, grid.rows));
         let node = |k: usize| (k / grid.columns) * along * filtered.grid.columns + (k % grid.columns) * across;
@@ -306,8 +306,8 @@ impl Smooth {
     }
 
     /// Replaces the surface of the filter by that of the spline; `valid` stays unchanged.
-    fn with_spline(self, grid: &Grid, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
-        let fitted = spline(kept, grid, density, options.cutoff_mm, options.spline_smoothness)?;
+    fn with_spline(self, grid: &Grid, kept: &InlierReadings, density: f64, options: &MapOptions) -> Result<Self, MapError> {
+        let fitted = fit_spline(kept, grid, density, options.cutoff_mm, options.spline_smoothness)?;
         Ok(Self {
             values: fitted.values,
             slopes: fitted.slopes,
@@ -317,7 +317,7 @@ impl Smooth {
         })
     }
 
-    fn into_map(self, grid: Grid, kept: &Kept, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
+    fn into_map(self, grid: Grid, kept: &InlierReadings, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
         let Levelled { values, sources } = level_off(&grid, self.values, &self.slopes, &self.valid, level_off_mm);
         let rest2: f64 =
             kept.places.iter().zip(&kept.values).map(|(p, v)| (v - grid.interpolate(&values, *p)).powi(2)).sum();
@@ -402,7 +402,7 @@ pub fn filter_grid(
     values: &[f64],
     valid: &[bool],
     cutoff_mm: f64,
-    order: Order,
+    order: FilterOrder,
     robust_form: bool,
 ) -> Result<FilteredGrid, MapError> {
     if values.len() != grid.len() || valid.len() != grid.len() {
@@ -414,10 +414,10 @@ pub fn filter_grid(
     if let Some(index) = (0..grid.len()).find(|&k| valid[k] && !values[k].is_finite()) {
         return Err(MapError::NotFinite { index });
     }
-    let gaussian = Gaussian { cutoff_mm, order };
+    let gaussian = GaussianFilter { cutoff_mm, order };
     let mask: Vec<f64> = valid.iter().map(|v| f64::from(u8::from(*v))).collect();
     let plain = gaussian.filter_nodes(values, &mask, grid);
-    let (filtered, rounds) = if robust_form { robust_grid(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
+    let (filtered, rounds) = if robust_form { filter_robustly(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
     let count = filtered.supported.iter().filter(|s| **s).count();
     if count == 0 {
         return Err(MapError::TooSparse { valid: 0, nodes: grid.len(), cutoff_mm });
@@ -426,14 +426,14 @@ pub fn filter_grid(
     Ok(FilteredGrid { values: levelled.values, valid: filtered.supported, rounds })
 }
 
-fn robust_grid(gaussian: &Gaussian, plain: Filtered, values: &[f64], mask: &[f64], grid: &Grid) -> (Filtered, usize) {
+fn filter_robustly(gaussian: &GaussianFilter, plain: FilterResult, values: &[f64], mask: &[f64], grid: &Grid) -> (FilterResult, usize) {
     let masked = |weights: &[f64]| weights.iter().zip(mask).map(|(w, m)| w * m).collect::<Vec<f64>>();
     let again = |weights: &[f64]| gaussian.filter_nodes(values, &masked(weights), grid);
-    let compare = |filtered: &Filtered, _: Option<&[f64]>| {
+    let compare = |filtered: &FilterResult, _: Option<&[f64]>| {
         let known = |k: usize| mask[k] > 0.0 && filtered.supported[k];
         let plain = (0..grid.len()).map(|k| if known(k) { values[k] - filtered.values[k] } else { f64::NAN }).collect();
         Residuals { values: plain, freedom: vec![1.0; grid.len()] }
     };
-    let found = super::robust::iterate(plain, grid.len(), again, compare);
+    let found = super::robust_filter::iterate(plain, grid.len(), again, compare);
     (found.filtered, found.rounds)
 }

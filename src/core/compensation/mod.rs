@@ -15,30 +15,30 @@
 mod correction;
 mod error;
 mod filter;
-mod kept;
+mod inliers;
 mod learning;
-mod level;
+mod level_off;
 mod map;
 mod next_pass;
 mod parameters;
 pub mod path;
 mod response;
-mod robust;
-mod sampling;
-mod shared;
+mod robust_filter;
+mod cutoff_limits;
+mod machine_transfer;
 mod spline;
 
 pub use correction::Correction;
 pub use error::MapError;
-pub use filter::Order;
-pub use learning::{Forecast, GainRule, LearningState, Seen, Smoother};
-pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, told_map};
+pub use filter::FilterOrder;
+pub use learning::{Forecast, GainRule, LearningState, PassObservation, ParameterExplainer};
+pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, map_from_model};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{
-    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, Set, Smooth, WheelTerm,
-    parameters, smooth_of,
+    SurfacePoint, EstimatedParameter, ParameterError, ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, ExplainedDeviation, WheelTerm,
+    estimate_parameters, explained_by_parameters,
 };
-pub use response::{Response, Sense, response};
-pub use sampling::{contact_width_mm, point_spacing_mm};
-pub use shared::{Alike, Shared};
-pub use spline::{Roughness, SplineError};
+pub use response::{Response, ResponseKind, estimate_response};
+pub use cutoff_limits::{contact_width_mm, point_spacing_mm};
+pub use machine_transfer::{MachineSimilarity, TransferredState};
+pub use spline::{SplineSmoothness, SplineError};

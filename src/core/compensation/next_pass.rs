@@ -5,7 +5,7 @@ use thiserror::Error;
 use super::correction::Correction;
 use super::learning::LearningState;
 use super::map::ErrorMap;
-use super::parameters::Set;
+use super::parameters::ParameterCorrections;
 
 /// Limits of a correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,7 +73,7 @@ impl Correction {
     /// limits.
     ///
     /// The map leaves out the part that the parameters in `set` compensate.
-    pub fn compensating(&self, known: &LearningState, set: Option<&Set>) -> Self {
+    pub fn compensating(&self, known: &LearningState, set: Option<&ParameterCorrections>) -> Self {
         let seen_mm = self.apparent_mm();
         let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
         if let Some(set) = set {
@@ -119,7 +119,7 @@ impl Correction {
         &self,
         error: &ErrorMap,
         known: &LearningState,
-        set: Option<&Set>,
+        set: Option<&ParameterCorrections>,
         limits: &CorrectionLimits,
     ) -> Result<NextPass, NextPassError> {
         let changed = self.compensating(known, set);
@@ -161,7 +161,7 @@ fn normal_tail(z: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::{GainRule, MapOptions, Seen};
+    use crate::compensation::{GainRule, MapOptions, PassObservation};
     use crate::geometry::Grid;
 
     const LIMITS: CorrectionLimits = CorrectionLimits {
@@ -185,7 +185,7 @@ mod tests {
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<NextPass, NextPassError> {
         let options = MapOptions::new(1.0, 1.0);
         let known = LearningState::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
-        correction.next_pass(error, &known.updated(&Seen { correction, error, response: None, explained: None }), None, &LIMITS)
+        correction.next_pass(error, &known.updated(&PassObservation { correction, error, response: None, explained: None }), None, &LIMITS)
     }
 
     #[test]

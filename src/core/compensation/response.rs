@@ -18,7 +18,7 @@ use crate::geometry::{Point, Vector};
 /// Kind of the part's response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Sense {
+pub enum ResponseKind {
     /// As commanded.
     AsCommanded,
     /// With the opposite sign.
@@ -49,7 +49,7 @@ pub struct Response {
     /// Root mean square of the measured change that the commanded one does not explain, in millimetres.
     pub unexplained_mm: f64,
     /// Classification of the response.
-    pub sense: Sense,
+    pub sense: ResponseKind,
 }
 
 /// Share of the unexplained variance of the straight map; a mirrored or turned map must leave less than this.
@@ -65,7 +65,7 @@ const TWICE: f64 = 1.6;
 /// surface with their unit normals, in any order, where both maps were measured. `scatter_mm` is the standard
 /// deviation by which the error changes without any command: the repeatability of grinding and measuring together.
 /// Frames: the model frame.
-pub fn response(
+pub fn estimate_response(
     errors: [&ErrorMap; 2],
     corrections: [&Correction; 2],
     places: &[(Point, Vector)],
@@ -73,7 +73,7 @@ pub fn response(
 ) -> Response {
     let [before, after] = errors;
     let grid = after.grid;
-    let unseen = Motions::new(places);
+    let unseen = MotionProjector::new(places);
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
     // Parameters move the surface as a map does, and the part responds to them in the same way.
@@ -91,24 +91,24 @@ pub fn response(
     };
     let straight = fit(|place, _| place);
     let mirrored = [
-        (Sense::MirroredX, fit(|[x, y], [cx, _]| [cx - x, y])),
-        (Sense::MirroredY, fit(|[x, y], [_, cy]| [x, cy - y])),
-        (Sense::Turned, fit(|[x, y], [cx, cy]| [cx - x, cy - y])),
-        (Sense::Turned, fit(|[x, y], [cx, cy]| [(cx - cy) / 2.0 + y, (cx + cy) / 2.0 - x])),
-        (Sense::Turned, fit(|[x, y], [cx, cy]| [(cx + cy) / 2.0 - y, (cy - cx) / 2.0 + x])),
+        (ResponseKind::MirroredX, fit(|[x, y], [cx, _]| [cx - x, y])),
+        (ResponseKind::MirroredY, fit(|[x, y], [_, cy]| [x, cy - y])),
+        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [cx - x, cy - y])),
+        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [(cx - cy) / 2.0 + y, (cx + cy) / 2.0 - x])),
+        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [(cx + cy) / 2.0 - y, (cy - cx) / 2.0 + x])),
     ];
     Response {
         slope: straight.slope,
         correlation: straight.correlation,
         asked_mm: straight.commanded_rms,
         unexplained_mm: straight.unexplained_rms,
-        sense: sense(&straight, &mirrored, scatter_mm),
+        sense: classify(&straight, &mirrored, scatter_mm),
     }
 }
 
-fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
+fn classify(straight: &Regression, mirrored: &[(ResponseKind, Regression)], scatter_mm: f64) -> ResponseKind {
     if straight.commanded_rms < 2.0 * scatter_mm || straight.commanded_rms == 0.0 {
-        return Sense::Unclear;
+        return ResponseKind::Unclear;
     }
     let best = mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("five ways are tried");
     let left = [straight, &best.1].map(|fit| 1.0 - fit.correlation * fit.correlation.abs());
@@ -117,31 +117,31 @@ fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
         return best.0;
     }
     if straight.slope > TWICE && straight.correlation > 0.5 {
-        return Sense::Doubled;
+        return ResponseKind::Doubled;
     }
     if straight.slope > 0.4 && straight.correlation > 0.5 {
-        return Sense::AsCommanded;
+        return ResponseKind::AsCommanded;
     }
     if straight.slope < -0.4 && straight.correlation < -0.5 {
-        return Sense::Flipped;
+        return ResponseKind::Flipped;
     }
-    if straight.slope.abs() < 0.4 { Sense::NoEffect } else { Sense::Unclear }
+    if straight.slope.abs() < 0.4 { ResponseKind::NoEffect } else { ResponseKind::Unclear }
 }
 
 /// Regression through the origin.
-struct Fit {
+struct Regression {
     slope: f64,
     correlation: f64,
     commanded_rms: f64,
     unexplained_rms: f64,
 }
 
-fn regress(asked: &[f64], answer: &[f64]) -> Fit {
+fn regress(asked: &[f64], answer: &[f64]) -> Regression {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
     let (aa, ab, bb) = (dot(asked, asked), dot(asked, answer), dot(answer, answer));
     let or_zero = |v: f64| if v.is_finite() { v } else { 0.0 };
     let (count, slope) = (asked.len().max(1) as f64, or_zero(ab / aa));
-    Fit {
+    Regression {
         slope,
         correlation: or_zero(ab / (aa * bb).sqrt()),
         commanded_rms: (aa / count).sqrt(),
@@ -150,14 +150,14 @@ fn regress(asked: &[f64], answer: &[f64]) -> Fit {
 }
 
 /// Changes by motions of the part: they span all changes that registration removes from a map.
-struct Motions {
+struct MotionProjector {
     /// Change by each of the six motions at each place, with lengths in units of the part's size.
     rows: Vec<Vector6<f64>>,
     /// Pseudo-inverse of their sum of squares; on a flat part some motions change nothing.
     inverse: Matrix6<f64>,
 }
 
-impl Motions {
+impl MotionProjector {
     fn new(places: &[(Point, Vector)]) -> Self {
         let size = places.iter().map(|(p, _)| p.coords.norm()).fold(f64::MIN_POSITIVE, f64::max);
         let row = |(p, n): &(Point, Vector)| {
@@ -205,7 +205,7 @@ mod tests {
         let before = map(error);
         let none = Correction::zero(GRID, 0.0);
         let asked = Correction { values_mm: before.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
-        response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
+        estimate_response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
     }
 
     /// Returns the nodes of the grid on a flat part.
@@ -215,24 +215,24 @@ mod tests {
 
     #[test]
     fn every_way_to_answer_is_told() {
-        assert_eq!(answered(|x, y| -error(x, y)).sense, Sense::AsCommanded);
-        assert_eq!(answered(|x, y| -0.8 * error(x, y)).sense, Sense::AsCommanded);
-        assert_eq!(answered(error).sense, Sense::Flipped);
-        assert_eq!(answered(|x, y| -error(-x, y)).sense, Sense::MirroredX);
-        assert_eq!(answered(|x, y| -error(x, -y)).sense, Sense::MirroredY);
-        assert_eq!(answered(|x, y| -error(-x, -y)).sense, Sense::Turned);
-        assert_eq!(answered(|x, y| -error(y, -x)).sense, Sense::Turned);
-        assert_eq!(answered(|x, y| -error(-y, x)).sense, Sense::Turned);
-        assert_eq!(answered(|x, y| -2.0 * error(x, y)).sense, Sense::Doubled);
-        assert_eq!(answered(|x, y| -1.2 * error(x, y)).sense, Sense::AsCommanded);
-        assert_eq!(answered(|_, _| 0.0).sense, Sense::NoEffect);
+        assert_eq!(answered(|x, y| -error(x, y)).sense, ResponseKind::AsCommanded);
+        assert_eq!(answered(|x, y| -0.8 * error(x, y)).sense, ResponseKind::AsCommanded);
+        assert_eq!(answered(error).sense, ResponseKind::Flipped);
+        assert_eq!(answered(|x, y| -error(-x, y)).sense, ResponseKind::MirroredX);
+        assert_eq!(answered(|x, y| -error(x, -y)).sense, ResponseKind::MirroredY);
+        assert_eq!(answered(|x, y| -error(-x, -y)).sense, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -error(y, -x)).sense, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -error(-y, x)).sense, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -2.0 * error(x, y)).sense, ResponseKind::Doubled);
+        assert_eq!(answered(|x, y| -1.2 * error(x, y)).sense, ResponseKind::AsCommanded);
+        assert_eq!(answered(|_, _| 0.0).sense, ResponseKind::NoEffect);
     }
 
     #[test]
     fn a_change_within_the_scatter_tells_nothing() {
         let flat = map(|_, _| 1e-5);
         let none = Correction::zero(GRID, 0.0);
-        assert_eq!(response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, Sense::Unclear);
-        assert_eq!(response([&flat, &flat], [&none, &none], &places(), 0.0).sense, Sense::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, ResponseKind::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 0.0).sense, ResponseKind::Unclear);
     }
 }

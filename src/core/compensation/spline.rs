@@ -26,14 +26,14 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::filter::Trend;
-use super::kept::Kept;
+use super::inliers::InlierReadings;
 use crate::geometry::Grid;
-use crate::sparse::{Pattern, SelectedInverse};
+use crate::sparse::{SparsityPattern, SelectedInverse};
 
 /// Number of knots per cut-off: with five the splines alone pass waves at the cut-off to 0.2 %.
 const KNOTS: f64 = 5.0;
 /// Maximum number of coefficients; a factor of this size takes some 2 GB.
-const MOST_COEFFICIENTS: f64 = 2e5;
+const MAX_COEFFICIENTS: f64 = 2e5;
 /// Step of ln mu for the derivative of the inverse.
 const STEP: f64 = 0.02;
 /// Share of the largest diagonal entry that is added to all of them: far outside the readings nothing else determines
@@ -44,7 +44,7 @@ const RIDGE: f64 = 1e-13;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
-pub enum Roughness {
+pub enum SplineSmoothness {
     /// Half of the amplitude of a wave at the cut-off passes.
     #[default]
     Cutoff,
@@ -69,7 +69,7 @@ pub enum SplineError {
 
 /// Smoothing surface at the nodes of a grid.
 #[derive(Clone, Debug)]
-pub(super) struct Fitted {
+pub(super) struct SplineResult {
     pub values: Vec<f64>,
     pub slopes: Vec<[f64; 2]>,
     /// Standard uncertainty at every node.
@@ -84,24 +84,24 @@ pub(super) struct Fitted {
 /// Fits a smoothing surface to readings over a grid.
 ///
 /// `density` is the number of readings per square millimetre.
-pub(super) fn spline(
-    kept: &Kept,
+pub(super) fn fit_spline(
+    kept: &InlierReadings,
     grid: &Grid,
     density: f64,
     cutoff_mm: f64,
-    roughness: Roughness,
-) -> Result<Fitted, SplineError> {
+    roughness: SplineSmoothness,
+) -> Result<SplineResult, SplineError> {
     let points = kept.values.len();
     let undetermined = || SplineError::NotDetermined { points };
-    let axes = axes(grid, cutoff_mm)?;
+    let axes = spline_axes(grid, cutoff_mm)?;
     let trend = Trend::fit(&kept.places, &kept.values, 1);
     let rest: Vec<f64> = kept.places.iter().zip(&kept.values).map(|(p, v)| v - trend.at(*p)).collect();
-    let system = System::new(axes, &kept.places, &rest).ok_or_else(undetermined)?;
+    let system = NormalEquations::new(axes, &kept.places, &rest).ok_or_else(undetermined)?;
     let mu_of = |cutoff_mm: f64| density * (cutoff_mm / TAU).powi(4);
     let size_mm = (0..2).map(|k| system.axes[k].length()).fold(cutoff_mm, f64::max);
     let mu = match roughness {
-        Roughness::Cutoff => mu_of(cutoff_mm),
-        Roughness::CrossValidation => {
+        SplineSmoothness::Cutoff => mu_of(cutoff_mm),
+        SplineSmoothness::CrossValidation => {
             system.cross_validated(mu_of(cutoff_mm), mu_of(size_mm)).ok_or_else(undetermined)?
         }
     };
@@ -111,20 +111,20 @@ pub(super) fn spline(
     Ok(fitted)
 }
 
-fn axes(grid: &Grid, cutoff_mm: f64) -> Result<[Axis; 2], SplineError> {
+fn spline_axes(grid: &Grid, cutoff_mm: f64) -> Result<[SplineAxis; 2], SplineError> {
     let length = |k: usize| grid.counts()[k].saturating_sub(1).max(1) as f64 * grid.spacing_mm[k];
     let cells = |k: usize| (KNOTS * length(k) / cutoff_mm).ceil().max(4.0);
     let coefficients = (cells(0) + 3.0) * (cells(1) + 3.0);
-    if coefficients > MOST_COEFFICIENTS {
+    if coefficients > MAX_COEFFICIENTS {
         let [width_mm, depth_mm] = [length(0), length(1)];
         return Err(SplineError::TooFine { cutoff_mm, width_mm, depth_mm, coefficients });
     }
-    Ok([0, 1].map(|k| Axis { first: grid.first_mm[k], step: length(k) / cells(k), cells: cells(k) as usize }))
+    Ok([0, 1].map(|k| SplineAxis { first: grid.first_mm[k], step: length(k) / cells(k), cells: cells(k) as usize }))
 }
 
 /// Uniform cubic B-splines along one axis.
 #[derive(Clone, Copy, Debug)]
-struct Axis {
+struct SplineAxis {
     first: f64,
     step: f64,
     cells: usize,
@@ -145,7 +145,7 @@ fn basis(derivative: usize, u: f64) -> [f64; 4] {
     }
 }
 
-impl Axis {
+impl SplineAxis {
     fn count(&self) -> usize {
         self.cells + 3
     }
@@ -196,8 +196,8 @@ fn later(di: isize, dj: isize) -> usize {
 }
 
 /// Normal equations, with the bending separate and not yet weighted.
-struct System<'a> {
-    axes: [Axis; 2],
+struct NormalEquations<'a> {
+    axes: [SplineAxis; 2],
     places: &'a [[f64; 2]],
     values: &'a [f64],
     /// B^T B, [`LATER`] entries to a coefficient.
@@ -207,14 +207,14 @@ struct System<'a> {
     right: Vec<f64>,
     /// Coefficients and their existing later neighbours, in the order of the pattern.
     entries: Vec<(u32, u8)>,
-    pattern: Pattern,
+    pattern: SparsityPattern,
 }
 
-impl<'a> System<'a> {
-    fn new(axes: [Axis; 2], places: &'a [[f64; 2]], values: &'a [f64]) -> Option<Self> {
+impl<'a> NormalEquations<'a> {
+    fn new(axes: [SplineAxis; 2], places: &'a [[f64; 2]], values: &'a [f64]) -> Option<Self> {
         let [nx, ny] = [axes[0].count(), axes[1].count()];
         let (entries, begins, rows) = neighbours(nx, ny);
-        let pattern = Pattern::new(nx * ny, begins, rows)?;
+        let pattern = SparsityPattern::new(nx * ny, begins, rows)?;
         let mut system = Self {
             axes,
             places,
@@ -226,13 +226,13 @@ impl<'a> System<'a> {
             pattern,
         };
         for (place, value) in places.iter().zip(values) {
-            system.lay_in(*place, *value);
+            system.add_reading(*place, *value);
         }
         Some(system)
     }
 
-    fn lay_in(&mut self, place: [f64; 2], value: f64) {
-        let local = Local::at(&self.axes, place);
+    fn add_reading(&mut self, place: [f64; 2], value: f64) {
+        let local = LocalSplines::new(&self.axes, place);
         for a in 0..16 {
             let from = &mut self.normal[local.index(a) * LATER..][..LATER];
             let (ia, ja) = ((a % 4) as isize, (a / 4) as isize);
@@ -279,11 +279,11 @@ impl<'a> System<'a> {
     }
 
     fn squares(&self, coefficients: &[f64]) -> f64 {
-        let left = |(p, v): (&[f64; 2], &f64)| (v - Local::at(&self.axes, *p).sum(coefficients)).powi(2);
+        let left = |(p, v): (&[f64; 2], &f64)| (v - LocalSplines::new(&self.axes, *p).sum(coefficients)).powi(2);
         self.places.iter().zip(self.values).map(left).sum()
     }
 
-    fn fitted(&self, grid: &Grid, mu: f64) -> Option<Fitted> {
+    fn fitted(&self, grid: &Grid, mu: f64) -> Option<SplineResult> {
         let coefficients = self.solve(mu)?;
         let (below, above) = rayon::join(|| self.inverse(mu * (-STEP).exp()), || self.inverse(mu * STEP.exp()));
         let (below, above) = (below?, above?);
@@ -297,13 +297,13 @@ impl<'a> System<'a> {
             .into_par_iter()
             .with_min_len(256)
             .map(|k| {
-                let local = Local::at(&self.axes, grid.place_mm(k));
+                let local = LocalSplines::new(&self.axes, grid.place_mm(k));
                 let [p, q] = local.slopes(&self.axes, &coefficients);
-                [local.sum(&coefficients), p, q, point_sigma * local.form(&sandwich).max(0.0).sqrt()]
+                [local.sum(&coefficients), p, q, point_sigma * local.quadratic_form(&sandwich).max(0.0).sqrt()]
             })
             .collect();
         let finite = nodes.iter().flatten().all(|v| v.is_finite());
-        finite.then(|| Fitted {
+        finite.then(|| SplineResult {
             values: nodes.iter().map(|n| n[0]).collect(),
             slopes: nodes.iter().map(|n| [n[1], n[2]]).collect(),
             sigma: nodes.iter().map(|n| n[3]).collect(),
@@ -362,7 +362,7 @@ fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) 
 }
 
 /// Returns the bending of every pair of neighbouring splines.
-fn bending(axes: &[Axis; 2]) -> Vec<f64> {
+fn bending(axes: &[SplineAxis; 2]) -> Vec<f64> {
     let [x, y] = axes.map(|axis| [0, 1, 2].map(|derivative| axis.products(derivative)));
     let (nx, ny) = (axes[0].count(), axes[1].count());
     let product = |table: &[[f64; 4]], i: usize, d: isize| {
@@ -381,15 +381,15 @@ fn bending(axes: &[Axis; 2]) -> Vec<f64> {
 }
 
 /// The sixteen splines at a place.
-struct Local {
+struct LocalSplines {
     first: usize,
     across: usize,
     fraction: [f64; 2],
     shares: [f64; 16],
 }
 
-impl Local {
-    fn at(axes: &[Axis; 2], place: [f64; 2]) -> Self {
+impl LocalSplines {
+    fn new(axes: &[SplineAxis; 2], place: [f64; 2]) -> Self {
         let ((i, u), (j, v)) = (axes[0].cell(place[0]), axes[1].cell(place[1]));
         let (x, y) = (basis(0, u), basis(0, v));
         let across = axes[0].count();
@@ -404,7 +404,7 @@ impl Local {
         (0..16).map(|k| self.shares[k] * coefficients[self.index(k)]).sum()
     }
 
-    fn slopes(&self, axes: &[Axis; 2], coefficients: &[f64]) -> [f64; 2] {
+    fn slopes(&self, axes: &[SplineAxis; 2], coefficients: &[f64]) -> [f64; 2] {
         [0, 1].map(|axis| {
             let x = basis(usize::from(axis == 0), self.fraction[0]);
             let y = basis(usize::from(axis == 1), self.fraction[1]);
@@ -413,7 +413,7 @@ impl Local {
     }
 
     /// Returns b^T S b for a symmetric matrix S given by coefficient and later neighbour.
-    fn form(&self, matrix: &[f64]) -> f64 {
+    fn quadratic_form(&self, matrix: &[f64]) -> f64 {
         let mut sum = 0.0;
         for a in 0..16 {
             let row = &matrix[self.index(a) * LATER..][..LATER];

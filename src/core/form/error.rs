@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use crate::geometry::Sample;
+use crate::geometry::DeviationSample;
 
 /// Reason why a form figure cannot be computed.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -39,7 +39,7 @@ pub enum FormError {
 }
 
 /// Rejects samples that are too few or not finite.
-pub(super) fn check(samples: &[Sample], least: usize) -> Result<(), FormError> {
+pub(super) fn check(samples: &[DeviationSample], least: usize) -> Result<(), FormError> {
     if samples.len() < least {
         return Err(FormError::TooFewPoints { points: samples.len(), min_points: least });
     }

@@ -3,21 +3,21 @@
 use serde::Serialize;
 
 use super::FormError;
-use super::basis::Basis;
+use super::polynomial_basis::PolynomialBasis;
 use super::error::check;
-use super::fit::{Fit, fit_most};
+use super::fit::{PolynomialFit, fit_determined_terms};
 use super::iso::{Iso10110, iso_10110};
-use super::removed::{Removed, pv, without};
-use crate::geometry::{Aperture, Sample, bounds};
+use super::removed_forms::{RemovedForm, pv, remove_forms};
+use crate::geometry::{Aperture, DeviationSample, bounds};
 
 /// Terms of the fit in PVr (Evans 2009: the first 36 Fringe Zernike polynomials).
 const PVR_TERMS: usize = 36;
 /// PV 99.8 % leaves out one point in this many at either end.
-const LEFT_OUT: usize = 1000;
+const PV_998_TRIM_DIVISOR: usize = 1000;
 /// Maximum number of cells for the coverage, along the longer side of the bounds.
-const MOST_CELLS: f64 = 64.0;
+const MAX_CELLS: f64 = 64.0;
 /// Average number of points in a cell of the coverage.
-const POINTS_A_CELL: f64 = 4.0;
+const POINTS_PER_CELL: f64 = 4.0;
 
 /// Options for the figures.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,7 +25,7 @@ pub struct FormOptions {
     /// Aperture of the polynomials and the coverage. `None` for the bounds of the points.
     pub aperture: Option<Aperture>,
     /// Forms to remove by least squares before anything else.
-    pub removed: Vec<Removed>,
+    pub removed: Vec<RemovedForm>,
     /// Wavelength that the ISO 10110-5 notation names.
     pub wavelength_nm: f64,
 }
@@ -71,11 +71,11 @@ pub struct Coverage {
 
 /// Form figures of the deviations.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Figures {
+pub struct DeviationFigures {
     /// Number of points.
     pub points: usize,
     /// Forms removed before anything else.
-    pub removed: Vec<Removed>,
+    pub removed: Vec<RemovedForm>,
     /// Largest minus smallest deviation.
     pub pv_mm: f64,
     /// Robust peak to valley.
@@ -95,9 +95,9 @@ pub struct Figures {
     /// Power, irregularity and the related figures of ISO 10110-5.
     pub iso_10110: Iso10110,
     /// Fit of Zernike polynomials on the smallest disc that contains the aperture; `None` if it fails.
-    pub zernike: Option<Fit>,
+    pub zernike: Option<PolynomialFit>,
     /// Fit of Legendre polynomials on the smallest rectangle that contains the aperture; `None` if it fails.
-    pub legendre: Option<Fit>,
+    pub legendre: Option<PolynomialFit>,
 }
 
 /// Computes the form figures of deviations.
@@ -108,51 +108,51 @@ pub struct Figures {
 /// # Errors
 /// Fewer than four points, points on a line, numbers that are not finite, a point far outside of the aperture, and a
 /// wavelength that is not a finite number above 0.
-pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, FormError> {
+pub fn compute_figures(samples: &[DeviationSample], options: &FormOptions) -> Result<DeviationFigures, FormError> {
     check(samples, 4)?;
     let aperture = match &options.aperture {
         Some(aperture) => aperture.clone(),
-        None => rectangle(bounds(samples.iter().map(|s| s.place_mm)))?,
+        None => rectangle_from_bounds(bounds(samples.iter().map(|s| s.place_mm)))?,
     };
     let mut removed = options.removed.clone();
     removed.sort();
     removed.dedup();
-    let samples = without(&removed, samples)?;
+    let samples = remove_forms(&removed, samples)?;
     let points = samples.len();
-    let by_value = |a: &&Sample, b: &&Sample| a.deviation_mm.total_cmp(&b.deviation_mm);
-    let extreme = |s: &Sample| Extreme { value_mm: s.deviation_mm, at_mm: s.place_mm };
+    let by_value = |a: &&DeviationSample, b: &&DeviationSample| a.deviation_mm.total_cmp(&b.deviation_mm);
+    let extreme = |s: &DeviationSample| Extreme { value_mm: s.deviation_mm, at_mm: s.place_mm };
     let (Some(highest), Some(lowest)) = (samples.iter().max_by(by_value), samples.iter().min_by(by_value)) else {
         return Err(FormError::TooFewPoints { points, min_points: 4 });
     };
     let mean = |f: fn(f64) -> f64| samples.iter().map(|s| f(s.deviation_mm)).sum::<f64>() / points as f64;
-    let basis = Basis::for_aperture(&aperture);
-    let suited = fit_most(&basis, PVR_TERMS, &samples)?;
-    let of_kind = |wanted: Basis| {
-        if wanted == basis { Some(suited.clone()) } else { fit_most(&wanted, PVR_TERMS, &samples).ok() }
+    let basis = PolynomialBasis::for_aperture(&aperture);
+    let suited = fit_determined_terms(&basis, PVR_TERMS, &samples)?;
+    let of_kind = |wanted: PolynomialBasis| {
+        if wanted == basis { Some(suited.clone()) } else { fit_determined_terms(&wanted, PVR_TERMS, &samples).ok() }
     };
-    Ok(Figures {
+    Ok(DeviationFigures {
         points,
         pv_mm: highest.deviation_mm - lowest.deviation_mm,
         pvr: robust_pv(&suited, &samples)?,
-        pv_998_mm: pv_of_most(samples.iter().map(|s| s.deviation_mm)).unwrap_or_default(),
+        pv_998_mm: pv_998(samples.iter().map(|s| s.deviation_mm)).unwrap_or_default(),
         rms_mm: mean(|d| d * d).sqrt(),
         mean_mm: mean(|d| d),
         highest: extreme(highest),
         lowest: extreme(lowest),
         coverage: coverage(&aperture, &samples),
         iso_10110: iso_10110(&samples, &aperture, options.wavelength_nm)?,
-        zernike: of_kind(Basis::zernike(&aperture)),
-        legendre: of_kind(Basis::legendre(aperture.bounds())),
+        zernike: of_kind(PolynomialBasis::zernike(&aperture)),
+        legendre: of_kind(PolynomialBasis::legendre(aperture.bounds())),
         removed,
     })
 }
 
-fn rectangle([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormError> {
+fn rectangle_from_bounds([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormError> {
     let has_area = (0..2).all(|k| high[k] - low[k] > 0.0);
     if has_area { Ok(Aperture::from_corners([low, high])) } else { Err(FormError::NoArea) }
 }
 
-fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
+fn robust_pv(fit: &PolynomialFit, samples: &[DeviationSample]) -> Result<RobustPv, FormError> {
     let values = fit.values_mm(samples)?;
     let fit_pv_mm = pv(values.into_iter());
     let residual_rms_mm = fit.residual_rms_mm;
@@ -169,20 +169,20 @@ fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
 ///
 /// Only whole values are left out, never more than that share; with fewer than a thousand values, none is. Returns
 /// `None` if there are no values.
-pub fn pv_of_most(values: impl Iterator<Item = f64>) -> Option<f64> {
+pub fn pv_998(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_unstable_by(f64::total_cmp);
-    let beyond = values.len() / LEFT_OUT;
+    let beyond = values.len() / PV_998_TRIM_DIVISOR;
     Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
 /// Computes the share of the cells within the aperture that hold a point. A cell has the size that four points take on
 /// average.
-fn coverage(aperture: &Aperture, samples: &[Sample]) -> Coverage {
+fn coverage(aperture: &Aperture, samples: &[DeviationSample]) -> Coverage {
     let [low, high] = aperture.bounds();
     let size: [f64; 2] = std::array::from_fn(|k| high[k] - low[k]);
-    let wanted = (POINTS_A_CELL * size[0] * size[1] / samples.len() as f64).sqrt();
-    let cell_mm = wanted.max(size[0].max(size[1]) / MOST_CELLS);
+    let wanted = (POINTS_PER_CELL * size[0] * size[1] / samples.len() as f64).sqrt();
+    let cell_mm = wanted.max(size[0].max(size[1]) / MAX_CELLS);
     let count: [usize; 2] = std::array::from_fn(|k| (size[k] / cell_mm).ceil().max(1.0) as usize);
     let mut held = vec![false; count[0] * count[1]];
     for sample in samples {

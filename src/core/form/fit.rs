@@ -10,22 +10,22 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::FormError;
-use super::basis::{Basis, Terms};
+use super::polynomial_basis::{PolynomialBasis, Terms};
 use super::error::check;
-use crate::geometry::Sample;
+use crate::geometry::DeviationSample;
 
 /// Number of rows in a chunk.
-const SHARE: usize = 512;
+const CHUNK_ROWS: usize = 512;
 /// Smallest share of a term that is independent of the terms before it. Below it the points do not determine the term.
-const NEW: f64 = 1e-7;
+const MIN_INDEPENDENT_SHARE: f64 = 1e-7;
 /// Fewest points per term of a fit that selects its number of terms.
-const POINTS_A_TERM: usize = 4;
+const POINTS_PER_TERM: usize = 4;
 
 /// Fit of polynomials to deviations.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Fit {
+pub struct PolynomialFit {
     /// Polynomials of the fit.
-    pub basis: Basis,
+    pub basis: PolynomialBasis,
     /// Coefficient of each term in millimetres. The mean square of a term is 1 over the full disc or rectangle.
     pub coefficients_mm: Vec<f64>,
     /// Root mean square of the deviations that each term explains, in millimetres and with its sign, after the term is
@@ -43,15 +43,15 @@ pub struct Fit {
 ///
 /// # Errors
 /// Fewer points than terms; a term that the points do not determine; a point that is not finite or far outside.
-pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormError> {
+pub fn fit_polynomials(basis: &PolynomialBasis, terms: usize, samples: &[DeviationSample]) -> Result<PolynomialFit, FormError> {
     check(samples, terms)?;
     let rows = basis.prepare_terms(terms)?;
-    let solved = solve(terms, samples, |index, sample, row| rows.values(index, sample, row))?;
-    let Solved { coefficients, orthogonal, residual, undetermined } = solved;
+    let solved = solve_least_squares(terms, samples, |index, sample, row| rows.values(index, sample, row))?;
+    let LeastSquaresSolution { coefficients, orthogonal, residual, undetermined } = solved;
     if let Some(k) = undetermined {
         return Err(FormError::Undetermined { term: basis.term_name(k), points: samples.len() });
     }
-    Ok(Fit {
+    Ok(PolynomialFit {
         basis: basis.clone(),
         coefficients_mm: coefficients,
         orthogonal_mm: orthogonal,
@@ -64,25 +64,25 @@ pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormE
 ///
 /// # Errors
 /// Points that do not determine even one term, or that are not finite or far outside.
-pub fn fit_most(basis: &Basis, most: usize, samples: &[Sample]) -> Result<Fit, FormError> {
-    check(samples, POINTS_A_TERM)?;
-    let mut terms = basis.complete_terms(most.min(samples.len() / POINTS_A_TERM));
+pub fn fit_determined_terms(basis: &PolynomialBasis, most: usize, samples: &[DeviationSample]) -> Result<PolynomialFit, FormError> {
+    check(samples, POINTS_PER_TERM)?;
+    let mut terms = basis.complete_terms(most.min(samples.len() / POINTS_PER_TERM));
     loop {
-        match fit(basis, terms, samples) {
+        match fit_polynomials(basis, terms, samples) {
             Err(FormError::Undetermined { .. }) if terms > 1 => terms = basis.complete_terms(terms - 1),
             fitted => return fitted,
         }
     }
 }
 
-impl Fit {
+impl PolynomialFit {
     /// Returns the value of the fit at every sample, in millimetres and in the order of the samples.
     ///
     /// # Errors
     /// A sample far outside of the polynomials' domain.
-    pub fn values_mm(&self, samples: &[Sample]) -> Result<Vec<f64>, FormError> {
+    pub fn values_mm(&self, samples: &[DeviationSample]) -> Result<Vec<f64>, FormError> {
         let terms: Terms = self.basis.prepare_terms(self.coefficients_mm.len())?;
-        let value = |row: &mut Vec<f64>, (index, sample): (usize, &Sample)| {
+        let value = |row: &mut Vec<f64>, (index, sample): (usize, &DeviationSample)| {
             terms.values(index, sample, row)?;
             Ok(row.iter().zip(&self.coefficients_mm).map(|(value, c)| value * c).sum())
         };
@@ -94,7 +94,7 @@ impl Fit {
 }
 
 /// Solution of a least-squares problem.
-pub(super) struct Solved {
+pub(super) struct LeastSquaresSolution {
     pub(super) coefficients: Vec<f64>,
     pub(super) orthogonal: Vec<f64>,
     /// Root mean square of the residuals.
@@ -104,20 +104,20 @@ pub(super) struct Solved {
 }
 
 /// Solves for the coefficients of functions whose values at a sample `row` writes.
-pub(super) fn solve(
+pub(super) fn solve_least_squares(
     terms: usize,
-    samples: &[Sample],
-    row: impl Fn(usize, &Sample, &mut [f64]) -> Result<(), FormError> + Sync,
-) -> Result<Solved, FormError> {
+    samples: &[DeviationSample],
+    row: impl Fn(usize, &DeviationSample, &mut [f64]) -> Result<(), FormError> + Sync,
+) -> Result<LeastSquaresSolution, FormError> {
     let width = terms + 1;
     let triangles: Vec<Result<DMatrix<f64>, FormError>> = samples
-        .par_chunks(SHARE)
+        .par_chunks(CHUNK_ROWS)
         .enumerate()
         .map(|(share, chunk)| {
             let mut rows = DMatrix::zeros(chunk.len(), width);
             let mut values = vec![0.0; terms];
             for (k, sample) in chunk.iter().enumerate() {
-                row(share * SHARE + k, sample, &mut values)?;
+                row(share * CHUNK_ROWS + k, sample, &mut values)?;
                 for (column, value) in values.iter().enumerate() {
                     rows[(k, column)] = *value;
                 }
@@ -128,7 +128,7 @@ pub(super) fn solve(
         .collect();
     let triangles: Vec<DMatrix<f64>> = triangles.into_iter().collect::<Result<_, FormError>>()?;
     let mut r = DMatrix::<f64>::zeros(width, width);
-    for some in triangles.chunks(SHARE.div_ceil(width)) {
+    for some in triangles.chunks(CHUNK_ROWS.div_ceil(width)) {
         let height = width + some.iter().map(DMatrix::nrows).sum::<usize>();
         let mut stacked = DMatrix::zeros(height, width);
         stacked.rows_mut(0, width).copy_from(&r);
@@ -142,12 +142,12 @@ pub(super) fn solve(
     Ok(back_substituted(&r, terms, samples.len()))
 }
 
-fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> Solved {
+fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> LeastSquaresSolution {
     let scale = (points as f64).sqrt();
     let undetermined = (0..terms).find(|&k| {
         let norm = r.column(k).rows(0, k + 1).norm();
         // Not a plain comparison: a NaN determines nothing.
-        !matches!(r[(k, k)].abs().partial_cmp(&(NEW * norm)), Some(std::cmp::Ordering::Greater))
+        !matches!(r[(k, k)].abs().partial_cmp(&(MIN_INDEPENDENT_SHARE * norm)), Some(std::cmp::Ordering::Greater))
     });
     let orthogonal: Vec<f64> = (0..terms).map(|k| r[(k, terms)] * r[(k, k)].signum() / scale).collect();
     let mut coefficients = vec![0.0; terms];
@@ -157,5 +157,5 @@ fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> Solved {
             coefficients[k] = (r[(k, terms)] - known) / r[(k, k)];
         }
     }
-    Solved { coefficients, orthogonal, residual: r[(terms, terms)].abs() / scale, undetermined }
+    LeastSquaresSolution { coefficients, orthogonal, residual: r[(terms, terms)].abs() / scale, undetermined }
 }

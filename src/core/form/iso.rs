@@ -14,12 +14,12 @@ use serde::Serialize;
 
 use super::FormError;
 use super::error::check;
-use super::fit::solve;
-use super::removed::{Removed, pv, without};
-use crate::geometry::{Aperture, Sample};
+use super::fit::solve_least_squares;
+use super::removed_forms::{RemovedForm, pv, remove_forms};
+use crate::geometry::{Aperture, DeviationSample};
 
 /// Half of the highest power of r of the symmetric part.
-pub(super) const SYMMETRIC: usize = 6;
+pub(super) const MAX_SYMMETRIC_DEGREE: usize = 6;
 
 /// Power, irregularity and the related figures of the surface by ISO 10110-5, in nanometres.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -51,7 +51,7 @@ pub struct Iso10110 {
 /// # Errors
 /// Fewer than four points, points on a line, numbers that are not finite, and a wavelength that is not a finite number
 /// above 0.
-pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) -> Result<Iso10110, FormError> {
+pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm: f64) -> Result<Iso10110, FormError> {
     check(samples, 4)?;
     if !(wavelength_nm > 0.0 && wavelength_nm.is_finite()) {
         return Err(FormError::Wavelength { wavelength_nm });
@@ -59,20 +59,20 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
     let [low, high] = aperture.bounds();
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     let radius = samples.iter().map(|s| (s.place_mm[0] - middle[0]).hypot(s.place_mm[1] - middle[1])).fold(0.0, f64::max);
-    let square = |s: &Sample| {
+    let square = |s: &DeviationSample| {
         let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.place_mm[k] - middle[k]) / radius);
         x * x + y * y
     };
-    let total = without(&[Removed::Piston, Removed::Tilt], samples)?;
-    let irregularity = without(&[Removed::Piston, Removed::Tilt, Removed::Power], samples)?;
+    let total = remove_forms(&[RemovedForm::Piston, RemovedForm::Tilt], samples)?;
+    let irregularity = remove_forms(&[RemovedForm::Piston, RemovedForm::Tilt, RemovedForm::Power], samples)?;
     // The coefficient of r^2. Its origin does not matter, because piston and tilt are fitted too.
-    let power = solve(4, samples, |_, s, row| {
+    let power = solve_least_squares(4, samples, |_, s, row| {
         let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.place_mm[k] - middle[k]) / radius);
         row.copy_from_slice(&[1.0, x, y, x * x + y * y]);
         Ok(())
     })?
     .coefficients[3];
-    let symmetric = symmetric(&irregularity, square)?;
+    let symmetric = fit_symmetric_part(&irregularity, square)?;
     let varying = irregularity.iter().zip(&symmetric).map(|(s, even)| s.deviation_mm - even);
     let nm = |mm: f64| 1e6 * mm;
     let rms_varying_nm = nm(rms(varying));
@@ -94,16 +94,16 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
 /// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 and returns the values of the fit at the samples. These
 /// polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer terms if the points do not
 /// determine all.
-fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
-    let values = |s: &Sample| even_terms(square(s));
-    let mut terms = (SYMMETRIC + 1).min(samples.len() / 4).max(1);
+fn fit_symmetric_part(samples: &[DeviationSample], square: impl Fn(&DeviationSample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
+    let values = |s: &DeviationSample| even_terms(square(s));
+    let mut terms = (MAX_SYMMETRIC_DEGREE + 1).min(samples.len() / 4).max(1);
     loop {
-        let solved = solve(terms, samples, |_, s, row| {
+        let solved = solve_least_squares(terms, samples, |_, s, row| {
             row.copy_from_slice(&values(s)[..row.len()]);
             Ok(())
         })?;
         if solved.undetermined.is_none() || terms == 1 {
-            let even = |s: &Sample| values(s).iter().zip(&solved.coefficients).map(|(value, c)| value * c).sum();
+            let even = |s: &DeviationSample| values(s).iter().zip(&solved.coefficients).map(|(value, c)| value * c).sum();
             return Ok(samples.iter().map(even).collect());
         }
         terms -= 1;
@@ -111,11 +111,11 @@ fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Resu
 }
 
 /// Returns the values of the symmetric terms, given (r/R)^2.
-pub(super) fn even_terms(square: f64) -> [f64; SYMMETRIC + 1] {
+pub(super) fn even_terms(square: f64) -> [f64; MAX_SYMMETRIC_DEGREE + 1] {
     let t = 2.0 * square - 1.0;
-    let mut row = [1.0; SYMMETRIC + 1];
+    let mut row = [1.0; MAX_SYMMETRIC_DEGREE + 1];
     row[1] = t;
-    for n in 1..SYMMETRIC {
+    for n in 1..MAX_SYMMETRIC_DEGREE {
         let k = n as f64;
         row[n + 1] = ((2.0 * k + 1.0) * t * row[n] - k * row[n - 1]) / (k + 1.0);
     }
@@ -136,12 +136,12 @@ fn notation(found: &Iso10110) -> String {
 /// Returns the indication of ISO 10110-5 with A, B and C, and with RMSt, RMSi and RMSa, every value rounded up. Units:
 /// nanometres.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
-    let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(up);
+    let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(format_rounded_up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")
 }
 
 /// Formats a value in nanometres, rounded up: to whole nanometres from 10 nm on, to hundredths below.
-fn up(value_nm: f64) -> String {
+fn format_rounded_up(value_nm: f64) -> String {
     // The rounding error of a zero must not become a hundredth, and a zero has no sign.
     let steps = if value_nm >= 10.0 { 1.0 } else { 100.0 };
     format!("{}", ((value_nm * steps - 1e-6).ceil().max(0.0) + 0.0) / steps)

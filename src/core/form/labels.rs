@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::figures::Figures;
-use super::removed::Removed;
+use super::figures::DeviationFigures;
+use super::removed_forms::RemovedForm;
 use super::slope::Slope;
 
 /// Direction of all figures.
@@ -11,7 +11,7 @@ pub const DIRECTION: &str = "along the outward normal of the nominal surface, po
 
 /// Figure with its label.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Labelled {
+pub struct LabelledFigure {
     /// Name of the figure.
     pub name: &'static str,
     /// Value of the figure.
@@ -32,31 +32,31 @@ pub struct Labelled {
 
 /// Motions and forms removed from the deviations before any figure is computed.
 #[derive(Clone, Debug, PartialEq)]
-pub struct TakenOut {
+pub struct RemovedParts {
     /// Motions removed by the registration, in words.
     pub motion: String,
     /// Part removed by the filter of the map, in words.
     pub filter: String,
 }
 
-impl TakenOut {
+impl RemovedParts {
     /// Returns the words for the motion and for the removed forms, separated by commas.
-    pub fn describe(&self, forms: &[Removed]) -> String {
+    pub fn describe(&self, forms: &[RemovedForm]) -> String {
         let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.name()));
         words.collect::<Vec<_>>().join(", ")
     }
 }
 
 /// Cut-off of figures that are computed from the points.
-pub const EVERY_POINT: &str = "none: every point used";
+pub const NO_CUT_OFF: &str = "none: every point used";
 
 /// Returns the figures of points with their labels, in the order of a report.
 ///
 /// Units: micrometres; coverage in percent.
-pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
-    let Figures { pvr, highest, lowest, coverage, .. } = figures;
+pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
+    let DeviationFigures { pvr, highest, lowest, coverage, .. } = figures;
     let removed = taken_out.describe(&figures.removed);
-    let um = |name, mm: f64, made: &str| row(name, 1e3 * mm, "um", &removed, EVERY_POINT, made);
+    let um = |name, mm: f64, made: &str| labelled_figure(name, 1e3 * mm, "um", &removed, NO_CUT_OFF, made);
     let of_fit = format!(
         "robust: PV of {} {} terms fitted to all points, {:.4} um, and 3 times the rms of the rest, {:.4} um",
         pvr.terms,
@@ -75,27 +75,27 @@ pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
         ),
         um("RMS of the points", figures.rms_mm, "of all points, about zero"),
         um("mean", figures.mean_mm, "of all points"),
-        Labelled {
+        LabelledFigure {
             at_mm: Some(highest.at_mm),
             ..um("highest (stock left)", highest.value_mm, "the one highest point")
         },
-        Labelled { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the one lowest point") },
-        row("coverage", 100.0 * coverage.share, "%", "nothing", EVERY_POINT, &cells),
+        LabelledFigure { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the one lowest point") },
+        labelled_figure("coverage", 100.0 * coverage.share, "%", "nothing", NO_CUT_OFF, &cells),
     ]
 }
 
 /// Returns the slopes of a map with their labels.
 ///
 /// Units: microradians.
-pub fn labelled_slope(slope: &Slope, taken_out: &TakenOut) -> Vec<Labelled> {
+pub fn label_slope(slope: &Slope, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
     let [x, y] = slope.integration_mm;
     let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);
-    let urad = |name, rad: f64| row(name, 1e6 * rad, "urad", &taken_out.motion, &taken_out.filter, &made);
+    let urad = |name, rad: f64| labelled_figure(name, 1e6 * rad, "urad", &taken_out.motion, &taken_out.filter, &made);
     vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.largest_rad)]
 }
 
-fn row(name: &'static str, value: f64, unit: &'static str, removed: &str, cut_off: &str, made: &str) -> Labelled {
-    Labelled {
+fn labelled_figure(name: &'static str, value: f64, unit: &'static str, removed: &str, cut_off: &str, made: &str) -> LabelledFigure {
+    LabelledFigure {
         name,
         value,
         unit,

@@ -10,24 +10,24 @@
 //! inside, nanometres and micrometres only in text. Signs: positive where material is above the nominal surface, along
 //! the outward normal. The figures describe the surface. A wavefront reflected by a mirror has twice the error.
 
-mod basis;
+mod polynomial_basis;
 mod error;
 mod figures;
 mod fit;
 mod iso;
 mod labels;
-mod of_many;
-mod removed;
+mod iso_fits;
+mod removed_forms;
 mod slope;
-mod slope_of_many;
+mod slope_operator;
 
-pub use basis::Basis;
+pub use polynomial_basis::PolynomialBasis;
 pub use error::FormError;
-pub use figures::{Coverage, Extreme, Figures, FormOptions, RobustPv, figures, pv_of_most};
-pub use fit::{Fit, fit, fit_most};
+pub use figures::{Coverage, Extreme, DeviationFigures, FormOptions, RobustPv, compute_figures, pv_998};
+pub use fit::{PolynomialFit, fit_polynomials, fit_determined_terms};
 pub use iso::{Iso10110, iso_10110, iso_10110_notation};
-pub use labels::{DIRECTION, EVERY_POINT, Labelled, TakenOut, labelled, labelled_slope};
-pub use of_many::{IsoFits, IsoOfForm};
-pub use removed::Removed;
+pub use labels::{DIRECTION, NO_CUT_OFF, LabelledFigure, RemovedParts, label_figures, label_slope};
+pub use iso_fits::{IsoFits, IsoFormValues};
+pub use removed_forms::RemovedForm;
 pub use slope::{Slope, slope};
-pub use slope_of_many::SlopesAt;
+pub use slope_operator::SlopeOperator;

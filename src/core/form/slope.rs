@@ -68,7 +68,7 @@ mod tests {
 
     const NODES: usize = 41 * 31;
 
-    fn of(f: impl Fn(f64, f64) -> f64, valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
+    fn slope_of(f: impl Fn(f64, f64) -> f64, valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
         let values: Vec<f64> = (0..NODES).map(|k| f((k % 41) as f64 - 20.0, (k / 41) as f64 - 15.0)).collect();
         slope(
             &Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0; 2] },
@@ -82,12 +82,12 @@ mod tests {
     fn a_plane_has_its_slope_at_every_length() {
         let all = vec![true; NODES];
         for length in [0.1, 2.0, 3.0, 12.0] {
-            let found = of(|x, y| 3e-6 * x - 4e-6 * y + 1.0, &all, length).unwrap();
+            let found = slope_of(|x, y| 3e-6 * x - 4e-6 * y + 1.0, &all, length).unwrap();
             assert!((found.rms_rad - 5e-6).abs() < 1e-15 && (found.largest_rad - 5e-6).abs() < 1e-15);
             assert!((found.rms_along_rad[0] - 3e-6).abs() < 1e-15);
         }
-        assert_eq!(of(|_, _| 0.0, &all, 4.0).unwrap().rms_rad, 0.0);
-        let found = of(|_, _| 0.0, &all, 4.9).unwrap();
+        assert_eq!(slope_of(|_, _| 0.0, &all, 4.0).unwrap().rms_rad, 0.0);
+        let found = slope_of(|_, _| 0.0, &all, 4.9).unwrap();
         assert_eq!((found.integration_mm, found.nodes), ([4.0, 4.0], 37 * 27));
     }
 
@@ -97,7 +97,7 @@ mod tests {
         let (k, all) = (std::f64::consts::TAU / 12.0, vec![true; NODES]);
         for length in [2.0, 4.0, 6.0] {
             let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
-            let found = of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().rms_along_rad[0];
+            let found = slope_of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().rms_along_rad[0];
             // Not whole waves: a few percent.
             assert!((found / expected - 1.0).abs() < 0.05, "{length}: {found} {expected}");
         }
@@ -108,10 +108,10 @@ mod tests {
         let mut valid = vec![true; NODES];
         valid[15 * 41 + 20] = false;
         let spike = |x: f64, y: f64| if (x, y) == (0.0, 0.0) { 1.0 } else { 0.0 };
-        let found = of(spike, &valid, 2.0).unwrap();
+        let found = slope_of(spike, &valid, 2.0).unwrap();
         assert_eq!((found.rms_rad, found.nodes), (0.0, 39 * 29 - 4));
-        assert_eq!(of(spike, &vec![false; NODES], 2.0), Err(FormError::NoSlope { integration_mm: 2.0 }));
-        assert_eq!(of(spike, &valid, 50.0), Err(FormError::NoSlope { integration_mm: 50.0 }));
-        assert!(matches!(of(spike, &valid, f64::NAN), Err(FormError::Integration { .. })));
+        assert_eq!(slope_of(spike, &vec![false; NODES], 2.0), Err(FormError::NoSlope { integration_mm: 2.0 }));
+        assert_eq!(slope_of(spike, &valid, 50.0), Err(FormError::NoSlope { integration_mm: 50.0 }));
+        assert!(matches!(slope_of(spike, &valid, f64::NAN), Err(FormError::Integration { .. })));
     }
 }

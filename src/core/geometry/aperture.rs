@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Largest accepted coordinate or size of a part, in millimetres.
-const LARGEST_MM: f64 = 1e6;
+const MAX_COORDINATE_MM: f64 = 1e6;
 
 /// Maximum number of corners of a polygon: its check compares every pair of edges.
-const MOST_CORNERS: usize = 4000;
+const MAX_CORNERS: usize = 4000;
 
 /// The outline of a part in the (x, y) plane.
 ///
@@ -121,21 +121,21 @@ impl Aperture {
     pub fn validate(&self) -> Result<(), ApertureError> {
         match self {
             Self::Rectangle { centre_mm, width_mm, height_mm } => {
-                coordinates("centre_mm", centre_mm)?;
-                size("width_mm", *width_mm)?;
-                size("height_mm", *height_mm)
+                check_coordinates("centre_mm", centre_mm)?;
+                check_size("width_mm", *width_mm)?;
+                check_size("height_mm", *height_mm)
             }
             Self::Circle { centre_mm, radius_mm } => {
-                coordinates("centre_mm", centre_mm)?;
-                size("radius_mm", *radius_mm)
+                check_coordinates("centre_mm", centre_mm)?;
+                check_size("radius_mm", *radius_mm)
             }
             Self::Ellipse { centre_mm, semi_axes_mm } => {
-                coordinates("centre_mm", centre_mm)?;
-                semi_axes_mm.iter().try_for_each(|&axis| size("semi_axes_mm", axis))
+                check_coordinates("centre_mm", centre_mm)?;
+                semi_axes_mm.iter().try_for_each(|&axis| check_size("semi_axes_mm", axis))
             }
             Self::Annulus { centre_mm, inner_radius_mm, outer_radius_mm } => {
-                coordinates("centre_mm", centre_mm)?;
-                size("outer_radius_mm", *outer_radius_mm)?;
+                check_coordinates("centre_mm", centre_mm)?;
+                check_size("outer_radius_mm", *outer_radius_mm)?;
                 if (0.0..*outer_radius_mm).contains(inner_radius_mm) {
                     return Ok(());
                 }
@@ -274,26 +274,26 @@ impl Aperture {
 }
 
 /// Checks the coordinates of a point.
-fn coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
-    match point.iter().find(|v| v.is_nan() || v.abs() > LARGEST_MM) {
+fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
+    match point.iter().find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_MM) {
         Some(&value_mm) => Err(ApertureError::Coordinate { key, value_mm }),
         None => Ok(()),
     }
 }
 
 /// Checks a size.
-fn size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
-    if value_mm > 0.0 && value_mm <= LARGEST_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
+fn check_size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
+    if value_mm > 0.0 && value_mm <= MAX_COORDINATE_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
 }
 
 /// Checks that corners in order make a simple polygon.
 fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
     let count = corners.len();
-    if !(3..=MOST_CORNERS).contains(&count) {
+    if !(3..=MAX_CORNERS).contains(&count) {
         return Err(ApertureError::CornerCount { count });
     }
     for corner in corners {
-        coordinates("corners_mm", corner)?;
+        check_coordinates("corners_mm", corner)?;
     }
     let edges: Vec<_> = edges(corners).collect();
     if let Some(i) = edges.iter().position(|[p, q]| p == q) {

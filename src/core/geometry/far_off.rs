@@ -3,13 +3,13 @@
 use super::Point;
 
 /// Limit of the distance from the middle, in units of the median distance.
-const FAR: f64 = 50.0;
+const MAX_MEDIAN_RATIO: f64 = 50.0;
 
 /// Returns the index of the point that is farthest from the middle of all points, and its distance, if that distance is
 /// more than `FAR` times the median distance. The middle is the median of each coordinate.
 ///
 /// Units: millimetres. Returns `None` for fewer than three points, or if half of them coincide.
-pub(crate) fn far_off(points: &[Point]) -> Option<(usize, f64)> {
+pub(crate) fn find_far_off(points: &[Point]) -> Option<(usize, f64)> {
     if points.len() < 3 {
         return None;
     }
@@ -22,7 +22,7 @@ pub(crate) fn far_off(points: &[Point]) -> Option<(usize, f64)> {
     let apart: Vec<f64> = points.iter().map(|p| (p - middle).norm()).collect();
     let usual_mm = median(apart.clone());
     let far = (0..apart.len()).max_by(|&a, &b| apart[a].total_cmp(&apart[b]))?;
-    (usual_mm > 0.0 && apart[far] > FAR * usual_mm).then_some((far, apart[far]))
+    (usual_mm > 0.0 && apart[far] > MAX_MEDIAN_RATIO * usual_mm).then_some((far, apart[far]))
 }
 
 #[cfg(test)]
@@ -32,12 +32,12 @@ mod tests {
     #[test]
     fn one_of_many_is_named_and_none_of_a_spread_cloud() {
         let mut points: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect();
-        assert_eq!(far_off(&points), None);
+        assert_eq!(find_far_off(&points), None);
         points[17] = Point::new(1e6, 0.0, 0.0);
-        let (index, distance_mm) = far_off(&points).unwrap();
+        let (index, distance_mm) = find_far_off(&points).unwrap();
         assert_eq!(index, 17);
         assert!((distance_mm - 1e6).abs() < 10.0, "{distance_mm}");
-        assert_eq!(far_off(&[Point::origin(); 5]), None);
-        assert_eq!(far_off(&points[16..18]), None);
+        assert_eq!(find_far_off(&[Point::origin(); 5]), None);
+        assert_eq!(find_far_off(&points[16..18]), None);
     }
 }

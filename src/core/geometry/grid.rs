@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Maximum number of nodes of a grid: a correction is read back over a wire.
-const MOST_NODES: f64 = 4e6;
+const MAX_NODES: f64 = 4e6;
 
 /// Regular grid over x and y of the model frame; nodes run row by row, x fastest.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -55,7 +55,7 @@ impl Grid {
         let sizes = [high[0] - low[0], high[1] - low[1]];
         let steps = sizes.map(|size| (size / spacing_mm).ceil().max(1.0));
         let nodes = (steps[0] + 1.0) * (steps[1] + 1.0);
-        if nodes > MOST_NODES || nodes.is_nan() {
+        if nodes > MAX_NODES || nodes.is_nan() {
             let [width_mm, depth_mm] = sizes;
             return Err(GridError::TooFine { spacing_mm, width_mm, depth_mm, nodes });
         }
@@ -96,7 +96,7 @@ impl Grid {
         let nodes = self.columns as f64 * self.rows as f64;
         self.columns > 0
             && self.rows > 0
-            && nodes <= MOST_NODES
+            && nodes <= MAX_NODES
             && self.first_mm.iter().all(|v| v.is_finite())
             && self.spacing_mm.iter().all(|v| *v > 0.0 && v.is_finite())
     }

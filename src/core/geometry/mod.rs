@@ -5,20 +5,20 @@
 pub mod aperture;
 mod far_off;
 pub mod grid;
-pub mod grid_order;
-mod nearest;
+pub mod grid_recognition;
+mod point_tree;
 pub mod pose;
 pub mod rigid;
-pub mod sample;
+pub mod deviation_sample;
 
 pub use aperture::{Aperture, ApertureError};
-pub(crate) use far_off::far_off;
+pub(crate) use far_off::find_far_off;
 pub use grid::{Grid, GridError};
-pub use grid_order::{GridOrder, recognise_grid};
-pub(crate) use nearest::Nearest;
+pub use grid_recognition::{GriddedCloud, recognise_grid};
+pub(crate) use point_tree::PointTree;
 pub use pose::{Pose, PoseError, Twist};
 pub use rigid::{RigidError, RigidFit, fit_rigid};
-pub use sample::Sample;
+pub use deviation_sample::DeviationSample;
 
 /// A position in space, in millimetres.
 pub type Point = nalgebra::Point3<f64>;

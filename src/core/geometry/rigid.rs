@@ -14,10 +14,10 @@ use super::{Point, Pose, Vector};
 
 /// Smallest ratio of the spread across a line to the spread along it; with a smaller ratio the points do not fix the
 /// rotation about the line.
-const LEAST_WIDTH_SHARE: f64 = 1e-3;
+const MIN_WIDTH_SHARE: f64 = 1e-3;
 /// Smallest ratio of the spread out of a plane to the largest spread; with a smaller ratio the points cannot reveal a
 /// mirror image.
-const LEAST_DEPTH_SHARE: f64 = 1e-2;
+const MIN_DEPTH_SHARE: f64 = 1e-2;
 
 /// Result of a rigid fit.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,7 +90,7 @@ pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
         let mirrored: Vec<Vector> =
             from.iter().zip(to).map(|(p, q)| (q.coords - b) - mirror * (p.coords - a)).collect();
         let mirrored_rms_mm = rms(&mirrored);
-        let deep = spreads(from)[2].min(spreads(to)[2]) > LEAST_DEPTH_SHARE * spreads(from)[0];
+        let deep = spreads(from)[2].min(spreads(to)[2]) > MIN_DEPTH_SHARE * spreads(from)[0];
         if deep && mirrored_rms_mm < 0.1 * rms_mm {
             return Err(RigidError::Mirrored { rms_mm, mirrored_rms_mm });
         }
@@ -112,7 +112,7 @@ fn check(from: &[Point], to: &[Point]) -> Result<(), RigidError> {
     for points in [from, to] {
         let [length, width, _] = spreads(points);
         let share = if length > 0.0 { width / length } else { 0.0 };
-        if share < LEAST_WIDTH_SHARE {
+        if share < MIN_WIDTH_SHARE {
             return Err(RigidError::Collinear { share });
         }
     }
@@ -141,7 +141,7 @@ mod tests {
     use super::*;
     use crate::geometry::Twist;
 
-    const SEEN: [[f64; 3]; 5] = [
+    const OBSERVED: [[f64; 3]; 5] = [
         [2400.0, -2698.0, 4817.0],
         [-2397.0, -2699.0, 4820.0],
         [2396.0, 2656.0, 2141.0],
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn a_planted_motion_is_found_to_rounding_at_every_angle() {
-        let from = points(&SEEN);
+        let from = points(&OBSERVED);
         for count in [3, 4, 5] {
             for angle in [0.0, 1e-9, 0.01, 1.0, 2.0, std::f64::consts::PI] {
                 let omega = Vector::new(0.36, -0.48, 0.8) * angle;
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_point_that_is_off_is_the_worst_one() {
-        let from = points(&SEEN);
+        let from = points(&OBSERVED);
         let mut to = from.clone();
         to[3].z += 4.0;
         let fit = fit_rigid(&from, &to).unwrap();
@@ -188,7 +188,7 @@ mod tests {
 
     #[test]
     fn a_mirror_image_is_refused_where_the_points_can_tell() {
-        let from = points(&SEEN);
+        let from = points(&OBSERVED);
         let to: Vec<Point> = from.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
         assert!(
             matches!(fit_rigid(&from, &to), Err(RigidError::Mirrored { mirrored_rms_mm, .. }) if mirrored_rms_mm < 1e-9)
@@ -202,7 +202,7 @@ mod tests {
 
     #[test]
     fn what_fixes_no_pose_is_refused() {
-        let from = points(&SEEN);
+        let from = points(&OBSERVED);
         let line = points(&[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0001], [5.0, 5.0, 5.0]]);
         assert!(matches!(fit_rigid(&line, &from[..4]), Err(RigidError::Collinear { share }) if share < 1e-3));
         assert!(matches!(fit_rigid(&from[..4], &line), Err(RigidError::Collinear { .. })));

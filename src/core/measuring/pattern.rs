@@ -5,14 +5,14 @@ use std::f64::consts::{PI, TAU};
 use thiserror::Error;
 
 use crate::geometry::{Point, Vector};
-use crate::surface::{Nominal, OffsetSurface, Place, Side};
+use crate::surface::{Nominal, OffsetSurface, FacetIndex, Side};
 
 /// Maximum number of targets: more than a machine measures in a week.
-const MOST_TARGETS: f64 = 1e7;
+const MAX_TARGETS: f64 = 1e7;
 /// Largest distance beyond the edge, in millimetres, that counts as on the part: it is rounding.
-const ON_PART_MM: f64 = 1e-6;
+const EDGE_TOLERANCE_MM: f64 = 1e-6;
 /// Maximum number of iterations; after that a place counts as not on the surface.
-const MOST_TURNS: usize = 50;
+const MAX_ITERATIONS: usize = 50;
 
 /// Place to touch: a point of the nominal surface and its outward unit normal, in the model frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,11 +64,11 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     let surface = OffsetSurface::new(nominal, 0.0, side).expect("a radius of 0 is good");
     let bounds = bounds(nominal);
     let places = places(layout, bounds, margin_mm)?;
-    let (mut found, mut walk) = (Vec::with_capacity(places.len()), Walk::new(surface, bounds));
+    let (mut found, mut walk) = (Vec::with_capacity(places.len()), SurfaceWalk::new(surface, bounds));
     for place in &places {
         let target = match place {
-            Wanted::AtXy(xy) => walk.target_at(*xy),
-            Wanted::NearestTo(point) => walk.target_nearest_to(point),
+            TargetRequest::AtXy(xy) => walk.target_at(*xy),
+            TargetRequest::NearestTo(point) => walk.target_nearest_to(point),
         };
         found.extend(target.filter(|target| walk.is_inside(target, margin_mm)));
     }
@@ -94,7 +94,7 @@ pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target
         .collect()
 }
 
-enum Wanted {
+enum TargetRequest {
     AtXy([f64; 2]),
     NearestTo(Point),
 }
@@ -114,12 +114,12 @@ fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
     }
 }
 
-fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result<Vec<Wanted>, PatternError> {
+fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result<Vec<TargetRequest>, PatternError> {
     let [width, depth] = [0, 1].map(|k| (high[k] - low[k] - 2.0 * margin_mm).max(0.0));
     let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
     let grid = |columns: f64, rows: f64| {
         let count = columns * rows;
-        if count > MOST_TARGETS {
+        if count > MAX_TARGETS {
             return Err(PatternError::TooMany { count });
         }
         let (columns, rows) = (columns as usize, rows as usize);
@@ -129,7 +129,7 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
                 let (i, j) = (k % columns, k / columns);
                 // Every second row runs backwards, so that the probe need not travel back.
                 let i = if j % 2 == 0 { i } else { columns - 1 - i };
-                Wanted::AtXy([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
+                TargetRequest::AtXy([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
             })
             .collect())
     };
@@ -152,14 +152,14 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
             let area = (width * depth).max(1e-9);
             spiral((area / f64::from((*count).max(1))).sqrt(), middle, [width, depth])
         }
-        Layout::Points(points) => Ok(points.iter().map(|p| Wanted::NearestTo(*p)).collect()),
+        Layout::Points(points) => Ok(points.iter().map(|p| TargetRequest::NearestTo(*p)).collect()),
     }
 }
 
-fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Vec<Wanted>, PatternError> {
+fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Vec<TargetRequest>, PatternError> {
     let reach = 0.5 * width.hypot(depth);
     let count = PI * (reach / spacing).powi(2);
-    if count > MOST_TARGETS {
+    if count > MAX_TARGETS {
         return Err(PatternError::TooMany { count });
     }
     // Archimedes' spiral r = spacing * turns, with an arc of one spacing from point to point.
@@ -172,33 +172,33 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
         let (sin, cos) = angle.sin_cos();
         let (x, y) = (r * cos, r * sin);
         if x.abs() <= 0.5 * width && y.abs() <= 0.5 * depth {
-            found.push(Wanted::AtXy([middle[0] + x, middle[1] + y]));
+            found.push(TargetRequest::AtXy([middle[0] + x, middle[1] + y]));
         }
         angle += spacing / r.max(spacing / TAU).hypot(spacing / TAU);
     }
 }
 
 /// Walk over the surface from target to target.
-struct Walk<'a> {
+struct SurfaceWalk<'a> {
     surface: OffsetSurface<'a>,
-    facet: Place,
+    facet: FacetIndex,
     /// Height of the last target, at which the search for the next begins.
     z: f64,
     /// Diagonal of the bounds in x and y: limit of one step in height.
     size_mm: f64,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> SurfaceWalk<'a> {
     fn new(surface: OffsetSurface<'a>, [low, high]: [[f64; 2]; 2]) -> Self {
         let z = surface.nominal().points().next().map_or(0.0, |p| p.z);
-        Self { surface, facet: Place::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
+        Self { surface, facet: FacetIndex::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
     /// Finds the point of the surface over x and y by Newton's method on the height: each step intersects the vertical
     /// line with the tangent plane at the foot.
     fn target_at(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
         let mut p = Point::new(x, y, self.z);
-        for _ in 0..MOST_TURNS {
+        for _ in 0..MAX_ITERATIONS {
             let foot = self.surface.project(&p, self.facet);
             self.facet = foot.facet;
             let lean = foot.normal.z;
@@ -209,7 +209,7 @@ impl<'a> Walk<'a> {
             p.z -= step.clamp(-self.size_mm, self.size_mm);
             if step.abs() < 1e-9 * (1.0 + self.size_mm) {
                 self.z = p.z;
-                return (foot.beyond_edge_mm <= ON_PART_MM).then_some(Target { point: p, normal: foot.normal });
+                return (foot.beyond_edge_mm <= EDGE_TOLERANCE_MM).then_some(Target { point: p, normal: foot.normal });
             }
         }
         None
@@ -221,7 +221,7 @@ impl<'a> Walk<'a> {
         let target = Target { point: p - foot.distance_mm * foot.normal, normal: foot.normal };
         // A point far away belongs to another part, or to another unit.
         let near = foot.distance_mm.abs() <= 0.05 * self.size_mm;
-        (foot.beyond_edge_mm <= ON_PART_MM && near).then_some(target)
+        (foot.beyond_edge_mm <= EDGE_TOLERANCE_MM && near).then_some(target)
     }
 
     /// Returns true if the surface continues for the margin in every direction.
@@ -235,7 +235,7 @@ impl<'a> Walk<'a> {
         outline.is_none_or(|o| o.contains(target.point.x, target.point.y))
             && (margin_mm == 0.0
                 || around.map(|(s, c)| target.point + margin_mm * (c * u + s * v)).all(|p| {
-                    self.surface.project(&p, self.facet).beyond_edge_mm <= ON_PART_MM
+                    self.surface.project(&p, self.facet).beyond_edge_mm <= EDGE_TOLERANCE_MM
                         && outline.is_none_or(|o| o.contains(p.x, p.y))
                 }))
     }
@@ -251,13 +251,13 @@ fn frame(normal: &Vector) -> (Vector, Vector) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::Projection;
+    use crate::surface::PlaneProjection;
 
     /// Returns a dome z = -(x^2 + y^2) / 200 over 40 x 20 mm, with a point every 0.5 mm.
     fn dome() -> Nominal {
         let points = (0..81 * 41).map(|k| [f64::from(k % 81) * 0.5 - 20.0, f64::from(k / 81) * 0.5 - 10.0]);
         let points = points.map(|[x, y]| Point::new(x, y, -(x * x + y * y) / 200.0)).collect();
-        Nominal::from_points(points, Projection::Auto).unwrap()
+        Nominal::from_points(points, PlaneProjection::Auto).unwrap()
     }
 
     #[test]

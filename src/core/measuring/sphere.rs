@@ -36,7 +36,7 @@ pub enum SphereFitError {
 }
 
 /// Minimum number of points: one more than the unknowns, so that the fit can be judged.
-const LEAST: usize = 5;
+const MIN_POINTS: usize = 5;
 
 /// Fits a sphere by least squares of the distances from it, by Gauss-Newton starting from the algebraic fit.
 ///
@@ -44,7 +44,7 @@ const LEAST: usize = 5;
 /// Returns an error if there are fewer than five points, if the points lie on a plane, or if a coordinate is not
 /// finite.
 pub fn fit_sphere(points: &[Point]) -> Result<SphereFit, SphereFitError> {
-    if points.len() < LEAST {
+    if points.len() < MIN_POINTS {
         return Err(SphereFitError::TooFew { points: points.len() });
     }
     let middle = points.iter().fold(nalgebra::Vector3::zeros(), |sum, p| sum + p.coords) / points.len() as f64;

@@ -90,7 +90,7 @@ impl Basis {
     }
 
     /// Returns the number of polynomials. They come first in the basis.
-    pub(super) fn count_of_polynomials(&self) -> usize {
+    pub(super) fn polynomial_count(&self) -> usize {
         self.degrees.len()
     }
 
@@ -245,7 +245,7 @@ mod tests {
     #[test]
     fn within_the_part_they_make_the_covariance_of_the_field() {
         for (smoothness, near) in [(Smoothness::Exponential, 0.05), (Smoothness::Matern2, 0.02), (Smoothness::SquaredExponential, 0.02)] {
-            for lay in [Anisotropy::NONE, Anisotropy::at(0.7, 3.0)] {
+            for lay in [Anisotropy::NONE, Anisotropy::from_angle(0.7, 3.0)] {
                 let field = Field { smoothness, anisotropy: lay, ..Field::new(1.0, 12.0) };
                 let waves = Basis::over(&PART, lay, 3000, 4);
                 for (a, b) in [([0.0, 0.0], [3.0, 1.0]), ([10.0, -5.0], [14.0, 2.0]), ([20.0, 10.0], [20.0, 2.0])] {
@@ -299,7 +299,7 @@ mod tests {
         }
         let line: Vec<[f64; 2]> = (0..30).map(|k| [f64::from(k), 1.0 + 1e-15 * f64::from(k % 3)]).collect();
         assert!(
-            Basis::over(&line, Anisotropy::at(0.3, 2.0), 10, 4)
+            Basis::over(&line, Anisotropy::from_angle(0.3, 2.0), 10, 4)
                 .at(&line)
                 .col_iter()
                 .all(|column| column.norm_max() < 1e3)
@@ -308,7 +308,7 @@ mod tests {
 
     #[test]
     fn on_a_grid_a_field_is_what_it_is_at_each_of_its_places() {
-        let waves = Basis::over(&PART, Anisotropy::at(0.4, 2.0), 60, 4);
+        let waves = Basis::over(&PART, Anisotropy::from_angle(0.4, 2.0), 60, 4);
         let grid = BasisGrid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
         let coefficients: Vec<f64> = (0..60).map(|k| (f64::from(k) * 0.7).sin()).collect();
         let on = waves.on_grid(&waves.grid(&grid), &coefficients);

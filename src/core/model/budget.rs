@@ -12,7 +12,7 @@ use super::form::SampledForms;
 use super::hypotheses::FieldHypotheses;
 use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
-use super::{Observed, orthonormal_base};
+use super::{Observations, orthonormal_base};
 
 /// Contribution of one source to the standard uncertainties of the figures; the squares of all contributions add up.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -28,7 +28,7 @@ pub struct BudgetEntry {
 }
 
 /// Components of a variance.
-struct Parts {
+struct VarianceComponents {
     /// Noise of the points.
     noise: f64,
     /// Field between the points.
@@ -45,7 +45,7 @@ struct Parts {
 /// `ground_in` is the form that each random effect has ground into the part, after its own best fit: a row per place, a
 /// column per effect. It is `None` before the first correction.
 pub(super) fn decompose(
-    (observed, sources): (&Observed, &[UncertaintySource]),
+    (observed, sources): (&Observations, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
     (drawn, ground_in): (&SampledForms, Option<&DMatrix<f64>>),
     uncertainties_mm: [f64; 2],
@@ -82,11 +82,11 @@ pub(super) fn decompose(
 /// random effect (w'e)^2, and the field the remainder. The increase of the variance when the motions are unknown is the
 /// part of the pose.
 fn parts(
-    observed: &Observed,
+    observed: &Observations,
     fields: &FieldHypotheses,
     posterior: &Posterior,
     (places, slopes): (&[[f64; 2]], &DVector<f64>),
-) -> Option<Parts> {
+) -> Option<VarianceComponents> {
     let (node, tau, scatter_mm) = posterior.best()?;
     let field2 = tau * node.scale * scatter_mm.powi(2);
     let scatter2 = scatter_mm.powi(2) + field2 * node.truncated_variance;
@@ -98,7 +98,7 @@ fn parts(
     // The random effects in the coordinates, then in those of the motions, and then the part of them that no wave
     // shows.
     let (coordinates, products) = fields.coordinates(&observed.random_effects);
-    let of_effects = fields.of_effects(&observed.random_effects);
+    let of_effects = fields.project_onto_effects(&observed.random_effects);
     let stated = observed.random_effects.ncols();
     let shown = DMatrix::from_fn(stated, stated, |a, b| {
         products[(a, b)] - (0..known).map(|k| coordinates[(k, a)] * coordinates[(k, b)]).sum::<f64>()
@@ -133,7 +133,7 @@ fn parts(
     let of_stated = |e: usize| (0..whole).map(|k| effect(k, e) * weights[(k, 0)]).sum::<f64>().powi(2);
     let stated: Vec<f64> = (0..stated).map(of_stated).collect();
     let form = (pose_known - scatter - stated.iter().sum::<f64>()).max(0.0);
-    Some(Parts { noise: scatter, form, pose: (explained - explained_free).max(0.0), random_effects: stated })
+    Some(VarianceComponents { noise: scatter, form, pose: (explained - explained_free).max(0.0), random_effects: stated })
 }
 
 /// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the

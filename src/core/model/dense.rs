@@ -18,7 +18,7 @@ use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
-use super::{Hyperparameters, ModelError, Observed};
+use super::{Hyperparameters, ModelError, Observations};
 
 /// Prediction of the field at a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -50,14 +50,14 @@ impl DensePosterior {
     /// # Errors
     /// Returns an error if the numbers of rows differ, a number is not finite, a hyperparameter is not above 0, or the
     /// points cannot tell the effects apart.
-    pub fn fit(observed: &Observed, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
-        Self::with(observed, hyperparameters, |_, _| 0.0)
+    pub fn fit(observed: &Observations, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
+        Self::with_shared_covariance(observed, hyperparameters, |_, _| 0.0)
     }
 
     /// Fits like [`Self::fit`], with a further covariance `shared_mm2` of each pair of observed points, by their
     /// indices. The places of a prediction have no part in it.
-    pub(super) fn with(
-        observed: &Observed,
+    pub(super) fn with_shared_covariance(
+        observed: &Observations,
         hyperparameters: Hyperparameters,
         shared_mm2: impl Fn(usize, usize) -> f64,
     ) -> Result<Self, ModelError> {
@@ -65,7 +65,7 @@ impl DensePosterior {
         hyperparameters.check()?;
         let covariance = covariance_mm2(observed, &hyperparameters, shared_mm2);
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
-        let Observed { places, deviations_mm, .. } = observed;
+        let Observations { places, deviations_mm, .. } = observed;
         let effects = observed.all_effects();
         let (n, p, vague) = (places.len(), effects.ncols(), observed.fixed_effects.ncols());
         let mut right = Mat::zeros(n, p + 1);
@@ -104,7 +104,7 @@ impl DensePosterior {
     }
 
     /// Returns the sum of squares of the whitened residuals, d'K^-1 (d - H b).
-    pub(super) fn whitened_squares(&self, observed: &Observed) -> f64 {
+    pub(super) fn whitened_squares(&self, observed: &Observations) -> f64 {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
@@ -118,7 +118,7 @@ impl DensePosterior {
     /// Predicts the field at places, without the effects.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
         let p = self.estimates.len();
-        let across = self.hyperparameters.field.pairs().across(&self.places, places);
+        let across = self.hyperparameters.field.pair_covariance().cross_covariance(&self.places, places);
         let solved = self.factor.solve(&across);
         let sigma2 = self.hyperparameters.field.sigma_mm * self.hyperparameters.field.sigma_mm;
         (0..places.len())
@@ -137,12 +137,12 @@ impl DensePosterior {
     /// of places in mm^2.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
         let p = self.estimates.len();
-        let pairs = self.hyperparameters.field.pairs();
-        let across = pairs.across(&self.places, places);
+        let pairs = self.hyperparameters.field.pair_covariance();
+        let across = pairs.cross_covariance(&self.places, places);
         let solved = self.factor.solve(&across);
         let moved = self.effects.transpose() * &across;
         let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
-        let prior = pairs.across(places, places);
+        let prior = pairs.cross_covariance(places, places);
         let covariance = prior - across.transpose() * &solved + moved.transpose() * &known * &moved;
         let mean_of = |c: usize| dot(across.col_as_slice(c), &self.weights);
         ((0..places.len()).map(mean_of).collect(), covariance)
@@ -151,13 +151,13 @@ impl DensePosterior {
 
 /// Returns the lower triangle of the covariance K of the points, without the effects.
 fn covariance_mm2(
-    observed: &Observed,
+    observed: &Observations,
     hyperparameters: &Hyperparameters,
     shared_mm2: impl Fn(usize, usize) -> f64,
 ) -> Mat<f64> {
-    let Observed { places, path, .. } = observed;
+    let Observations { places, path, .. } = observed;
     let scatter2 = hyperparameters.noise_sigma_mm * hyperparameters.noise_sigma_mm;
-    let pairs = hyperparameters.field.pairs();
+    let pairs = hyperparameters.field.pair_covariance();
     let mut covariance = Mat::zeros(places.len(), places.len());
     for c in 0..places.len() {
         let column = &mut covariance.col_as_slice_mut(c)[c..];
@@ -202,13 +202,13 @@ mod tests {
     use super::super::Field;
     use super::*;
 
-    const HYPER: Hyperparameters =
+    const HYPERPARAMETERS: Hyperparameters =
         Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {
         // By hand, k = 4 and s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
-        let model = DensePosterior::fit(&Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPER).unwrap();
+        let model = DensePosterior::fit(&Observations::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPERPARAMETERS).unwrap();
         let [at, far] = model.predict(&[[1.0, 2.0], [1e4, 0.0]])[..] else { panic!() };
         assert!((at.mean_mm - 12.0 / 4.25).abs() < 1e-14 && (at.sigma_mm.powi(2) - (4.0 - 16.0 / 4.25)).abs() < 1e-14);
         assert_eq!(far, Prediction { mean_mm: 0.0, sigma_mm: 2.0 });
@@ -221,8 +221,8 @@ mod tests {
         // By hand, k = 4, s^2 = 0.25 and e^2 = 2.25: the field gets the share 4 / 6.5 of the deviation 3.
         let stated = DMatrix::from_element(1, 1, 1.5);
         let model = DensePosterior::fit(
-            &Observed { random_effects: stated, ..Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]) },
-            HYPER,
+            &Observations { random_effects: stated, ..Observations::without_effects(vec![[1.0, 2.0]], vec![3.0]) },
+            HYPERPARAMETERS,
         )
         .unwrap();
         let told = model.predict(&[[1.0, 2.0]])[0];
@@ -237,10 +237,10 @@ mod tests {
     fn of_two_points_of_a_path_it_is_what_is_worked_out_by_hand() {
         // Both points lie at one place, so the field is the same at both. With a noise autocorrelation of 0.5, K =
         // [4.25 4.125; 4.125 4.25]; its elements sum to 16.75.
-        let drifting = Hyperparameters { noise_autocorrelation: 0.5, ..HYPER };
-        let at = |path: [f64; 2]| Observed {
+        let drifting = Hyperparameters { noise_autocorrelation: 0.5, ..HYPERPARAMETERS };
+        let at = |path: [f64; 2]| Observations {
             path: path.to_vec(),
-            ..Observed::without_effects(vec![[1.0, 2.0]; 2], vec![3.0, 1.0])
+            ..Observations::without_effects(vec![[1.0, 2.0]; 2], vec![3.0, 1.0])
         };
         let model = DensePosterior::fit(&at([7.0, 8.0]), drifting).unwrap();
         let told = model.predict(&[[1.0, 2.0]])[0];
@@ -249,7 +249,7 @@ mod tests {
         assert!((told.sigma_mm.powi(2) - (4.0 - 32.0 / 8.375)).abs() < 1e-13, "{told:?}");
         // Far apart on the path, the noise of the two points is independent.
         let apart = DensePosterior::fit(&at([7.0, 900.0]), drifting).unwrap();
-        let alone = DensePosterior::fit(&at([7.0, 8.0]), HYPER).unwrap();
+        let alone = DensePosterior::fit(&at([7.0, 8.0]), HYPERPARAMETERS).unwrap();
         assert!((apart.log_likelihood() - alone.log_likelihood()).abs() < 1e-13);
     }
 
@@ -268,13 +268,13 @@ mod tests {
         let planted = DVector::from_column_slice(&[40.0, 0.3, -0.2]);
         let still = wave(&places);
         let moved: Vec<f64> = still.iter().zip((&effects * &planted).iter()).map(|(d, m)| d + m).collect();
-        let with = |deviations_mm| Observed {
+        let with = |deviations_mm| Observations {
             places: places.clone(),
             deviations_mm,
             fixed_effects: effects.clone(),
-            ..Observed::without_effects(places.clone(), Vec::new())
+            ..Observations::without_effects(places.clone(), Vec::new())
         };
-        let [a, b] = [still, moved].map(|d| DensePosterior::fit(&with(d), HYPER).unwrap());
+        let [a, b] = [still, moved].map(|d| DensePosterior::fit(&with(d), HYPERPARAMETERS).unwrap());
         // The fit returns the planted effects in addition to the component that the field itself has along them.
         assert!((b.estimated_effects().0 - a.estimated_effects().0 - &planted).norm() < 1e-9);
         let asked = [[30.0, 20.0], [70.0, 10.0]];
@@ -292,7 +292,7 @@ mod tests {
         let at = places(80);
         let away: Vec<[f64; 2]> = at.iter().map(|[x, y]| [x + 1e4, y - 3e3]).collect();
         let fit = |places: &[[f64; 2]]| {
-            DensePosterior::fit(&Observed::without_effects(places.to_vec(), wave(&at)), HYPER).unwrap()
+            DensePosterior::fit(&Observations::without_effects(places.to_vec(), wave(&at)), HYPERPARAMETERS).unwrap()
         };
         let (here, there) = (fit(&at).predict(&[[11.0, 12.0]])[0], fit(&away).predict(&[[10_011.0, -2988.0]])[0]);
         assert!((here.mean_mm - there.mean_mm).abs() < 1e-9 && (here.sigma_mm - there.sigma_mm).abs() < 1e-9);
@@ -300,28 +300,28 @@ mod tests {
 
     #[test]
     fn what_is_no_model_is_refused_in_words() {
-        let of = |observed: &Observed, hyperparameters| {
+        let of = |observed: &Observations, hyperparameters| {
             DensePosterior::fit(observed, hyperparameters).err().unwrap().to_string()
         };
-        let two = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
-        assert_eq!(of(&two, HYPER), "point 2 has a number that is not finite");
-        let none = Observed::without_effects(vec![], vec![]);
-        assert!(of(&none, HYPER).contains("at least 1 points; 0"));
-        let odd = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0]);
-        assert!(of(&odd, HYPER).contains("do not match"));
-        let good = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
-        assert!(of(&good, Hyperparameters { noise_sigma_mm: 0.0, ..HYPER }).contains("the noise is 0 mm"));
+        let two = Observations::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
+        assert_eq!(of(&two, HYPERPARAMETERS), "point 2 has a number that is not finite");
+        let none = Observations::without_effects(vec![], vec![]);
+        assert!(of(&none, HYPERPARAMETERS).contains("at least 1 points; 0"));
+        let odd = Observations::without_effects(vec![[0.0; 2]; 2], vec![1.0]);
+        assert!(of(&odd, HYPERPARAMETERS).contains("do not match"));
+        let good = Observations::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
+        assert!(of(&good, Hyperparameters { noise_sigma_mm: 0.0, ..HYPERPARAMETERS }).contains("the noise is 0 mm"));
         for noise_autocorrelation in [1.0, -0.1, f64::NAN] {
-            assert!(of(&good, Hyperparameters { noise_autocorrelation, ..HYPER }).contains("below 1"));
+            assert!(of(&good, Hyperparameters { noise_autocorrelation, ..HYPERPARAMETERS }).contains("below 1"));
         }
         for path in [vec![0.0; good.places.len() + 1], vec![f64::NAN; good.places.len()]] {
-            assert!(of(&Observed { path, ..good.clone() }, HYPER).contains("do not match"));
+            assert!(of(&Observations { path, ..good.clone() }, HYPERPARAMETERS).contains("do not match"));
         }
-        let alike = Observed {
+        let alike = Observations {
             fixed_effects: DMatrix::from_element(9, 2, 1.0),
-            ..Observed::without_effects(places(9), vec![0.0; 9])
+            ..Observations::without_effects(places(9), vec![0.0; 9])
         };
-        assert!(of(&alike, HYPER).contains("do not separate the effects"));
-        assert!(DensePosterior::fit(&good, HYPER).is_ok(), "two points at one place");
+        assert!(of(&alike, HYPERPARAMETERS).contains("do not separate the effects"));
+        assert!(DensePosterior::fit(&good, HYPERPARAMETERS).is_ok(), "two points at one place");
     }
 }

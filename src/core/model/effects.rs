@@ -4,14 +4,14 @@ use nalgebra::{DMatrix, DVector};
 
 use super::hypotheses::{FieldHypotheses, NoiseKind};
 use super::posterior::Posterior;
-use super::{DensePosterior, ModelError, Observed, Prior, Smoothness};
+use super::{DensePosterior, ModelError, Observations, Prior, Smoothness};
 
 /// Maximum number of points, as the model uses every pair of them. Effects on the whole part are wide, so more points
 /// give no more information.
-const MOST_TOGETHER: usize = 600;
+const MAX_POINTS: usize = 600;
 
 /// Minimum probability of a field, as a share of that of the most probable one; others are ignored.
-const FEW: f64 = 1e-3;
+const MIN_PROBABILITY_SHARE: f64 = 1e-3;
 
 /// Estimated effects with their covariance.
 #[derive(Clone, Debug)]
@@ -32,17 +32,17 @@ impl EffectEstimates {
     ///
     /// # Errors
     /// Returns an error if there are too few points, columns are collinear, or the numbers of rows differ.
-    pub fn estimate(observed: &Observed, priors: &Prior) -> Result<Self, ModelError> {
+    pub fn estimate(observed: &Observations, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();
-        let most = n.min(MOST_TOGETHER);
+        let most = n.min(MAX_POINTS);
         let chosen: Vec<usize> = (0..most).map(|k| k * n / most.max(1)).collect();
         let some = observed.subset(&chosen);
         let fields = FieldHypotheses::over(&some, NoiseKind::PLAIN)?;
         // A smooth field is overconfident if the form is rough; rougher fields are conservative.
         let rough = |smoothness| smoothness == Smoothness::Matern2;
-        let mut likely = Posterior::of(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
-        likely.retain(|(_, weight)| *weight > FEW);
+        let mut likely = Posterior::new(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
+        likely.retain(|(_, weight)| *weight > MIN_PROBABILITY_SHARE);
         let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
         let p = observed.fixed_effects.ncols() + observed.random_effects.ncols();
         let (mut values, mut squares) = (DVector::zeros(p), DMatrix::zeros(p, p));

@@ -3,7 +3,7 @@
 use faer::Mat;
 
 use super::ModelError;
-use super::matern::Curve;
+use super::matern::Correlation;
 
 /// Random field with mean 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,7 +64,7 @@ impl Anisotropy {
     pub const NONE: Self = Self { along: [1.0, 0.0], stretch: 1.0 };
 
     /// Creates an anisotropy from its angle to the x axis and its stretch.
-    pub fn at(angle_rad: f64, stretch: f64) -> Self {
+    pub fn from_angle(angle_rad: f64, stretch: f64) -> Self {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
@@ -90,17 +90,17 @@ impl Field {
 
     /// Returns the covariance of the field at two places.
     pub fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
-        self.pairs().covariance_mm2(a, b)
+        self.pair_covariance().covariance_mm2(a, b)
     }
 
     /// Prepares the covariance for many pairs of places.
-    pub(super) fn pairs(&self) -> Pairs {
-        let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.straightened(axis).map(|v| v / self.range_mm));
-        Pairs { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Curve::of(self.smoothness) }
+    pub(super) fn pair_covariance(&self) -> PairCovariance {
+        let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.isotropic_place(axis).map(|v| v / self.range_mm));
+        PairCovariance { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Correlation::new(self.smoothness) }
     }
 
     /// Maps a place into the plane in which the field is isotropic; the map preserves areas.
-    fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
+    fn isotropic_place(&self, at: [f64; 2]) -> [f64; 2] {
         if self.anisotropy.stretch == 1.0 {
             return at;
         }
@@ -127,15 +127,15 @@ impl Field {
 
 /// Field, prepared for the covariance of many pairs of places.
 #[derive(Clone, Copy)]
-pub(super) struct Pairs {
+pub(super) struct PairCovariance {
     /// Images of the axes in the plane in which the field is isotropic and has a range of 1.
     x: [f64; 2],
     y: [f64; 2],
     variance_mm2: f64,
-    curve: Curve,
+    curve: Correlation,
 }
 
-impl Pairs {
+impl PairCovariance {
     #[inline]
     pub(super) fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
         let (dx, dy) = (a[0] - b[0], a[1] - b[1]);
@@ -149,7 +149,7 @@ impl Pairs {
     }
 
     /// Returns the covariances of some places, a row each, with others, a column each.
-    pub(super) fn across(&self, rows: &[[f64; 2]], columns: &[[f64; 2]]) -> Mat<f64> {
+    pub(super) fn cross_covariance(&self, rows: &[[f64; 2]], columns: &[[f64; 2]]) -> Mat<f64> {
         let mut across = Mat::zeros(rows.len(), columns.len());
         columns.iter().enumerate().for_each(|(c, at)| self.column(*at, rows, across.col_as_slice_mut(c)));
         across
@@ -162,14 +162,14 @@ mod tests {
 
     #[test]
     fn along_its_lay_a_field_is_wider_and_its_range_is_the_mean_of_both() {
-        let field = Field { anisotropy: Anisotropy::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
+        let field = Field { anisotropy: Anisotropy::from_angle(0.5, 4.0), ..Field::new(2.0, 30.0) };
         let at = |r: f64, angle: f64| field.covariance_mm2([1.0, 1.0], [1.0 + r * angle.cos(), 1.0 + r * angle.sin()]);
         let alike = Field::new(2.0, 30.0).covariance_mm2([0.0; 2], [20.0, 0.0]);
         // The range along is 4 times that across: twice the mean along, half of it across.
         assert!((at(40.0, 0.5) - alike).abs() < 1e-12, "{} {alike}", at(40.0, 0.5));
         assert!((at(10.0, 0.5 + std::f64::consts::FRAC_PI_2) - alike).abs() < 1e-12);
         assert_eq!(field.covariance_mm2([3.0, 4.0], [3.0, 4.0]), 4.0);
-        let angle_deg = |angle: f64| Anisotropy::at(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
+        let angle_deg = |angle: f64| Anisotropy::from_angle(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
         for (angle, told) in [(30.0, 30.0), (120.0, -60.0), (-150.0, 30.0), (90.0, 90.0)] {
             assert!((angle_deg(angle) - told).abs() < 1e-9, "{angle}: {}", angle_deg(angle));
         }
@@ -182,10 +182,10 @@ mod tests {
         assert!(of(Field::new(0.0, 1.0)).contains("the field is 0 mm"));
         assert!(of(Field::new(1.0, f64::INFINITY)).contains("the range is inf mm"));
         for lay in
-            [Anisotropy::at(0.0, 0.5), Anisotropy::at(f64::NAN, 2.0), Anisotropy { along: [1.0, 1.0], stretch: 2.0 }]
+            [Anisotropy::from_angle(0.0, 0.5), Anisotropy::from_angle(f64::NAN, 2.0), Anisotropy { along: [1.0, 1.0], stretch: 2.0 }]
         {
             assert!(of(Field { anisotropy, ..Field::new(1.0, 1.0) }).contains("lay"));
         }
-        assert!(of(Field { anisotropy: Anisotropy::at(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
+        assert!(of(Field { anisotropy: Anisotropy::from_angle(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
     }
 }

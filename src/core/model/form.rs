@@ -14,14 +14,14 @@ use rayon::prelude::*;
 use super::budget::{self, BudgetEntry};
 use super::hypotheses::FieldHypotheses;
 use super::intermediate::IntermediateNodes;
-use super::machine_uncertainty::{MachineEffects, MachineUncertainty, UncertaintySource, unsound};
-use super::normals::Normals;
+use super::machine_uncertainty::{MachineEffects, MachineUncertainty, UncertaintySource, invalid_uncertainty};
+use super::random_normals::NormalGenerator;
 use super::posterior::{HypothesisSet, NoisePrior, Posterior, PosteriorSamples, select_hypotheses};
 use super::{AreaOptions, IsoFigures, SlopeFigures};
-use super::{Hyperparameters, ModelError, Observed, Prediction, Prior, orthonormal_base, spacing_mm};
-use crate::form::{IsoFits, SlopesAt};
-use crate::geometry::{Nearest, Point, Vector};
-use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
+use super::{Hyperparameters, ModelError, Observations, Prediction, Prior, orthonormal_base, spacing_mm};
+use crate::form::{IsoFits, SlopeOperator};
+use crate::geometry::{PointTree, Point, Vector};
+use crate::registration::{Deviation, MIN_SIGMA_MM, PointStatus, Registration, robust_median_and_sigma};
 
 /// Posterior of the form of a part, from a registered measurement.
 #[derive(Clone, Debug)]
@@ -109,30 +109,30 @@ pub struct Interval {
 const SAMPLES: usize = 1000;
 /// Number of samples of one kind of field: the smooth fields for the lower bounds, the rough fields for the upper
 /// bounds.
-const FEWER: usize = 250;
+const BOUND_SAMPLES: usize = 250;
 /// Minimum probability at which a possibility counts: that the field is rough, or that isolated points are neighbours
 /// by chance.
-const MAY_BE: f64 = 0.025;
+const MIN_PROBABILITY: f64 = 0.025;
 /// Maximum number of places at which the samples are evaluated.
-const MOST_PLACES: usize = 6000;
+const MAX_PLACES: usize = 6000;
 /// Number of samples that are processed at a time.
-const A_TIME: usize = 50;
+const SAMPLES_PER_BLOCK: usize = 50;
 /// Minimum logarithm of the likelihood ratio of the best field and no field for a form to count as detected. Without a
 /// form one part in a hundred exceeds it.
-const EVIDENCE: f64 = 3.0;
+const MIN_EVIDENCE: f64 = 3.0;
 /// Limit of the distance from the field, in robust sigmas: a larger distance is not noise.
-const STANDS_OUT: f64 = 6.0;
+const OUTLIER_SIGMAS: f64 = 6.0;
 /// Maximum share of points that can stand out from the field. If more stand out, they are part of the form itself.
-const MOST_APART: f64 = 0.1;
+const MAX_OUTLIER_SHARE: f64 = 0.1;
 /// Minimum degrees of freedom for a field to separate the noise from the form.
-const FEW_FREE: f64 = 20.0;
+const MIN_DEGREES_OF_FREEDOM: f64 = 20.0;
 /// Number of points below which correlated noise of the probe, a drift for example, can look like form.
 const FEW_POINTS: usize = 200;
 /// Factor of the values below the median if there are few points. In simulations of a drift at 25, 50 and 100 points,
 /// factor 1 covers the RMS in 91, 83 and 89 of 100 parts, this factor in 92 and more.
 const FEW_LOW_FACTOR: f64 = 0.75;
 /// Share of the largest variance below which a direction counts as locked.
-const HELD: f64 = 1e-13;
+const MAX_LOCKED_SHARE: f64 = 1e-13;
 
 impl Form {
     /// Fits the model to the deviations of a registration, over x and y of the model frame, and returns the form.
@@ -140,28 +140,28 @@ impl Form {
     /// # Errors
     /// Too few points, or points from which the form cannot be estimated.
     pub fn estimate(registration: &Registration, inputs: &ModelInputs) -> Result<Self, ModelError> {
-        let seen = FittedModel::of(registration, inputs, true)?;
+        let seen = FittedModel::fit(registration, inputs, true)?;
         let posterior = seen.posterior(inputs);
         let chosen: Vec<usize> = thinned(seen.observed.places.len()).collect();
         let some = seen.observed.subset(&chosen);
         let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
         let of = |draws: PosteriorSamples, is_between: bool| {
-            let drawn = seen.drawn(draws, some.places.clone(), some.fixed_effects.clone(), is_between);
-            let drawn = SampledForms { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
-            drawn.without(at(&seen.of_all(&chosen)).as_ref())
+            let drawn = seen.evaluate_samples(draws, some.places.clone(), some.fixed_effects.clone(), is_between);
+            let drawn = SampledForms { chosen: chosen.clone(), ..drawn }.with_smooth_sigma(&seen.observed);
+            drawn.without_ground_in(at(&seen.indices_of_all(&chosen)).as_ref())
         };
         let whole = |drawn: SampledForms, apart: &[usize], inputs: &ModelInputs| {
-            seen.with_those(apart, drawn.with_the_scatter(&seen.observed, &posterior, inputs), inputs).after_best_fit()
+            seen.with_unexplained_points(apart, drawn.with_unresolved_form(&seen.observed, &posterior, inputs), inputs).after_best_fit()
         };
         let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1), true);
         let slope = seen.slope(inputs, &posterior, &drawn);
         let drawn = whole(drawn, &seen.unexplained, inputs);
         let form = if seen.is_chance { &[][..] } else { &seen.confirmed };
         let least =
-            whole(of(posterior.samples(HypothesisSet::Smooth, FEWER, 2), false), form, &least_form(&posterior, inputs))
-                .told_by();
-        let most = match posterior.is_rough() > MAY_BE {
-            true => whole(of(posterior.samples(HypothesisSet::Rough, FEWER, 3), false), &seen.unexplained, inputs).told_by(),
+            whole(of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2), false), form, &min_form_inputs(&posterior, inputs))
+                .figures_at_places();
+        let most = match posterior.rough_probability() > MIN_PROBABILITY {
+            true => whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3), false), &seen.unexplained, inputs).figures_at_places(),
             false => Vec::new(),
         };
         let ground_in = at(&drawn.chosen);
@@ -192,29 +192,29 @@ impl Form {
         places: &[(Point, Vector)],
         is_whole: bool,
     ) -> Result<Self, ModelError> {
-        let seen = FittedModel::of(registration, inputs, false)?;
+        let seen = FittedModel::fit(registration, inputs, false)?;
         let posterior = seen.posterior(inputs);
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
         // If there are many more places than touches, the places are close enough to each other.
         let is_between = places.len() < 2 * seen.inliers.len();
-        let at = places.iter().map(plane).collect();
-        let drawn = seen.drawn(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
+        let at = places.iter().map(xy).collect();
+        let drawn = seen.evaluate_samples(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
         let drawn = SampledForms { untouched: (0..places.len()).collect(), ..drawn };
-        let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
+        let drawn = drawn.rough_where_touched(&seen.observed.places).with_smooth_sigma(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.machine_effects.columns(places.iter().copied()));
-        let drawn = drawn.without(ground_in.as_ref());
+        let drawn = drawn.without_ground_in(ground_in.as_ref());
         let slope = if is_whole { seen.slope(inputs, &posterior, &drawn) } else { None };
-        let drawn = seen.with_those(&seen.unexplained, drawn.with_what_is_narrow(inputs), inputs).after_best_fit();
+        let drawn = seen.with_unexplained_points(&seen.unexplained, drawn.with_narrow_form(inputs), inputs).after_best_fit();
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
     }
 }
 
 /// Registration in the terms of the model, with the field hypotheses.
 struct FittedModel {
-    motions: Motions,
+    motions: FreeMotions,
     /// Observations at all used points.
-    all: Observed,
+    all: Observations,
     /// Indices of the points that no field explains, ascending. They count as form nevertheless.
     unexplained: Vec<usize>,
     /// Those of them that neighbouring touches confirm.
@@ -223,7 +223,7 @@ struct FittedModel {
     is_chance: bool,
     /// Indices of the other points, and the observations there.
     inliers: Vec<usize>,
-    observed: Observed,
+    observed: Observations,
     /// Effects of the machine, its probe, the temperature and the datum on all points together.
     machine_effects: MachineEffects,
     /// Columns of these effects that are ground into the part, at all used points; None before the first correction.
@@ -233,7 +233,7 @@ struct FittedModel {
 
 impl FittedModel {
     /// Builds the hypotheses without the points that no field explains.
-    fn of(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
+    fn fit(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
         /// Number of rounds. Each round estimates the hyperparameters again. Without the tallest points of a defect,
         /// its flanks stand out.
         const ROUNDS: usize = 3;
@@ -242,11 +242,11 @@ impl FittedModel {
         }
         /// Number of touches around one.
         const AROUND: f64 = 8.0;
-        let mut seen = Self::with_all_in_the_fit(registration, inputs, at_points)?;
+        let mut seen = Self::from_fitted_points(registration, inputs, at_points)?;
         for _ in 0..ROUNDS {
-            let more = seen.unexplained(inputs);
+            let more = seen.find_unexplained(inputs);
             let apart = seen.unexplained.len() + more.len();
-            if more.is_empty() || apart as f64 > MOST_APART * seen.all.places.len() as f64 {
+            if more.is_empty() || apart as f64 > MAX_OUTLIER_SHARE * seen.all.places.len() as f64 {
                 break;
             }
             let mut apart = [&seen.unexplained[..], &more[..]].concat();
@@ -260,23 +260,23 @@ impl FittedModel {
         let left_out = registration.deviations.iter().filter(|d| d.status == PointStatus::Outlier).count();
         let alone = (left_out + seen.unexplained.len() - seen.confirmed.len()) as f64;
         let by_chance = 0.5 * AROUND * alone * alone / seen.all.places.len() as f64;
-        Ok(Self { is_chance: by_chance > MAY_BE, ..seen })
+        Ok(Self { is_chance: by_chance > MIN_PROBABILITY, ..seen })
     }
 
     fn posterior(&self, inputs: &ModelInputs) -> Posterior<'_> {
-        Posterior::of(&self.fields, &self.observed, inputs.prior.as_ref(), probe(inputs))
+        Posterior::new(&self.fields, &self.observed, inputs.prior.as_ref(), noise_prior(inputs))
     }
 
     /// Evaluates the samples at the places, in the frame of the registration. Each sample contains the motion that fits
     /// it best to the observations.
-    fn drawn(
+    fn evaluate_samples(
         &self,
         draws: PosteriorSamples,
         places: Vec<[f64; 2]>,
         effects: DMatrix<f64>,
         is_between: bool,
     ) -> SampledForms {
-        let Observed { fixed_effects: rows, random_effects: stated, deviations_mm, .. } = &self.observed;
+        let Observations { fixed_effects: rows, random_effects: stated, deviations_mm, .. } = &self.observed;
         let weights = rows * inverse_of_products(rows);
         let found = weights.tr_mul(&DVector::from_column_slice(deviations_mm));
         let beside = weights.tr_mul(stated) * &draws.random_effects;
@@ -286,42 +286,42 @@ impl FittedModel {
             let of_form = &sums * waves;
             DMatrix::from_fn(rows.ncols(), waves.ncols(), |m, c| found[m] - beside[(m, c)] - of_form[(m, c)])
         });
-        SampledForms::by(&self.fields, draws, (places, effects), &moved, is_between)
+        SampledForms::evaluate(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
     /// Returns the points whose residual from the field is too large for noise, as indices of all used points.
-    fn unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
+    fn find_unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
         /// Minimum number of points: with fewer, the usual residual is unknown.
         const MIN_POINTS: usize = 40;
-        let Observed { places, deviations_mm, fixed_effects: effects, random_effects: stated, .. } = &self.observed;
+        let Observations { places, deviations_mm, fixed_effects: effects, random_effects: stated, .. } = &self.observed;
         if places.len() < MIN_POINTS {
             return Vec::new();
         }
         let posterior = self.posterior(inputs);
         let (waves, of_stated) = posterior.mean();
-        let told = self.fields.at_points(&waves);
+        let told = self.fields.evaluate_at_points(&waves);
         let moved = stated * of_stated;
         let left = |k: usize| deviations_mm[k] - told[k] - moved[k];
-        let residuals_mm = best_fitted(DMatrix::from_fn(places.len(), 1, |k, _| left(k)), effects);
-        let (middle_mm, sigma_mm) = robust_sigma(residuals_mm.iter().copied());
+        let residuals_mm = without_best_fit(DMatrix::from_fn(places.len(), 1, |k, _| left(k)), effects);
+        let (middle_mm, sigma_mm) = robust_median_and_sigma(residuals_mm.iter().copied());
         // If a field passes through every point, the residuals do not show the noise.
         let scatter_mm = posterior.mean_hyperparameters().noise_sigma_mm;
-        let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * scatter_mm).max(LEAST_SIGMA_MM);
+        let limit_mm = OUTLIER_SIGMAS * sigma_mm.max(0.5 * scatter_mm).max(MIN_SIGMA_MM);
         let stands_out = |k: &usize| (residuals_mm[*k] - middle_mm).abs() > limit_mm;
-        self.of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
+        self.indices_of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
     }
 
     /// Converts indices of the points in the model to indices of all used points.
-    fn of_all(&self, chosen: &[usize]) -> Vec<usize> {
+    fn indices_of_all(&self, chosen: &[usize]) -> Vec<usize> {
         chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
     /// Adds points that no field explains to the samples, each with its measured deviation minus the noise of a touch.
     /// At measured points they are inserted in the order of the points. At other places each replaces the nearest
     /// place.
-    fn with_those(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
+    fn with_unexplained_points(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
-        let chosen = self.of_all(&drawn.chosen);
+        let chosen = self.indices_of_all(&drawn.chosen);
         let drawn = SampledForms { chosen, ..drawn };
         if apart.is_empty() {
             return drawn;
@@ -334,17 +334,17 @@ impl FittedModel {
             apart.truncate((count * rows).div_ceil(self.inliers.len().max(1)));
             apart.sort_unstable();
         }
-        let found = self.touched_at(&apart, &drawn, inputs);
-        if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
+        let found = self.samples_at_points(&apart, &drawn, inputs);
+        if at_points { drawn.joined_with(found) } else { drawn.replaced_by(&found) }
     }
 
     /// Returns samples of the form at the points, from their deviations: one column for each given sample.
-    fn touched_at(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
+    fn samples_at_points(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
-        let of_probe = |mm: f64| probe(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
+        let of_probe = |mm: f64| noise_prior(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
         let mut forms = [0, 1].map(|_| DMatrix::zeros(points.len(), drawn.noise_mm.len()));
         for c in 0..drawn.noise_mm.len() {
-            let mut normals = Normals::new(6, c as u64);
+            let mut normals = NormalGenerator::new(6, c as u64);
             let scatter_mm = of_probe(drawn.noise_mm[c]);
             // The tallest touch of a defect probably has positive noise. Therefore the second samples, which bound the
             // extremes, use one noise for all touches.
@@ -368,12 +368,12 @@ impl FittedModel {
             random_effects: drawn.random_effects.clone(),
             intermediate: None,
         };
-        found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
+        found.without_ground_in(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
 
     /// Builds the hypotheses over the points that the pose was fitted to. The other points are far from the surface,
     /// and no field describes them.
-    fn with_all_in_the_fit(
+    fn from_fitted_points(
         registration: &Registration,
         inputs: &ModelInputs,
         at_points: bool,
@@ -383,12 +383,12 @@ impl FittedModel {
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, min_points: 7 });
         }
-        let motions = Motions::of(registration, used.iter().map(|d| d.point));
-        let stated = motions.stated(registration, inputs)?;
+        let motions = FreeMotions::from_registration(registration, used.iter().map(|d| d.point));
+        let stated = motions.machine_effects(registration, inputs)?;
         let columns = stated.columns(used.iter().map(|d| (d.point, d.normal)));
         let (shown, ground_in) =
             if inputs.is_corrected { (DMatrix::zeros(used.len(), 0), Some(columns)) } else { (columns, None) };
-        let mut all = Observed { random_effects: shown, ..motions.observed(&used) };
+        let mut all = Observations { random_effects: shown, ..motions.observed(&used) };
         if at_points && is_path(&all.places) {
             all.path = path;
         }
@@ -411,9 +411,9 @@ impl FittedModel {
 
     /// Computes the slopes of the samples, before form without a slope is added to them.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
-        let slopes = SlopesAt::new(&drawn.places, inputs.area.integration_mm)?;
-        let smooth = [0, 1].map(|k| best_fitted(drawn.forms[k].clone(), &drawn.effects));
-        Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), inputs)))
+        let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
+        let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
+        Some(SlopeFigures::from_forms(&slopes, &smooth, (is_form_detected(posterior), inputs)))
     }
 
     /// Builds the form from the samples, without slopes. `ground_in` has the columns of the effects that are ground
@@ -428,9 +428,9 @@ impl FittedModel {
     ) -> Form {
         let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.inliers));
         let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.random_effects);
-        let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
+        let covariance = best_fit_covariance(&self.observed, (&self.fields, posterior), alike);
         // Points apart from the field are detected, whatever the others show.
-        let is_seen = is_seen(posterior) || !self.unexplained.is_empty();
+        let is_seen = is_form_detected(posterior) || !self.unexplained.is_empty();
         let figures = drawn.figures(is_seen, ends, inputs);
         let budget = if is_whole { self.budget(inputs, posterior, drawn, ground_in, &figures) } else { Vec::new() };
         let iso = IsoFits::new(&drawn.places, inputs.area.middle_mm).filter(|_| is_whole);
@@ -446,12 +446,12 @@ impl FittedModel {
             points: drawn.points(),
             figures,
             budget,
-            iso: iso.map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, inputs)),
+            iso: iso.map(|fits| IsoFigures::from_forms(&fits, &drawn.forms, is_seen, inputs)),
             slope: None,
-            rms_smooth_sigma_mm: drawn.known_mm(),
+            rms_smooth_sigma_mm: drawn.rms_smooth_sigma_mm(),
             is_detected: is_seen,
             degrees_of_freedom: posterior.degrees_of_freedom(),
-            is_underdetermined: is_of_few(posterior, inputs),
+            is_underdetermined: is_underdetermined(posterior, inputs),
         }
     }
 
@@ -463,8 +463,8 @@ impl FittedModel {
         ground_in: Option<DMatrix<f64>>,
         figures: &FormFigures,
     ) -> Vec<BudgetEntry> {
-        let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
-        let uncertainties_mm = [figures.rms, figures.pv_998].map(|of| of.standard_mm());
+        let ground_in = ground_in.map(|columns| without_best_fit(columns, &drawn.effects));
+        let uncertainties_mm = [figures.rms, figures.pv_998].map(|of| of.standard_uncertainty_mm());
         let model = (&self.fields, posterior);
         let points = (&self.observed, &self.machine_effects.sources()[..]);
         let mut budget = budget::decompose(points, model, (drawn, ground_in.as_ref()), uncertainties_mm);
@@ -474,8 +474,8 @@ impl FittedModel {
 }
 
 /// Returns true if the points show a form.
-fn is_seen(posterior: &Posterior) -> bool {
-    posterior.evidence > EVIDENCE
+fn is_form_detected(posterior: &Posterior) -> bool {
+    posterior.evidence > MIN_EVIDENCE
 }
 
 /// Returns the inputs for the lower bounds of the form: if the noise is consistent with that of the probe, all of it
@@ -483,10 +483,10 @@ fn is_seen(posterior: &Posterior) -> bool {
 ///
 /// A reference sphere with some twenty touches determines the noise of the probe to 15 %. The excess of the noise over
 /// that value is not necessarily form.
-fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
+fn min_form_inputs(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
     const MAX_EXCESS_SIGMAS: f64 = 2.0;
-    match probe(inputs) {
+    match noise_prior(inputs) {
         Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAX_EXCESS_SIGMAS * u).exp() => {
             ModelInputs { probe_noise_mm: [0.0; 2], ..*inputs }
         }
@@ -495,12 +495,12 @@ fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
 }
 
 /// Returns true if the points are too few to separate the form from the noise, and the noise of the probe is unknown.
-fn is_of_few(posterior: &Posterior, inputs: &ModelInputs) -> bool {
-    posterior.degrees_of_freedom() < FEW_FREE && probe(inputs).is_none()
+fn is_underdetermined(posterior: &Posterior, inputs: &ModelInputs) -> bool {
+    posterior.degrees_of_freedom() < MIN_DEGREES_OF_FREEDOM && noise_prior(inputs).is_none()
 }
 
 /// Returns the prior of the noise of the probe; None if it is unknown.
-fn probe(inputs: &ModelInputs) -> NoisePrior {
+fn noise_prior(inputs: &ModelInputs) -> NoisePrior {
     (inputs.probe_noise_mm[0] > 0.0).then_some(inputs.probe_noise_mm)
 }
 
@@ -521,13 +521,13 @@ fn is_path(places: &[[f64; 2]]) -> bool {
     median_mm <= NEAR * spacing_mm(places)
 }
 
-fn plane((point, _): &(Point, Vector)) -> [f64; 2] {
+fn xy((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
 /// Returns at most [`MOST_PLACES`] indices below `of`, evenly spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
-    let most = of.min(MOST_PLACES);
+    let most = of.min(MAX_PLACES);
     (0..most).map(move |k| k * of / most)
 }
 
@@ -584,8 +584,8 @@ impl Default for ModelInputs {
 ///
 /// This is the covariance of least squares with correlated deviations: A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (Aitken
 /// 1935). K is the mean of the covariances of all fields. The covariance of the effects common to all points is added.
-fn of_the_fit(
-    observed: &Observed,
+fn best_fit_covariance(
+    observed: &Observations,
     (fields, posterior): (&FieldHypotheses, &Posterior),
     alike: &DMatrix<f64>,
 ) -> DMatrix<f64> {
@@ -638,7 +638,7 @@ struct IntermediateForms {
 
 impl SampledForms {
     /// Evaluates the samples at the places, adds the motions `moved`, and does the same between the places if asked to.
-    fn by(
+    fn evaluate(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
         (places, effects): (Vec<[f64; 2]>, DMatrix<f64>),
@@ -648,13 +648,13 @@ impl SampledForms {
         let PosteriorSamples { coefficients: waves, noise_mm: scatter_mm, truncated_mm: narrow_mm, random_effects: stated } = draws;
         let count = scatter_mm.len();
         let at = fields.basis.at(&places);
-        let firsts: Vec<usize> = (0..count).step_by(A_TIME).collect();
-        let is_between = is_between && places.len() < MOST_PLACES;
-        let between = if is_between { IntermediateNodes::of(&places, &fields.basis) } else { None };
+        let firsts: Vec<usize> = (0..count).step_by(SAMPLES_PER_BLOCK).collect();
+        let is_between = is_between && places.len() < MAX_PLACES;
+        let between = if is_between { IntermediateNodes::new(&places, &fields.basis) } else { None };
         let axes = between.as_ref().map(|between| fields.basis.grid(&between.grid));
         let mut forms = waves.each_ref().map(|waves| {
             let some = |first: &usize| {
-                let of = &at * waves.subcols(*first, A_TIME.min(count - first));
+                let of = &at * waves.subcols(*first, SAMPLES_PER_BLOCK.min(count - first));
                 (0..of.ncols()).flat_map(|c| of.col_as_slice(c).to_vec()).collect::<Vec<f64>>()
             };
             DMatrix::from_vec(places.len(), count, firsts.par_iter().flat_map_iter(some).collect())
@@ -669,7 +669,7 @@ impl SampledForms {
                 let all = (0..count).into_par_iter().flat_map_iter(one).collect();
                 DMatrix::from_vec(between.nodes.len(), count, all)
             });
-            IntermediateForms { effects: between.rows(&effects), forms: on, nodes: between }
+            IntermediateForms { effects: between.interpolate(&effects), forms: on, nodes: between }
         });
         let mut between = between;
         for (k, moved) in moved.iter().enumerate() {
@@ -698,7 +698,7 @@ impl SampledForms {
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
-        let tree = Nearest::new(touched.iter().map(at));
+        let tree = PointTree::new(touched.iter().map(at));
         let is_touched = |k: &usize| tree.nearest(&at(&self.places[*k]), 1).any(|(_, square)| square < near2);
         for k in (0..self.places.len()).filter(|k| !is_touched(k)) {
             let row = self.forms[0].row(k).into_owned();
@@ -709,11 +709,11 @@ impl SampledForms {
 
     /// Sets the standard uncertainty of the smooth form. The random effects also move the part, and so do motions at
     /// other places. Neither is form, so in these cases the best fit is removed first.
-    fn known_as(self, observed: &Observed) -> Self {
+    fn with_smooth_sigma(self, observed: &Observations) -> Self {
         let at_points = !self.chosen.is_empty();
         let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
-            true => spread_mm(&self.forms[0]),
-            false => spread_mm(&best_fitted(self.forms[0].clone(), &self.effects)),
+            true => row_sigmas_mm(&self.forms[0]),
+            false => row_sigmas_mm(&without_best_fit(self.forms[0].clone(), &self.effects)),
         };
         Self { smooth_sigma_mm, ..self }
     }
@@ -722,18 +722,18 @@ impl SampledForms {
     ///
     /// The residuals of a smooth form are the noise of the probe and, beyond that, form. This share of the residual at
     /// a point is added. Its uncertainty follows from the noise of the probe.
-    fn with_the_scatter(mut self, observed: &Observed, posterior: &Posterior, inputs: &ModelInputs) -> Self {
+    fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
         let seen = observed.subset(&self.chosen);
         let base = orthonormal_base(seen.all_effects());
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
         let found = &seen.deviations_mm;
-        if is_of_few(posterior, inputs) {
+        if is_underdetermined(posterior, inputs) {
             let mut all = DMatrix::zeros(found.len(), self.noise_mm.len());
             let free = posterior.degrees_of_freedom().max(1.0);
             for (c, mut form) in all.column_iter_mut().enumerate() {
-                let mut normals = Normals::new(7, c as u64);
+                let mut normals = NormalGenerator::new(7, c as u64);
                 // So few points can by chance show less than the form has elsewhere: a chi-squared number samples the
                 // variance.
                 let chi2: f64 = (0..free as usize).map(|_| normals.next().powi(2)).sum();
@@ -747,8 +747,8 @@ impl SampledForms {
         for (forms, narrow_mm) in forms.iter_mut().zip(narrow_mm) {
             let rows = forms.nrows();
             let of = |(c, form): (usize, &mut [f64])| {
-                let mut normals = Normals::new(2, c as u64);
-                let [probe_mm, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut normals);
+                let mut normals = NormalGenerator::new(2, c as u64);
+                let [probe_mm, more_mm] = split_noise(scatter_mm[c], narrow_mm[c], inputs, &mut normals);
                 let is_form = more_mm.powi(2) / (probe_mm.powi(2) + more_mm.powi(2)).max(f64::MIN_POSITIVE);
                 if is_form < 1e-6 {
                     return;
@@ -761,19 +761,19 @@ impl SampledForms {
             };
             forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
         }
-        self.narrow_between(inputs);
+        self.add_narrow_between(inputs);
         self
     }
 
     /// Adds form that is too narrow to be resolved to places that were not touched: the excess of the noise over that
     /// of the probe, and short waves.
-    fn with_what_is_narrow(mut self, inputs: &ModelInputs) -> Self {
+    fn with_narrow_form(mut self, inputs: &ModelInputs) -> Self {
         add_narrow(&mut self.forms, (&self.noise_mm, &self.truncated_mm), inputs, 4);
-        self.narrow_between(inputs);
+        self.add_narrow_between(inputs);
         self
     }
 
-    fn narrow_between(&mut self, inputs: &ModelInputs) {
+    fn add_narrow_between(&mut self, inputs: &ModelInputs) {
         if let Some(between) = &mut self.intermediate {
             add_narrow(&mut between.forms, (&self.noise_mm, &self.truncated_mm), inputs, 8);
         }
@@ -783,11 +783,11 @@ impl SampledForms {
     ///
     /// A part that was corrected by a measurement has the errors of the machine as its form, d = (f - E t) + E t + e.
     /// The points do not show t. It is as uncertain as before any measurement.
-    fn without(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
+    fn without_ground_in(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
         let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
             for (c, mut form) in forms.column_iter_mut().enumerate() {
-                let mut normals = Normals::new(5, c as u64);
+                let mut normals = NormalGenerator::new(5, c as u64);
                 for column in columns.column_iter() {
                     form.axpy(-normals.next(), &column, 1.0);
                 }
@@ -795,14 +795,14 @@ impl SampledForms {
         };
         self.forms.iter_mut().for_each(|forms| take(forms, columns));
         if let Some(IntermediateForms { nodes: between, forms, .. }) = &mut self.intermediate {
-            let columns = between.rows(columns);
+            let columns = between.interpolate(columns);
             forms.iter_mut().for_each(|forms| take(forms, &columns));
         }
         self
     }
 
     /// Joins the samples of both, in the order of the points.
-    fn beside(self, other: Self) -> Self {
+    fn joined_with(self, other: Self) -> Self {
         let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
         order.sort_unstable_by_key(|&row| chosen[row]);
@@ -883,13 +883,13 @@ impl SampledForms {
     }
 
     /// Returns the RMS over all places of the standard uncertainty of the smooth form, in mm.
-    fn known_mm(&self) -> f64 {
+    fn rms_smooth_sigma_mm(&self) -> f64 {
         let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
     /// Returns the figures of each sample at the places alone: RMS by the first variance, extremes by the second.
-    fn told_by(&self) -> Vec<[f64; 3]> {
+    fn figures_at_places(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
@@ -916,12 +916,12 @@ impl SampledForms {
         self.untouched.iter().for_each(|&row| is_touched[row] = false);
         let of = |(c, form): (usize, &[f64])| {
             let squares: f64 = form.iter().map(|v| v * v).sum();
-            let [low, high] = ends(form.iter().copied());
+            let [low, high] = min_and_max(form.iter().copied());
             // The outermost of all places are left out, but never a touched place.
             let touched = form.iter().zip(&is_touched).filter_map(|(value, is)| is.then_some(*value));
             let mut others: Vec<f64> = self.untouched.iter().map(|&row| form[row]).collect();
             between.iter().for_each(|between| others.extend(between.column(c).iter()));
-            let [mut lowest, mut highest] = ends(touched);
+            let [mut lowest, mut highest] = min_and_max(touched);
             if let Some(last) = others.len().checked_sub(1) {
                 let left_out = ((rows - self.untouched.len() + others.len()) / 1000).min(last / 2);
                 let mut nth = |k: usize| *others.select_nth_unstable_by(k, f64::total_cmp).1;
@@ -934,7 +934,7 @@ impl SampledForms {
     }
 }
 
-fn ends(of: impl Iterator<Item = f64>) -> [f64; 2] {
+fn min_and_max(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
@@ -948,8 +948,8 @@ fn add_narrow(
     for (forms, narrow_mm) in forms.iter_mut().zip(narrow_mm) {
         let rows = forms.nrows();
         let of = |(c, form): (usize, &mut [f64])| {
-            let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut Normals::new(2, c as u64));
-            let mut normals = Normals::new(stream, c as u64);
+            let [_, more_mm] = split_noise(scatter_mm[c], narrow_mm[c], inputs, &mut NormalGenerator::new(2, c as u64));
+            let mut normals = NormalGenerator::new(stream, c as u64);
             if more_mm > 0.0 {
                 form.iter_mut().for_each(|value| *value += more_mm * normals.next());
             }
@@ -960,21 +960,21 @@ fn add_narrow(
 
 /// Samples the noise of the probe, and returns it with the standard deviation of the form that is too narrow. If the
 /// noise of the probe is unknown, all noise counts as the probe's.
-fn parted(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut Normals) -> [f64; 2] {
-    let Some([probe_mm, probe_u]) = probe(inputs) else { return [scatter_mm, narrow_mm] };
+fn split_noise(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut NormalGenerator) -> [f64; 2] {
+    let Some([probe_mm, probe_u]) = noise_prior(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
     [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
 
 /// Subtracts from each form its own best fit.
-fn best_fitted(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
+fn without_best_fit(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
     let base = orthonormal_base(effects.clone());
     forms -= &base * base.tr_mul(&forms);
     forms
 }
 
 /// Returns the standard deviation of each row.
-fn spread_mm(forms: &DMatrix<f64>) -> Vec<f64> {
+fn row_sigmas_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
 
@@ -984,7 +984,7 @@ impl Interval {
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
 
     /// Returns the standard uncertainty: the width of the 95 % interval over that of a standard normal variable.
-    pub fn standard_mm(&self) -> f64 {
+    pub fn standard_uncertainty_mm(&self) -> f64 {
         const WIDTH: f64 = 2.0 * 1.96;
         (self.high_mm - self.low_mm) / WIDTH
     }
@@ -992,7 +992,7 @@ impl Interval {
     /// Builds the interval of equally probable values. Below the median each quantile is the lower of its own and that
     /// of `lower`. Above the median it is the highest of its own and those of `higher`. Without `has_low`, the
     /// quantiles below the median are 0.
-    pub(super) fn of(
+    pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
         has_low: bool,
@@ -1040,47 +1040,47 @@ impl Interval {
 }
 
 /// Motions that the registration was free to make, about the centroid of the points and in units of their size.
-pub(super) struct Motions {
+pub(super) struct FreeMotions {
     centre: Point,
     size_mm: f64,
     /// One column for each motion.
     free: DMatrix<f64>,
 }
 
-impl Motions {
-    pub(super) fn of(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
+impl FreeMotions {
+    pub(super) fn from_registration(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
         let n = points.clone().count() as f64;
         let centre = Point::from(points.clone().fold(Vector::zeros(), |sum, p| sum + p.coords) / n);
         let size_mm = (points.map(|p| (p - centre).norm_squared()).sum::<f64>() / n).sqrt().max(f64::MIN_POSITIVE);
-        let about = about(centre, size_mm);
+        let about = motion_about(centre, size_mm);
         let covariance = about * registration.quality.covariance * about.transpose();
         let SymmetricEigen { eigenvalues, eigenvectors } = covariance.symmetric_eigen();
-        let seen = |k: &usize| eigenvalues[*k] > HELD * eigenvalues.max();
+        let seen = |k: &usize| eigenvalues[*k] > MAX_LOCKED_SHARE * eigenvalues.max();
         let columns: Vec<Vector6<f64>> = (0..6).filter(seen).map(|k| eigenvectors.column(k).into_owned()).collect();
         let free = DMatrix::from_fn(6, columns.len(), |r, c| columns[c][r]);
         Self { centre, size_mm, free }
     }
 
     /// Returns the observations of the used points, with the motions as fixed effects.
-    pub(super) fn observed(&self, used: &[&Deviation]) -> Observed {
+    pub(super) fn observed(&self, used: &[&Deviation]) -> Observations {
         let places = used.iter().map(|d| [d.point.x, d.point.y]).collect();
         let deviations_mm = used.iter().map(|d| d.deviation_mm).collect();
         let fixed_effects = self.rows(used.iter().map(|d| (d.point, d.normal)));
-        Observed { fixed_effects, ..Observed::without_effects(places, deviations_mm) }
+        Observations { fixed_effects, ..Observations::without_effects(places, deviations_mm) }
     }
 
     /// Returns the effects of machine and datum on all points together, about their centroid.
     ///
     /// # Errors
     /// [`ModelError::Stated`] if a stated uncertainty is not valid.
-    pub(super) fn stated(
+    pub(super) fn machine_effects(
         &self,
         registration: &Registration,
         inputs: &ModelInputs,
     ) -> Result<MachineEffects, ModelError> {
         let of_others = [inputs.radius_sigma_mm, inputs.scale_sigma];
         let datum = inputs.locked_sigmas.unwrap_or_default();
-        if let Some((what, value)) = unsound(&inputs.machine, of_others, &datum) {
+        if let Some((what, value)) = invalid_uncertainty(&inputs.machine, of_others, &datum) {
             return Err(ModelError::StatedUncertainty { what, value });
         }
         let model_from_machine = registration.cmm_from_model.rotation.transpose();
@@ -1103,14 +1103,14 @@ impl Motions {
         let whole = &self.free * covariance * self.free.transpose();
         let whole = Matrix6::from_fn(|r, c| whole[(r, c)]);
         // The size is positive, so the matrix is invertible.
-        let back = about(self.centre, self.size_mm).try_inverse().unwrap_or_else(Matrix6::identity);
+        let back = motion_about(self.centre, self.size_mm).try_inverse().unwrap_or_else(Matrix6::identity);
         back * whole * back.transpose()
     }
 }
 
 /// Returns the matrix that converts a twist about the origin to the motion of a centre and the turn about it, the
 /// latter in mm at the distance `size_mm`.
-fn about(centre: Point, size_mm: f64) -> Matrix6<f64> {
+fn motion_about(centre: Point, size_mm: f64) -> Matrix6<f64> {
     let mut about = Matrix6::identity();
     // v + omega x c
     let cross: Matrix3<f64> = -centre.coords.cross_matrix();

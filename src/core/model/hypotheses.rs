@@ -30,38 +30,38 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::basis::Basis;
-use super::{Anisotropy, ModelError, Observed, Smoothness, orthonormal_base, spacing_mm};
+use super::{Anisotropy, ModelError, Observations, Smoothness, orthonormal_base, spacing_mm};
 
 /// Smoothnesses of the hypotheses, from rough to smooth.
-pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
+pub(super) const SMOOTHNESSES: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
 /// Number of ranges for each smoothness.
 const RANGES: usize = 9;
 /// Shortest range, in spacings of the points.
-const LEAST_RANGE: f64 = 2.5;
+const MIN_RANGE_SPACINGS: f64 = 2.5;
 /// Longest range, in sizes of the part (root mean square distance of the points from their centroid).
-const MOST_RANGE: f64 = 5.0;
+const MAX_RANGE_SIZES: f64 = 5.0;
 /// Shortest range, in half wavelengths of the shortest cosine.
-const WAVES_A_RANGE: f64 = 2.0;
+const MIN_RANGE_HALF_WAVELENGTHS: f64 = 2.0;
 /// Number of variance ratios (field to noise), in equal steps of their logarithm.
-const STRENGTHS: usize = 33;
+const VARIANCE_RATIOS: usize = 33;
 /// Lowest and highest variance ratio.
-const STRENGTH: [f64; 2] = [1e-3, 1e5];
+const VARIANCE_RATIO_LIMITS: [f64; 2] = [1e-3, 1e5];
 /// Maximum number of cosines: for at most [`MOST_WHOLE`] points, and for more.
-const MOST_WAVES: [usize; 2] = [1000, 600];
+const MAX_COSINES: [usize; 2] = [1000, 600];
 /// Number of cosines for each point, within the limits of the total number.
-const WAVES_A_POINT: f64 = 5.0;
+const COSINES_PER_POINT: f64 = 5.0;
 /// Minimum number of cosines.
-const FEWEST_WAVES: usize = 150;
+const MIN_COSINES: usize = 150;
 /// Maximum number of points that are used one by one. More points are reduced to the products of the basis functions.
-const MOST_WHOLE: usize = 600;
+const MAX_INDIVIDUAL_POINTS: usize = 600;
 /// Degree of the polynomials that are added to the cosines if there are more than [`MOST_WHOLE`] points. Few points
 /// cannot distinguish these polynomials from wheel wear or from a motion of the part.
 const DEGREE: usize = 4;
 /// Relative limit of the standard deviation: a node drops the basis functions after the last one above this share of
 /// the largest.
-const NOTHING: f64 = 1e-4;
+const MIN_SIGMA_SHARE: f64 = 1e-4;
 /// Relative limit of the remaining variance: the factor stops at pivots below this share of the largest.
-const NOT_APART: f64 = 1e-5;
+const MIN_PIVOT_SHARE: f64 = 1e-5;
 /// Number of rows that are processed at a time.
 const ROWS: usize = 1024;
 /// Number of blocks of rows whose sums are in memory at a time.
@@ -126,8 +126,8 @@ pub(super) struct FieldHypothesis {
 
 /// Returns all variance ratios, in ascending order.
 pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
-    let [least, most] = STRENGTH.map(f64::ln);
-    (0..STRENGTHS).map(move |k| (least + (most - least) * k as f64 / (STRENGTHS - 1) as f64).exp())
+    let [least, most] = VARIANCE_RATIO_LIMITS.map(f64::ln);
+    (0..VARIANCE_RATIOS).map(move |k| (least + (most - least) * k as f64 / (VARIANCE_RATIOS - 1) as f64).exp())
 }
 
 impl FieldHypotheses {
@@ -135,11 +135,11 @@ impl FieldHypotheses {
     ///
     /// # Errors
     /// Inconsistent shapes, numbers that are not finite, too few points, or linearly dependent fixed effects.
-    pub(super) fn over(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
-        let mut fields = Self::bare(observed, kind)?;
+    pub(super) fn over(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
+        let mut fields = Self::without_nodes(observed, kind)?;
         // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
         let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Exponential || k.is_multiple_of(2);
-        let all = fields.ranges_mm().enumerate().flat_map(|(k, range_mm)| KINDS.map(|of| (k, of, range_mm)));
+        let all = fields.ranges_mm().enumerate().flat_map(|(k, range_mm)| SMOOTHNESSES.map(|of| (k, of, range_mm)));
         let all: Vec<_> = all.filter(|&(k, smoothness, _)| is_laid(k, smoothness)).collect();
         let node = |&(_, smoothness, range_mm): &(usize, Smoothness, f64)| fields.node(smoothness, range_mm);
         fields.hypotheses = all.par_iter().filter_map(node).collect();
@@ -153,18 +153,18 @@ impl FieldHypotheses {
     /// more than the size of the part.
     fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
         let least_mm =
-            (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.basis.min_half_wavelength_mm());
-        let most_mm = (MOST_RANGE * size_mm(&self.places)).max(1.5 * least_mm);
+            (MIN_RANGE_SPACINGS * spacing_mm(&self.places)).max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
+        let most_mm = (MAX_RANGE_SIZES * size_mm(&self.places)).max(1.5 * least_mm);
         let ratio = (most_mm / least_mm).ln() / (RANGES - 1) as f64;
         (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
     }
 
-    fn bare(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
+    fn without_nodes(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
         observed.check()?;
         let places = observed.places.clone();
         let n = places.len();
-        let count = ((WAVES_A_POINT * n as f64) as usize).clamp(FEWEST_WAVES, MOST_WAVES[usize::from(n > MOST_WHOLE)]);
-        let waves = Basis::over(&places, kind.anisotropy, count, if n > MOST_WHOLE { DEGREE } else { 0 });
+        let count = ((COSINES_PER_POINT * n as f64) as usize).clamp(MIN_COSINES, MAX_COSINES[usize::from(n > MAX_INDIVIDUAL_POINTS)]);
+        let waves = Basis::over(&places, kind.anisotropy, count, if n > MAX_INDIVIDUAL_POINTS { DEGREE } else { 0 });
         let whitening = whitening(&observed.path, n, kind.autocorrelation);
         let effects = whitened(&whitening, &observed.fixed_effects);
         let factor = super::dense::checked_cholesky(effects.tr_mul(&effects))?;
@@ -185,12 +185,12 @@ impl FieldHypotheses {
             removed_by_fit: Mat::new(),
             hypotheses: Vec::new(),
         };
-        (fields.reduced, fields.removed_by_fit) = if n <= MOST_WHOLE { fields.whole() } else { fields.reduced_by_products() };
+        (fields.reduced, fields.removed_by_fit) = if n <= MAX_INDIVIDUAL_POINTS { fields.individual_points() } else { fields.reduced_by_products() };
         Ok(fields)
     }
 
     /// Computes R W phi with each point as a coordinate, and Q'W phi.
-    fn whole(&self) -> (Reduced, Mat<f64>) {
+    fn individual_points(&self) -> (Reduced, Mat<f64>) {
         let mut rows = self.rows_of(0..self.places.len());
         let (n, p) = self.base.shape();
         let base = Mat::from_fn(n, p, |r, c| self.base[(r, c)]);
@@ -275,7 +275,7 @@ impl FieldHypotheses {
     /// Solves the eigenproblem of a node. Returns None if the best fit leaves no variance of the field.
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
         let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
-        let least = NOTHING * strengths.iter().copied().fold(0.0, f64::max);
+        let least = MIN_SIGMA_SHARE * strengths.iter().copied().fold(0.0, f64::max);
         let last = strengths.iter().rposition(|strength| *strength > least);
         strengths.truncate(last.map_or(0, |last| last + 1));
         let (r, c) = (self.reduced.rows.nrows(), strengths.len());
@@ -348,7 +348,7 @@ impl FieldHypotheses {
     }
 
     /// Projects columns with one row for each point onto the fixed effects: Q'W times the columns.
-    pub(super) fn of_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(super) fn project_onto_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
@@ -374,7 +374,7 @@ impl FieldHypotheses {
     }
 
     /// Evaluates the field with these coefficients at the points.
-    pub(super) fn at_points(&self, coefficients: &[f64]) -> Vec<f64> {
+    pub(super) fn evaluate_at_points(&self, coefficients: &[f64]) -> Vec<f64> {
         let column = Mat::from_fn(coefficients.len(), 1, |r, _| coefficients[r]);
         let of = |places: &[[f64; 2]]| (self.basis.at(places) * &column).col_as_slice(0).to_vec();
         self.places.par_chunks(ROWS).flat_map_iter(of).collect()
@@ -429,7 +429,7 @@ fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     while pivots.len() < count {
         let pivot = (0..count).fold(0, |best, k| if left[k] > left[best] { k } else { best });
-        if left[pivot] <= NOT_APART * most {
+        if left[pivot] <= MIN_PIVOT_SHARE * most {
             break;
         }
         let mut row: Vec<f64> = (0..count).map(|k| at(k, pivot)).collect();

@@ -16,12 +16,12 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::field::Pairs;
-use super::{Hyperparameters, ModelError, Observed, Prediction};
+use super::field::PairCovariance;
+use super::{Hyperparameters, ModelError, Observations, Prediction};
 
 /// Standard deviation of a fixed effect, in units of that of the field. A larger value would lose the field in rounding
 /// errors.
-const VAGUE: f64 = 1e3;
+const FIXED_EFFECT_SIGMAS: f64 = 1e3;
 /// Number of places that are processed at a time: with some hundred points, their data stay in the processor's cache.
 const BLOCK: usize = 256;
 
@@ -29,7 +29,7 @@ const BLOCK: usize = 256;
 #[derive(Clone)]
 pub struct IncrementalPosterior {
     hyperparameters: Hyperparameters,
-    pairs: Pairs,
+    pairs: PairCovariance,
     /// Number of fixed and random effects.
     columns: usize,
     /// Observed points, and the rows of L.
@@ -37,7 +37,7 @@ pub struct IncrementalPosterior {
     lower: Vec<Vec<f64>>,
     /// L^-1 times the deviations.
     whitened: Vec<f64>,
-    blocks: Vec<Block>,
+    blocks: Vec<PlaceBlock>,
 }
 
 /// Place with its row of effects.
@@ -49,7 +49,7 @@ struct Place {
 
 /// Block of consecutive places.
 #[derive(Clone)]
-struct Block {
+struct PlaceBlock {
     places: Vec<Place>,
     mean_mm: Vec<f64>,
     variance_mm2: Vec<f64>,
@@ -69,7 +69,7 @@ fn joined(
     if rows != points || random_effects.nrows() != points {
         return Err(ModelError::Shape { points, deviations: points, rows });
     }
-    let smaller = 1.0 / (VAGUE * hyperparameters.field.sigma_mm);
+    let smaller = 1.0 / (FIXED_EFFECT_SIGMAS * hyperparameters.field.sigma_mm);
     let of = |k: usize| {
         let random = random_effects.row(k);
         let effects = fixed_effects.row(k).into_iter().copied().chain(random.iter().map(|of| smaller * of)).collect();
@@ -91,7 +91,7 @@ impl IncrementalPosterior {
     ///
     /// # Errors
     /// Returns an error if the numbers of rows differ, a number is not finite, or a hyperparameter is not above 0.
-    pub fn over(
+    pub fn at_places(
         places: &[[f64; 2]],
         fixed_effects: &DMatrix<f64>,
         random_effects: &DMatrix<f64>,
@@ -100,7 +100,7 @@ impl IncrementalPosterior {
         hyperparameters.check()?;
         let mut growing = Self {
             hyperparameters,
-            pairs: hyperparameters.field.pairs(),
+            pairs: hyperparameters.field.pair_covariance(),
             columns: fixed_effects.ncols() + random_effects.ncols(),
             observed_places: Vec::new(),
             lower: Vec::new(),
@@ -108,7 +108,7 @@ impl IncrementalPosterior {
             blocks: Vec::new(),
         };
         let places = joined(places, fixed_effects, random_effects, &hyperparameters)?;
-        let block = |places: &[Place]| Block {
+        let block = |places: &[Place]| PlaceBlock {
             places: places.to_vec(),
             mean_mm: vec![0.0; places.len()],
             variance_mm2: places.iter().map(|place| growing.covariance_mm2(place, place)).collect(),
@@ -123,13 +123,13 @@ impl IncrementalPosterior {
     /// # Errors
     /// Returns an error if the numbers of rows or columns differ or a number is not finite. No point is added in these
     /// cases.
-    pub fn update(&mut self, observed: &Observed) -> Result<(), ModelError> {
+    pub fn update(&mut self, observed: &Observations) -> Result<(), ModelError> {
         let places = self.places_of(observed)?;
         let known = self.observed_places.len();
         for (place, deviation_mm) in places.into_iter().zip(&observed.deviations_mm) {
-            self.border(place, Some(*deviation_mm))?;
+            self.append_point(place, Some(*deviation_mm))?;
         }
-        self.carry(known);
+        self.update_places(known);
         Ok(())
     }
 
@@ -141,8 +141,8 @@ impl IncrementalPosterior {
     /// Returns [`ModelError::NotDefinite`] if the new diagonal element of the factor is not finite and above 0.
     pub fn update_with_expected(&mut self, place: usize) -> Result<(), ModelError> {
         let known = self.observed_places.len();
-        self.border(self.blocks[place / BLOCK].places[place % BLOCK].clone(), None)?;
-        self.carry(known);
+        self.append_point(self.blocks[place / BLOCK].places[place % BLOCK].clone(), None)?;
+        self.update_places(known);
         Ok(())
     }
 
@@ -159,7 +159,7 @@ impl IncrementalPosterior {
     ///
     /// # Errors
     /// Those of [`Self::update`].
-    pub fn standardized_innovations(&self, observed: &Observed) -> Result<Vec<f64>, ModelError> {
+    pub fn standardized_innovations(&self, observed: &Observations) -> Result<Vec<f64>, ModelError> {
         let places = self.places_of(observed)?;
         let of = |(place, deviation_mm): (&Place, &f64)| {
             let (_, mean_mm, sigma_mm) = self.predicted(place);
@@ -168,8 +168,8 @@ impl IncrementalPosterior {
         Ok(places.par_iter().zip(&observed.deviations_mm).map(of).collect())
     }
 
-    fn places_of(&self, observed: &Observed) -> Result<Vec<Place>, ModelError> {
-        let Observed { places, deviations_mm, fixed_effects, random_effects, .. } = observed;
+    fn places_of(&self, observed: &Observations) -> Result<Vec<Place>, ModelError> {
+        let Observations { places, deviations_mm, fixed_effects, random_effects, .. } = observed;
         let (points, deviations, rows) = (places.len(), deviations_mm.len(), fixed_effects.nrows());
         if deviations != points || fixed_effects.ncols() + random_effects.ncols() != self.columns {
             return Err(ModelError::Shape { points, deviations, rows });
@@ -183,7 +183,7 @@ impl IncrementalPosterior {
     /// Returns the prior covariance of two places: that of the field and that of the effects.
     fn covariance_mm2(&self, a: &Place, b: &Place) -> f64 {
         let effects: f64 = a.effects.iter().zip(&b.effects).map(|(a, b)| a * b).sum();
-        self.pairs.covariance_mm2(a.at, b.at) + (VAGUE * self.hyperparameters.field.sigma_mm).powi(2) * effects
+        self.pairs.covariance_mm2(a.at, b.at) + (FIXED_EFFECT_SIGMAS * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
     /// Returns L^-1 times the covariances of a place with all observed points, and mean and standard deviation of the
@@ -202,7 +202,7 @@ impl IncrementalPosterior {
     }
 
     /// Adds the row of one point to the factor L. Without a deviation the point has the expected one.
-    fn border(&mut self, place: Place, deviation_mm: Option<f64>) -> Result<(), ModelError> {
+    fn append_point(&mut self, place: Place, deviation_mm: Option<f64>) -> Result<(), ModelError> {
         let (mut l, mean_mm, d) = self.predicted(&place);
         if !(d.is_finite() && d > 0.0) {
             return Err(ModelError::NotDefinite);
@@ -215,7 +215,7 @@ impl IncrementalPosterior {
     }
 
     /// Updates mean and variance at all places with the points from index `from` on.
-    fn carry(&mut self, from: usize) {
+    fn update_places(&mut self, from: usize) {
         let mut blocks = std::mem::take(&mut self.blocks);
         blocks.par_iter_mut().for_each(|block| {
             for k in from..self.observed_places.len() {
@@ -242,27 +242,27 @@ mod tests {
     use super::super::{DensePosterior, Field};
     use super::*;
 
-    const HYPER: Hyperparameters =
+    const HYPERPARAMETERS: Hyperparameters =
         Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
-    fn observed(count: u32, effects: usize) -> Observed {
+    fn observed(count: u32, effects: usize) -> Observations {
         let places: Vec<[f64; 2]> = (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect();
         let deviations_mm = places.iter().map(|[x, y]| 5e-3 * ((0.1 * x).sin() + 0.5 * (0.13 * y).cos())).collect();
         let effects =
             DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
-        Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
+        Observations { fixed_effects: effects, ..Observations::without_effects(places, deviations_mm) }
     }
 
-    fn asked(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
+    fn requested(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
         let places: Vec<[f64; 2]> = (0..600).map(|k| [2.7 * f64::from(k % 25), 1.9 * f64::from(k / 25)]).collect();
         let rows = DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
         (places, rows)
     }
 
-    fn grown(observed: &Observed, batches: &[usize]) -> IncrementalPosterior {
-        let (places, effects) = asked(observed.fixed_effects.ncols());
+    fn updated_in_batches(observed: &Observations, batches: &[usize]) -> IncrementalPosterior {
+        let (places, effects) = requested(observed.fixed_effects.ncols());
         let none = DMatrix::zeros(places.len(), 0);
-        let mut growing = IncrementalPosterior::over(&places, &effects, &none, HYPER).unwrap();
+        let mut growing = IncrementalPosterior::at_places(&places, &effects, &none, HYPERPARAMETERS).unwrap();
         let mut first = 0;
         for count in batches {
             let chosen: Vec<usize> = (first..first + count).collect();
@@ -276,8 +276,8 @@ mod tests {
     #[test]
     fn in_batches_it_tells_what_all_points_at_once_tell() {
         let observed = observed(120, 0);
-        let growing = grown(&observed, &[10, 1, 49, 60]);
-        let exact = DensePosterior::fit(&observed, HYPER).unwrap().predict(&asked(0).0);
+        let growing = updated_in_batches(&observed, &[10, 1, 49, 60]);
+        let exact = DensePosterior::fit(&observed, HYPERPARAMETERS).unwrap().predict(&requested(0).0);
         for (a, b) in exact.iter().zip(growing.predictions()) {
             assert!((a.mean_mm - b.mean_mm).abs() < 1e-10 && (a.sigma_mm - b.sigma_mm).abs() < 1e-10, "{a:?} {b:?}");
         }
@@ -286,32 +286,32 @@ mod tests {
     #[test]
     fn beside_effects_it_tells_field_and_effects_together() {
         let observed = observed(120, 3);
-        let growing = grown(&observed, &[60, 60]);
-        let dense = DensePosterior::fit(&observed, HYPER).unwrap();
+        let growing = updated_in_batches(&observed, &[60, 60]);
+        let dense = DensePosterior::fit(&observed, HYPERPARAMETERS).unwrap();
         let (found, _) = dense.estimated_effects();
-        let (places, effects) = asked(3);
+        let (places, effects) = requested(3);
         let moved = effects * found;
         for (k, (a, b)) in dense.predict(&places).iter().zip(growing.predictions()).enumerate() {
             assert!((a.mean_mm + moved[k] - b.mean_mm).abs() < 1e-7, "{k}: {a:?} {b:?}");
-            assert!(b.sigma_mm < HYPER.field.sigma_mm && b.sigma_mm > 0.0, "{k}: {b:?}");
+            assert!(b.sigma_mm < HYPERPARAMETERS.field.sigma_mm && b.sigma_mm > 0.0, "{k}: {b:?}");
         }
     }
 
     #[test]
     fn what_will_be_touched_is_known_better_whatever_will_be_found() {
         let observed = observed(60, 3);
-        let mut growing = grown(&observed, &[60]);
+        let mut growing = updated_in_batches(&observed, &[60]);
         let before: Vec<Prediction> = growing.predictions().collect();
-        let place = asked(3).0[77];
+        let place = requested(3).0[77];
         growing.update_with_expected(77).unwrap();
         let imagined: Vec<Prediction> = growing.predictions().collect();
         assert!(before.iter().zip(&imagined).all(|(a, b)| (a.mean_mm - b.mean_mm).abs() < 1e-12));
-        assert!(imagined[77].sigma_mm < HYPER.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
+        assert!(imagined[77].sigma_mm < HYPERPARAMETERS.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
         // A real touch at the same place finds a different deviation.
-        let mut touched = grown(&observed, &[60]);
+        let mut touched = updated_in_batches(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
         touched
-            .update(&Observed { fixed_effects: effects, ..Observed::without_effects(vec![place], vec![0.1]) })
+            .update(&Observations { fixed_effects: effects, ..Observations::without_effects(vec![place], vec![0.1]) })
             .unwrap();
         for (a, b) in touched.predictions().zip(&imagined) {
             assert!((a.sigma_mm - b.sigma_mm).abs() < 1e-12);
@@ -322,10 +322,10 @@ mod tests {
     fn a_point_off_by_ten_scatters_is_a_surprise_and_one_as_expected_is_none() {
         let observed = observed(121, 3);
         let first: Vec<usize> = (0..120).collect();
-        let growing = grown(&observed.subset(&first), &[120]);
+        let growing = updated_in_batches(&observed.subset(&first), &[120]);
         let mut last = observed.subset(&[120]);
         assert!(growing.standardized_innovations(&last).unwrap()[0].abs() < 2.0);
-        last.deviations_mm[0] += 10.0 * HYPER.noise_sigma_mm;
+        last.deviations_mm[0] += 10.0 * HYPERPARAMETERS.noise_sigma_mm;
         assert!(growing.standardized_innovations(&last).unwrap()[0] > 5.0);
     }
 
@@ -334,8 +334,8 @@ mod tests {
         let hyperparameters =
             Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
         let (place, stated) = (vec![[1.0, 2.0]], DMatrix::from_element(1, 1, 1.5));
-        let mut growing = IncrementalPosterior::over(&place, &DMatrix::zeros(1, 0), &stated, hyperparameters).unwrap();
-        growing.update(&Observed { random_effects: stated, ..Observed::without_effects(place, vec![3.0]) }).unwrap();
+        let mut growing = IncrementalPosterior::at_places(&place, &DMatrix::zeros(1, 0), &stated, hyperparameters).unwrap();
+        growing.update(&Observations { random_effects: stated, ..Observations::without_effects(place, vec![3.0]) }).unwrap();
         // The prior variance of field and effect together is 4 + 2.25; the noise variance of the observed point is
         // 0.25.
         let told = growing.predictions().next().unwrap();
@@ -345,10 +345,10 @@ mod tests {
 
     #[test]
     fn what_does_not_belong_together_is_refused() {
-        let (places, effects) = asked(3);
+        let (places, effects) = requested(3);
         let none = DMatrix::zeros(places.len(), 0);
-        assert!(IncrementalPosterior::over(&places, &DMatrix::zeros(7, 3), &none, HYPER).is_err());
-        let mut growing = IncrementalPosterior::over(&places, &effects, &none, HYPER).unwrap();
+        assert!(IncrementalPosterior::at_places(&places, &DMatrix::zeros(7, 3), &none, HYPERPARAMETERS).is_err());
+        let mut growing = IncrementalPosterior::at_places(&places, &effects, &none, HYPERPARAMETERS).unwrap();
         assert!(growing.update(&observed(5, 2)).is_err());
         let mut wrong = observed(5, 3);
         wrong.deviations_mm[4] = f64::NAN;

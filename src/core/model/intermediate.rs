@@ -7,15 +7,15 @@ use nalgebra::DMatrix;
 
 use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
-use crate::geometry::{Nearest, Point, bounds};
+use crate::geometry::{PointTree, Point, bounds};
 
 /// Maximum number of grid points, and grid points per spacing of the touched points where that maximum allows it.
-const MOST: f64 = 3000.0;
-const A_DISTANCE: f64 = 2.0;
+const MAX_NODES: f64 = 3000.0;
+const NODES_PER_SPACING: f64 = 2.0;
 /// Maximum degree of the polynomials that interpolate a smooth column between the points.
-const MOST_DEGREE: usize = 9;
+const MAX_DEGREE: usize = 9;
 /// Distance, in spacings of the points, within which touched places must surround a node.
-const FARTHEST: f64 = 2.5;
+const MAX_DISTANCE_SPACINGS: f64 = 2.5;
 
 /// Nodes of a grid, each between touched places.
 pub(super) struct IntermediateNodes {
@@ -30,13 +30,13 @@ pub(super) struct IntermediateNodes {
 
 impl IntermediateNodes {
     /// Lays a grid along the axes of some waves; returns `None` if it would have no node.
-    pub(super) fn of(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
+    pub(super) fn new(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
         let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.anisotropy.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
         let [low, high] = bounds(places.iter().copied());
         let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
         let area_mm2 = spans_mm[0] * spans_mm[1];
-        let spacing_mm = (distance_mm / A_DISTANCE).max((area_mm2 / MOST).sqrt());
+        let spacing_mm = (distance_mm / NODES_PER_SPACING).max((area_mm2 / MAX_NODES).sqrt());
         if !(area_mm2 > 0.0 && spacing_mm > 0.0 && spacing_mm.is_finite()) {
             return None;
         }
@@ -44,13 +44,13 @@ impl IntermediateNodes {
         let corner_mm =
             [0, 1].map(|axis: usize| 0.5 * (low[axis] + high[axis] - spacing_mm * (counts[axis] - 1) as f64));
         let grid = BasisGrid { corner_mm, spacing_mm, counts };
-        let tree = Nearest::new(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
-        let beside = |node: usize| Some((node, beside(grid.place(node), &places, &tree, FARTHEST * distance_mm)?));
+        let tree = PointTree::new(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
+        let beside = |node: usize| Some((node, surrounding_places(grid.place(node), &places, &tree, MAX_DISTANCE_SPACINGS * distance_mm)?));
         let (nodes, corners): (Vec<usize>, Vec<_>) = (0..counts[0] * counts[1]).filter_map(beside).unzip();
         if nodes.is_empty() {
             return None;
         }
-        let degree = (0..MOST_DEGREE).take_while(|degree| 3 * (degree + 2) * (degree + 3) / 2 <= places.len()).count();
+        let degree = (0..MAX_DEGREE).take_while(|degree| 3 * (degree + 2) * (degree + 3) / 2 <= places.len()).count();
         let at_nodes: Vec<[f64; 2]> = nodes.iter().map(|&node| grid.place(node)).collect();
         let terms = [&places, &at_nodes].map(|places| polynomials(places, [low, high], degree));
         Some(Self { grid, nodes, corners, terms })
@@ -61,7 +61,7 @@ impl IntermediateNodes {
     ///
     /// The polynomials are needed for the motions of a curved part, which are removed from forms that can be thousands
     /// of times larger: linear interpolation alone would leave a part of that.
-    pub(super) fn rows(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(super) fn interpolate(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();
         let fitted = factor.r().solve_upper_triangular(&factor.q().tr_mul(columns));
@@ -77,7 +77,7 @@ impl IntermediateNodes {
 
 /// Returns the three nearest touched places and their weights; `None` if touched places within `near_mm` do not
 /// surround the place.
-fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
+fn surrounding_places(at: [f64; 2], places: &[[f64; 2]], tree: &PointTree, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
     const CANDIDATES: u32 = 12;
     let near: Vec<(usize, f64)> = tree.nearest(&Point::new(at[0], at[1], 0.0), CANDIDATES).collect();
     let mut angles: Vec<f64> = Vec::new();
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     fn over(places: &[[f64; 2]]) -> Option<IntermediateNodes> {
-        IntermediateNodes::of(places, &Basis::over(places, Anisotropy::NONE, 100, 0))
+        IntermediateNodes::new(places, &Basis::over(places, Anisotropy::NONE, 100, 0))
     }
 
     #[test]
@@ -128,7 +128,7 @@ mod tests {
         let between = over(&places).unwrap();
         assert!(between.nodes.len() > 3 * places.len() / 2 && between.nodes.len() < 6 * places.len());
         let tilted = DMatrix::from_fn(96, 2, |r, c| [1.0, 0.3 * places[r][0] - 0.7 * places[r][1]][c]);
-        let rows = between.rows(&tilted);
+        let rows = between.interpolate(&tilted);
         for (r, node) in between.nodes.iter().enumerate() {
             let [x, y] = between.grid.place(*node);
             assert!((rows[(r, 0)] - 1.0).abs() < 1e-12 && (rows[(r, 1)] - 0.3 * x + 0.7 * y).abs() < 1e-9);
@@ -140,7 +140,7 @@ mod tests {
         let places: Vec<[f64; 2]> = (0..400).map(|k| [4.0 * f64::from(k % 20), 3.0 * f64::from(k / 20)]).collect();
         let between = over(&places).unwrap();
         let bent = |x: f64, y: f64| (0.03 * x).sin() + 1e-3 * x * y + (0.02 * y).cos();
-        let rows = between.rows(&DMatrix::from_fn(400, 1, |r, _| bent(places[r][0], places[r][1])));
+        let rows = between.interpolate(&DMatrix::from_fn(400, 1, |r, _| bent(places[r][0], places[r][1])));
         let off = between.nodes.iter().enumerate().map(|(r, node)| {
             let [x, y] = between.grid.place(*node);
             (rows[(r, 0)] - bent(x, y)).abs()

@@ -163,7 +163,7 @@ impl Effect {
 
 /// Returns name and value of the first standard uncertainty that is impossible: negative, not a number, or beyond the
 /// limit of any real machine or fixture.
-pub(super) fn unsound(
+pub(super) fn invalid_uncertainty(
     machine: &MachineUncertainty,
     [radius_mm, temperature]: [f64; 2],
     datum: &[f64; 6],

@@ -14,22 +14,22 @@ use super::Smoothness;
 /// Steps of the table per unit of x, and its last x: the correlation and its slope are below 1e-14 there.
 const STEPS: usize = 256;
 const LAST: usize = 45;
-const STEPS_A_RANGE: f64 = 4.0 * STEPS as f64;
+const STEPS_PER_RANGE: f64 = 4.0 * STEPS as f64;
 
 /// Table of the correlation and its slope.
 type Table = OnceLock<Vec<[f64; 2]>>;
 
 /// Correlation over the distance for one smoothness, the same for every pair of places.
 #[derive(Clone, Copy)]
-pub(super) struct Curve {
+pub(super) struct Correlation {
     /// Table from which the correlation is interpolated; `None` if it is an exponential.
     table: Option<&'static [[f64; 2]]>,
     /// True if the exponential is one of the distance, not of its square.
     is_rough: bool,
 }
 
-impl Curve {
-    pub(super) fn of(smoothness: Smoothness) -> Self {
+impl Correlation {
+    pub(super) fn new(smoothness: Smoothness) -> Self {
         static ONCE: Table = Table::new();
         Self { table: (smoothness == Smoothness::Matern2).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Exponential }
     }
@@ -40,7 +40,7 @@ impl Curve {
         let Some(table) = self.table else {
             return (-2.0 * if self.is_rough { ranges2.sqrt() } else { ranges2 }).exp();
         };
-        let at = (STEPS_A_RANGE * ranges2.sqrt()).min((LAST * STEPS) as f64);
+        let at = (STEPS_PER_RANGE * ranges2.sqrt()).min((LAST * STEPS) as f64);
         let k = at as usize;
         let Some([[a, da], [b, db]]) = table.get(k..k + 2).and_then(|pair| pair.first_chunk::<2>()) else { return 0.0 };
         let t = at - k as f64;
@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     fn correlation(smoothness: Smoothness, ranges: f64) -> f64 {
-        Curve::of(smoothness).at(ranges * ranges)
+        Correlation::new(smoothness).at(ranges * ranges)
     }
 
     /// Values of K_2 from tables (Abramowitz and Stegun, 9.8; Wolfram) at 0.1, 1, 2, 5, 10.

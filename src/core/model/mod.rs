@@ -27,7 +27,7 @@ mod dense;
 mod effects;
 mod error;
 mod field;
-mod figures;
+mod area_figures;
 mod form;
 mod hypotheses;
 mod incremental;
@@ -36,10 +36,10 @@ mod machine_uncertainty;
 mod matern;
 mod nelder_mead;
 mod noise_kind;
-mod normals;
+mod random_normals;
 mod part_priors;
 mod posterior;
-mod priors;
+mod prior;
 mod sessions;
 mod stopping;
 
@@ -48,12 +48,12 @@ pub use dense::{DensePosterior, Prediction};
 pub use effects::EffectEstimates;
 pub use error::ModelError;
 pub use field::{Anisotropy, Field, Smoothness};
-pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
+pub use area_figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use form::{Form, FormFigures, FormPoint, Interval, ModelInputs};
 pub use incremental::IncrementalPosterior;
 pub use machine_uncertainty::{MachineUncertainty, UncertaintySource};
 pub use part_priors::{PartFit, PartPriors};
-pub use priors::Prior;
+pub use prior::Prior;
 pub use sessions::{BetweenSessionVariance, PredictionInterval, Sessions};
 pub use stopping::{
     FIRST_BATCH, MAX_BATCHES, MIN_TOUCHES, PartialMeasurement, Reason, StoppingCriteria, StoppingDecision, decide,
@@ -78,7 +78,7 @@ pub struct Hyperparameters {
 
 /// Observations at the measured points. Every field has one row for each point.
 #[derive(Clone, Debug)]
-pub struct Observed {
+pub struct Observations {
     /// Positions of the points in the plane of projection, in mm.
     pub places: Vec<[f64; 2]>,
     /// Signed deviations along the normal, in mm.
@@ -92,7 +92,7 @@ pub struct Observed {
     pub path: Vec<f64>,
 }
 
-impl Observed {
+impl Observations {
     /// Returns observations without fixed or random effects.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let [effects, stated] = [0, 0].map(|columns| DMatrix::zeros(places.len(), columns));
@@ -164,13 +164,13 @@ impl Hyperparameters {
     /// # Errors
     /// Inconsistent shapes, numbers that are not finite, too few points, linearly dependent fixed effects, or an
     /// invalid prior.
-    pub fn estimate(observed: &Observed, priors: Option<&Prior>) -> Result<Self, ModelError> {
+    pub fn estimate(observed: &Observations, priors: Option<&Prior>) -> Result<Self, ModelError> {
         if let Some(priors) = priors {
             priors.check()?;
         }
         observed.check()?;
         let fields = posterior::select_hypotheses(observed)?;
-        Ok(posterior::Posterior::of(&fields, observed, priors, None).mean_hyperparameters())
+        Ok(posterior::Posterior::new(&fields, observed, priors, None).mean_hyperparameters())
     }
 
     /// Returns the correlation of the noise of two points that are this many steps of the path apart.

@@ -10,43 +10,43 @@ use rayon::prelude::*;
 
 use super::hypotheses::{NoiseKind, size_mm};
 use super::nelder_mead::maximize;
-use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observed, Prior, spacing_mm};
+use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observations, Prior, spacing_mm};
 use crate::geometry::bounds;
 
 /// Maximum number of points of a block, and of blocks.
-const POINTS_A_BLOCK: usize = 48;
-const MOST_BLOCKS: usize = 24;
+const POINTS_PER_BLOCK: usize = 48;
+const MAX_BLOCKS: usize = 24;
 /// Maximum number of points that are spread over the whole part.
 const SPREAD: usize = 150;
 /// Start values of the noise autocorrelation, steps of its refinement, its maximum, and the gain of the log-likelihood
 /// over no autocorrelation that it needs.
-const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
-const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
-const MOST_DRIFT: f64 = 0.97;
-const DRIFT_EVIDENCE: f64 = 2.0;
+const START_AUTOCORRELATIONS: [f64; 3] = [0.3, 0.6, 0.85];
+const AUTOCORRELATION_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
+const MAX_AUTOCORRELATION: f64 = 0.97;
+const MIN_AUTOCORRELATION_EVIDENCE: f64 = 2.0;
 /// Logarithm of the stretch at which the search of an anisotropy begins, maximum stretch, and the gain of the
 /// log-likelihood over isotropy that it needs.
-const FIRST_STRETCH: f64 = 0.6;
-const MOST_STRETCHED: f64 = 10.0;
-const LAY_EVIDENCE: f64 = 4.0;
+const START_LOG_STRETCH: f64 = 0.6;
+const MAX_STRETCH: f64 = 10.0;
+const MIN_ANISOTROPY_EVIDENCE: f64 = 4.0;
 /// Start values of the search: ranges in spacings of the points, and noise in strengths of the field.
 const RANGES: [f64; 4] = [3.0, 6.0, 12.0, 24.0];
 const RATIOS: [f64; 4] = [0.01, 0.1, 0.6, 3.0];
 /// Minimum range in spacings of the points: a narrower field cannot be distinguished from noise.
-const LEAST_RANGE: f64 = 2.5;
+const MIN_RANGE_SPACINGS: f64 = 2.5;
 
 /// Factor by which the field can be stronger than the observed deviations (one standard deviation of its logarithm).
 const STRONGER: f64 = 2.0;
 
 /// Logarithms of range and ratio, and the log-likelihood there.
-type Top = ([f64; 2], f64);
+type Maximum = ([f64; 2], f64);
 
 /// Returns the kinds of field that the points support: one without noise autocorrelation, and one with it if neighbours
 /// give enough evidence.
-pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) {
-    let blocks = CompositeLikelihood::of(observed);
-    let plain = blocks.maximum(NoiseKind::PLAIN, None);
-    let with_lay = |kind: NoiseKind, top: Top| NoiseKind {
+pub(super) fn candidates(observed: &Observations) -> (NoiseKind, Option<NoiseKind>) {
+    let blocks = CompositeLikelihood::new(observed);
+    let plain = blocks.find_maximum(NoiseKind::PLAIN, None);
+    let with_lay = |kind: NoiseKind, top: Maximum| NoiseKind {
         anisotropy: blocks.most_likely_anisotropy(kind, top).unwrap_or(Anisotropy::NONE),
         ..kind
     };
@@ -55,7 +55,7 @@ pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) 
 }
 
 struct CompositeLikelihood {
-    all: Vec<Observed>,
+    all: Vec<Observations>,
     distance_mm: f64,
     /// Prior for any part of this size, and root mean square of the deviations.
     priors: Prior,
@@ -63,11 +63,11 @@ struct CompositeLikelihood {
 }
 
 impl CompositeLikelihood {
-    fn of(observed: &Observed) -> Self {
+    fn new(observed: &Observations) -> Self {
         let mut whole: Vec<Vec<usize>> = vec![(0..observed.places.len()).collect()];
         let mut done = Vec::new();
         while let Some(mut block) = whole.pop() {
-            if block.len() <= POINTS_A_BLOCK {
+            if block.len() <= POINTS_PER_BLOCK {
                 done.push(block);
                 continue;
             }
@@ -77,7 +77,7 @@ impl CompositeLikelihood {
             let rest = block.split_off(block.len() / 2);
             whole.extend([block, rest]);
         }
-        let every = done.len().div_ceil(MOST_BLOCKS);
+        let every = done.len().div_ceil(MAX_BLOCKS);
         let blocks = done.iter().step_by(every).map(|block| with_plane(observed, block));
         let all = std::iter::once(spread(observed)).chain(blocks).collect();
         let squares: f64 = observed.deviations_mm.iter().map(|d| d * d).sum();
@@ -89,12 +89,12 @@ impl CompositeLikelihood {
     /// Computes the log-likelihood of a kind of field with its most probable scale, plus the log prior density. The
     /// arguments `range` and `ratio` are logarithms.
     fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
-        if range < (LEAST_RANGE * self.distance_mm).ln() {
+        if range < (MIN_RANGE_SPACINGS * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
         }
         let field = Field { anisotropy: kind.anisotropy, ..Field::new(1.0, range.exp()) };
         let unit = Hyperparameters { field, noise_sigma_mm: ratio.exp(), noise_autocorrelation: kind.autocorrelation };
-        let fit = |block: &Observed| {
+        let fit = |block: &Observations| {
             // A block that does not determine its plane, for example points on a line, is left out.
             let model = DensePosterior::fit(block, unit).ok()?;
             Some([
@@ -116,7 +116,7 @@ impl CompositeLikelihood {
         known + likelihood + 0.5 * squares - 0.5 * free - free * sigma_mm.ln()
     }
 
-    fn maximum(&self, kind: NoiseKind, near: Option<Top>) -> Top {
+    fn find_maximum(&self, kind: NoiseKind, near: Option<Maximum>) -> Maximum {
         let start = near.unwrap_or_else(|| {
             let starts =
                 RANGES.iter().flat_map(|range| RATIOS.map(|ratio| [(range * self.distance_mm).ln(), ratio.ln()]));
@@ -126,21 +126,21 @@ impl CompositeLikelihood {
     }
 
     /// Returns the most likely noise autocorrelation; `None` if it has too little evidence over none.
-    fn most_likely_autocorrelation(&self, plain: Top) -> Option<(NoiseKind, Top)> {
+    fn most_likely_autocorrelation(&self, plain: Maximum) -> Option<(NoiseKind, Maximum)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
-        for drift in DRIFTS {
-            let top = self.maximum(of(drift), None);
+        for drift in START_AUTOCORRELATIONS {
+            let top = self.find_maximum(of(drift), None);
             if top.1 > best.1.1 {
                 best = (drift, top);
             }
         }
-        if best.1.1 < plain.1 + DRIFT_EVIDENCE {
+        if best.1.1 < plain.1 + MIN_AUTOCORRELATION_EVIDENCE {
             return None;
         }
-        for step in DRIFT_STEPS {
-            for drift in [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MOST_DRIFT)) {
-                let top = self.maximum(of(drift), Some(best.1));
+        for step in AUTOCORRELATION_STEPS {
+            for drift in [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MAX_AUTOCORRELATION)) {
+                let top = self.find_maximum(of(drift), Some(best.1));
                 if top.1 > best.1.1 {
                     best = (drift, top);
                 }
@@ -150,38 +150,38 @@ impl CompositeLikelihood {
     }
 
     /// Returns the most likely anisotropy of the field; `None` if it has too little evidence over isotropy.
-    fn most_likely_anisotropy(&self, kind: NoiseKind, without: Top) -> Option<Anisotropy> {
+    fn most_likely_anisotropy(&self, kind: NoiseKind, without: Maximum) -> Option<Anisotropy> {
         // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
         // logarithm of the stretch are polar coordinates of the search plane.
-        let of = |[a, b]: [f64; 2]| Anisotropy::at(0.5 * b.atan2(a), a.hypot(b).exp().min(MOST_STRETCHED));
+        let of = |[a, b]: [f64; 2]| Anisotropy::from_angle(0.5 * b.atan2(a), a.hypot(b).exp().min(MAX_STRETCH));
         let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { anisotropy: of(place), ..kind }, without.0);
         let starts =
-            [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * FIRST_STRETCH));
+            [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * START_LOG_STRETCH));
         let start = starts.map(|start| (start, height(start))).into_iter().fold(([0.0; 2], without.1), higher);
         if start.0 == [0.0; 2] {
             return None;
         }
         let (place, top) = maximize(start.0, [0.3, 0.3], 0.05, height);
-        (top > without.1 + LAY_EVIDENCE).then(|| of(place))
+        (top > without.1 + MIN_ANISOTROPY_EVIDENCE).then(|| of(place))
     }
 }
 
-fn higher(a: Top, b: Top) -> Top {
+fn higher(a: Maximum, b: Maximum) -> Maximum {
     if b.1 > a.1 { b } else { a }
 }
 
 /// Returns some of the points, with both large and small distances between them.
-fn spread(observed: &Observed) -> Observed {
+fn spread(observed: &Observations) -> Observations {
     let n = observed.places.len();
     // Steps of the golden section cover the whole sequence evenly, without a repeating pattern.
     let golden = |k: usize| (((k as f64 + 0.5) * 0.618_033_988_749_894_9).fract() * n as f64) as usize;
     let mut chosen: Vec<usize> = if n <= SPREAD { (0..n).collect() } else { (0..SPREAD).map(golden).collect() };
     chosen.sort_unstable();
     chosen.dedup();
-    Observed { random_effects: DMatrix::zeros(chosen.len(), 0), ..observed.subset(&chosen) }
+    Observations { random_effects: DMatrix::zeros(chosen.len(), 0), ..observed.subset(&chosen) }
 }
 
-fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
+fn with_plane(observed: &Observations, block: &[usize]) -> Observations {
     let some = observed.subset(block);
     let middle = [0, 1].map(|axis| some.places.iter().map(|place| place[axis]).sum::<f64>() / block.len() as f64);
     let effects = DMatrix::from_fn(block.len(), 3, |r, c| match c {
@@ -189,5 +189,5 @@ fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
         c => some.places[r][c - 1] - middle[c - 1],
     });
     // The random effects vary slowly: over a block of neighbours they are a plane, which the fixed effects contain.
-    Observed { fixed_effects: effects, random_effects: DMatrix::zeros(block.len(), 0), ..some }
+    Observations { fixed_effects: effects, random_effects: DMatrix::zeros(block.len(), 0), ..some }
 }

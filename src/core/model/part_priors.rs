@@ -19,12 +19,12 @@ use serde::{Deserialize, Serialize};
 use super::{Hyperparameters, Prior};
 
 /// Prior factor by which parts differ, and number of parts that this prior counts for.
-const DIFFERENT: f64 = 2.5;
-const COUNTS_FOR: f64 = 2.0;
+const PART_FACTOR: f64 = 2.5;
+const PRIOR_PARTS: f64 = 2.0;
 /// Minimum factor of the prior: the points of a part that differs can still overrule it.
-const NARROWEST: f64 = 2.0;
+const MIN_FACTOR: f64 = 2.0;
 /// Maximum number of parts that count, because machines change.
-const MOST_PARTS: u32 = 20;
+const MAX_PARTS: u32 = 20;
 
 /// Statistics of the fields of earlier parts, by the kind of pass.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -72,7 +72,7 @@ impl PartPriors {
     pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
         let is_sound = |lesson: PartFit| {
-            number(lesson.range_mm) && number(lesson.scatter_ratio) && (1..=MOST_PARTS).contains(&lesson.parts)
+            number(lesson.range_mm) && number(lesson.scatter_ratio) && (1..=MAX_PARTS).contains(&lesson.parts)
         };
         [self.without_correction, self.with_correction].into_iter().flatten().all(is_sound)
     }
@@ -86,7 +86,7 @@ impl PartFit {
         let Some(before) = before else {
             return Self { range_mm: [range_mm, 1.0], scatter_ratio: [ratio, 1.0], parts: 1 };
         };
-        let n = f64::from((before.parts + 1).min(MOST_PARTS));
+        let n = f64::from((before.parts + 1).min(MAX_PARTS));
         // Online mean and variance (Welford 1962).
         let with = |[median, factor]: [f64; 2], value: f64| {
             let off = (value / median).ln();
@@ -102,7 +102,7 @@ impl PartFit {
 
     /// Returns the statistics over several machines, each counted as one part; `None` if there is no machine.
     fn pooled(machines: impl Iterator<Item = Self>) -> Option<Self> {
-        let machines: Vec<Self> = machines.take(MOST_PARTS as usize).collect();
+        let machines: Vec<Self> = machines.take(MAX_PARTS as usize).collect();
         let n = machines.len() as f64;
         let pooled = |of: fn(&Self) -> [f64; 2]| {
             let mean = machines.iter().map(|of_one| of(of_one)[0].ln()).sum::<f64>() / n;
@@ -119,12 +119,12 @@ impl PartFit {
     }
 
     /// Returns the prior of the next part.
-    pub fn priors(&self) -> Prior {
+    pub fn prior(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {
-            let squares = COUNTS_FOR * DIFFERENT.ln().powi(2) + (n - 1.0) * factor.ln().powi(2);
-            let variance = squares / (COUNTS_FOR + n - 1.0) * (1.0 + 1.0 / n);
-            [median, variance.sqrt().exp().max(NARROWEST)]
+            let squares = PRIOR_PARTS * PART_FACTOR.ln().powi(2) + (n - 1.0) * factor.ln().powi(2);
+            let variance = squares / (PRIOR_PARTS + n - 1.0) * (1.0 + 1.0 / n);
+            [median, variance.sqrt().exp().max(MIN_FACTOR)]
         };
         Prior { range_mm: expected(self.range_mm), noise_ratio: expected(self.scatter_ratio) }
     }
@@ -144,7 +144,7 @@ mod tests {
         let mut taught = PartPriors::default();
         assert!(taught.fit(true).is_none());
         taught.update(true, &hyperparameters(10.0, 0.1));
-        let one = taught.fit(true).unwrap().priors();
+        let one = taught.fit(true).unwrap().prior();
         // With one part, the variance is 2 (ln 2.5)^2.
         assert!((one.range_mm[0] - 10.0).abs() < 1e-12, "{one:?}");
         assert!((one.range_mm[1].ln() - 2f64.sqrt() * 2.5f64.ln()).abs() < 1e-12, "{one:?}");
@@ -156,7 +156,7 @@ mod tests {
         assert!((lesson.range_mm[1].ln() - 2f64.sqrt() * 2f64.ln()).abs() < 1e-12, "{lesson:?}");
         assert!((lesson.scatter_ratio[0] - 0.1).abs() < 1e-12 && (lesson.scatter_ratio[1] - 1.0).abs() < 1e-12);
         let variance = (2.0 * 2.5f64.ln().powi(2) + 2.0 * 2f64.ln().powi(2)) / 3.0 * 1.5;
-        assert!((lesson.priors().range_mm[1].ln() - variance.sqrt()).abs() < 1e-12);
+        assert!((lesson.prior().range_mm[1].ln() - variance.sqrt()).abs() < 1e-12);
         assert!(taught.fit(false).is_none() && taught.is_valid());
     }
 
@@ -166,7 +166,7 @@ mod tests {
         let mut factors = Vec::new();
         for _ in 0..200 {
             let next = PartFit::updated(lesson, &hyperparameters(15.0, 0.3));
-            factors.push(next.priors().range_mm[1]);
+            factors.push(next.prior().range_mm[1]);
             lesson = Some(next);
         }
         assert!(factors.windows(2).all(|pair| pair[1] <= pair[0] + 1e-12), "{factors:?}");
@@ -188,7 +188,7 @@ mod tests {
         };
         let one = PartPriors::pooled(&[machine(10.0)]);
         let [one, part] =
-            [one.fit(true).unwrap(), PartFit::updated(None, &hyperparameters(10.0, 0.1))].map(|of| of.priors());
+            [one.fit(true).unwrap(), PartFit::updated(None, &hyperparameters(10.0, 0.1))].map(|of| of.prior());
         let numbers = |of: Prior| [of.range_mm, of.noise_ratio].concat();
         assert!(numbers(one).iter().zip(numbers(part)).all(|(a, b)| (a / b - 1.0).abs() < 1e-12), "{one:?} {part:?}");
         assert!(
@@ -207,7 +207,7 @@ mod tests {
         let lesson = (0..12)
             .map(|k| hyperparameters(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
             .fold(None, |lesson, hyperparameters| Some(PartFit::updated(lesson, &hyperparameters)));
-        let priors = lesson.unwrap().priors();
+        let priors = lesson.unwrap().prior();
         assert!(priors.range_mm[1] > 3.5 && priors.noise_ratio[1] < 2.1, "{priors:?}");
     }
 

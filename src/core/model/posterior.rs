@@ -15,15 +15,15 @@ use rayon::prelude::*;
 
 use super::hypotheses::{FieldHypotheses, FieldHypothesis, NoiseKind, variance_ratios};
 use super::noise_kind::candidates;
-use super::normals::Normals;
-use super::{Field, Hyperparameters, ModelError, Observed, Prior, Smoothness};
+use super::random_normals::NormalGenerator;
+use super::{Field, Hyperparameters, ModelError, Observations, Prior, Smoothness};
 
 /// Factor on the variance of smooth fields for the upper bounds of extremes.
-const UNDER: f64 = 16.0;
+const UPPER_BOUND_VARIANCE_FACTOR: f64 = 16.0;
 /// Factor on the variance of rough fields for the upper bounds of extremes.
-const UNDER_ROUGH: f64 = 4.0;
+const UPPER_BOUND_VARIANCE_FACTOR_ROUGH: f64 = 4.0;
 /// Factor on the variance of fields for the lower bounds of extremes.
-const OVER: f64 = 1.0 / 4.0;
+const LOWER_BOUND_VARIANCE_FACTOR: f64 = 1.0 / 4.0;
 /// Factor by which the standard deviation of a field can exceed the RMS of the residuals (one standard deviation of its
 /// logarithm). Used for the pose and for the hyperparameters.
 const STRONGER: f64 = 3.0;
@@ -35,12 +35,12 @@ const STRONGER: f64 = 3.0;
 ///
 /// # Errors
 /// Those of [`FieldHypotheses::over`].
-pub(super) fn select_hypotheses(observed: &Observed) -> Result<FieldHypotheses, ModelError> {
+pub(super) fn select_hypotheses(observed: &Observations) -> Result<FieldHypotheses, ModelError> {
     let (plain, drifting) = candidates(observed);
     let fields = FieldHypotheses::over(observed, plain)?;
     let Some(drifting) = drifting else { return Ok(fields) };
     let other = FieldHypotheses::over(observed, drifting)?;
-    let [without, with] = [&fields, &other].map(|of| Posterior::of(of, observed, None, None).log_likelihood());
+    let [without, with] = [&fields, &other].map(|of| Posterior::new(of, observed, None, None).log_likelihood());
     Ok(if with > without { other } else { fields })
 }
 
@@ -50,7 +50,7 @@ pub(super) type NoisePrior = Option<[f64; 2]>;
 /// Field hypotheses with their probabilities.
 pub(super) struct Posterior<'f> {
     fields: &'f FieldHypotheses,
-    observed: &'f Observed,
+    observed: &'f Observations,
     probe: NoisePrior,
     /// Projections U' of the deviations and of the random effects, for each node.
     projected: Vec<Projected>,
@@ -81,7 +81,7 @@ pub(super) enum HypothesisSet {
 }
 
 impl HypothesisSet {
-    fn has(self, smoothness: Smoothness) -> bool {
+    fn contains(self, smoothness: Smoothness) -> bool {
         let is_rough = smoothness == Smoothness::Exponential;
         match self {
             Self::All => true,
@@ -91,11 +91,11 @@ impl HypothesisSet {
     }
 
     /// Returns the two factors on the variance of the field that the samples use.
-    fn variances(self, smoothness: Smoothness) -> [f64; 2] {
+    fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
-            Self::Smooth => [1.0, OVER],
-            _ if Self::Rough.has(smoothness) => [1.0, UNDER_ROUGH],
-            _ => [1.0, UNDER],
+            Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
+            _ if Self::Rough.contains(smoothness) => [1.0, UPPER_BOUND_VARIANCE_FACTOR_ROUGH],
+            _ => [1.0, UPPER_BOUND_VARIANCE_FACTOR],
         }
     }
 }
@@ -113,9 +113,9 @@ pub(super) struct PosteriorSamples {
 }
 
 impl<'f> Posterior<'f> {
-    pub(super) fn of(
+    pub(super) fn new(
         fields: &'f FieldHypotheses,
-        observed: &'f Observed,
+        observed: &'f Observations,
         priors: Option<&Prior>,
         probe: NoisePrior,
     ) -> Self {
@@ -183,7 +183,7 @@ impl<'f> Posterior<'f> {
                 }
             }
         }
-        NoiseLikelihood::of(&products, logs, self.fields.degrees_of_freedom, self.probe)
+        NoiseLikelihood::new(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
     /// Returns the most probable node and variance ratio.
@@ -199,8 +199,8 @@ impl<'f> Posterior<'f> {
     }
 
     /// Returns the probability that the field is a rough one.
-    pub(super) fn is_rough(&self) -> f64 {
-        let is = |of: &(usize, f64, f64)| HypothesisSet::Rough.has(self.fields.hypotheses[of.0].smoothness);
+    pub(super) fn rough_probability(&self) -> f64 {
+        let is = |of: &(usize, f64, f64)| HypothesisSet::Rough.contains(self.fields.hypotheses[of.0].smoothness);
         self.probabilities(HypothesisSet::All).iter().filter(|of| is(of)).map(|of| of.2).sum()
     }
 
@@ -217,7 +217,7 @@ impl<'f> Posterior<'f> {
     /// Returns (node, variance ratio, probability) for the fields of a set. The probabilities sum to 1.
     fn probabilities(&self, which: HypothesisSet) -> Vec<(usize, f64, f64)> {
         let chosen =
-            || self.densities.iter().enumerate().filter(|of| which.has(self.fields.hypotheses[of.0].smoothness));
+            || self.densities.iter().enumerate().filter(|of| which.contains(self.fields.hypotheses[of.0].smoothness));
         let top = chosen().flat_map(|(_, of)| of).copied().fold(f64::NEG_INFINITY, f64::max);
         let all = chosen().flat_map(|(node, of)| {
             variance_ratios().zip(of).map(move |(tau, density)| (node, tau, (density - top).exp()))
@@ -243,7 +243,7 @@ impl<'f> Posterior<'f> {
 
     /// Returns a weight, at most 1, for a field whose standard deviation exceeds the RMS of the residuals. The points
     /// would show almost nothing of a field that is much stronger.
-    fn doubt(&self, hyperparameters: &Hyperparameters) -> f64 {
+    fn strength_weight(&self, hyperparameters: &Hyperparameters) -> f64 {
         let beyond =
             (hyperparameters.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         (-0.5 * beyond * beyond).exp()
@@ -258,7 +258,7 @@ impl<'f> Posterior<'f> {
             let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
             let hyperparameters = self.hyperparameters(node, tau);
             let sum: f64 = densities.iter().map(|of| (of - most).exp()).sum();
-            Some((hyperparameters, most + sum.ln() + self.doubt(&hyperparameters).max(f64::MIN_POSITIVE).ln()))
+            Some((hyperparameters, most + sum.ln() + self.strength_weight(&hyperparameters).max(f64::MIN_POSITIVE).ln()))
         };
         let chosen = self.densities.iter().enumerate().filter(|of| is_of(self.fields.hypotheses[of.0].smoothness));
         let mut all: Vec<(Hyperparameters, f64)> = chosen.filter_map(of).collect();
@@ -344,14 +344,14 @@ impl<'f> Posterior<'f> {
     ) -> PosteriorSamples {
         let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let (waves, seen, count) = (node.standard_deviations.len(), node.eigenvalues.len(), chosen.len());
-        let mut streams: Vec<Normals> = chosen.iter().map(|(.., k)| Normals::new(seed, *k as u64)).collect();
+        let mut streams: Vec<NormalGenerator> = chosen.iter().map(|(.., k)| NormalGenerator::new(seed, *k as u64)).collect();
         let told: Vec<(f64, DVector<f64>)> = chosen
             .iter()
             .zip(&mut streams)
             .map(|((_, tau, _), normals)| {
                 let scale = self.noise_likelihood(number, *tau);
                 let scatter_mm = scale.sample_mm(normals);
-                (scatter_mm, scale.stated(scatter_mm, normals))
+                (scatter_mm, scale.sample_random_effects(scatter_mm, normals))
             })
             .collect();
         let mut before = Mat::<f64>::zeros(waves, count);
@@ -381,10 +381,10 @@ impl<'f> Posterior<'f> {
             coefficients
         };
         let narrow_mm = which
-            .variances(node.smoothness)
+            .variance_factors(node.smoothness)
             .map(|under| (0..count).map(|c| (strength2(c, under) * node.truncated_variance).sqrt()).collect());
         PosteriorSamples {
-            coefficients: which.variances(node.smoothness).map(of),
+            coefficients: which.variance_factors(node.smoothness).map(of),
             random_effects: DMatrix::from_fn(self.observed.random_effects.ncols(), count, |e, c| told[c].1[e]),
             noise_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
             truncated_mm: narrow_mm,
@@ -401,7 +401,7 @@ impl<'f> Posterior<'f> {
         let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let scale = self.noise_likelihood(number, tau);
         let scatter_mm = scale.mode_mm();
-        let stated = scale.stated_mean(scatter_mm);
+        let stated = scale.random_effects_mode(scatter_mm);
         let field2 = tau * node.scale;
         let left = Mat::from_fn(node.eigenvalues.len(), 1, |k, _| {
             let found = v[(k, 0)] - (0..stated.len()).map(|e| stated[e] * v[(k, 1 + e)]).sum::<f64>();
@@ -423,7 +423,7 @@ impl<'f> Posterior<'f> {
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
         for (number, tau, weight) in self.probabilities(HypothesisSet::All) {
             let node = &self.fields.hypotheses[number];
-            let weight = weight * self.doubt(&self.hyperparameters(number, tau));
+            let weight = weight * self.strength_weight(&self.hyperparameters(number, tau));
             if weight < 1e-6 {
                 continue;
             }
@@ -431,7 +431,7 @@ impl<'f> Posterior<'f> {
             let strength2 = own2 * tau * node.scale;
             // The variance of the polynomials is as large as the corners of the part need. As form of the part, the
             // polynomials would make the pose more uncertain than real forms do.
-            let cosines = self.fields.basis.count_of_polynomials()..node.standard_deviations.len();
+            let cosines = self.fields.basis.polynomial_count()..node.standard_deviations.len();
             let strong = DMatrix::from_fn(p, cosines.len(), |r, k| {
                 let wave = cosines.start + k;
                 sums[(r, wave)] * node.standard_deviations[wave]
@@ -461,7 +461,7 @@ struct NoiseLikelihood {
 }
 
 impl NoiseLikelihood {
-    fn of(products: &DMatrix<f64>, logs: f64, free: f64, probe: NoisePrior) -> Self {
+    fn new(products: &DMatrix<f64>, logs: f64, free: f64, probe: NoisePrior) -> Self {
         let stated = products.nrows() - 1;
         let (by_stated, axes) = if stated == 0 {
             (Vec::new(), DMatrix::zeros(0, 0))
@@ -524,14 +524,14 @@ impl NoiseLikelihood {
         (first, step, (0..FINE).map(|k| self.density(first + step * k as f64)).collect())
     }
 
-    fn is_plain(&self) -> bool {
+    fn is_closed_form(&self) -> bool {
         self.random_effect_terms.is_empty() && self.probe.is_none()
     }
 
     /// Returns the logarithm of the likelihood with s integrated out, without the constants that are the same for every
     /// field.
     fn log_marginal(&self) -> f64 {
-        if self.is_plain() {
+        if self.is_closed_form() {
             return -0.5 * (self.logs + self.degrees_of_freedom * self.squares.ln());
         }
         let (_, step, densities) = self.steps();
@@ -541,7 +541,7 @@ impl NoiseLikelihood {
 
     /// Returns the most probable s, in mm.
     fn mode_mm(&self) -> f64 {
-        if self.is_plain() {
+        if self.is_closed_form() {
             return (self.squares / self.degrees_of_freedom).sqrt();
         }
         let (first, step, densities) = self.steps();
@@ -549,8 +549,8 @@ impl NoiseLikelihood {
         (first + step * best as f64).exp()
     }
 
-    fn sample_mm(&self, normals: &mut Normals) -> f64 {
-        if self.is_plain() {
+    fn sample_mm(&self, normals: &mut NormalGenerator) -> f64 {
+        if self.is_closed_form() {
             // Chi-squared: for few degrees of freedom a sum of squared normal numbers, which is exact; otherwise the
             // cube-root approximation (Wilson and Hilferty 1931).
             const MANY: f64 = 60.0;
@@ -574,16 +574,16 @@ impl NoiseLikelihood {
     }
 
     /// Returns the most probable random effects, each in units of its standard uncertainty.
-    fn stated_mean(&self, scatter_mm: f64) -> DVector<f64> {
+    fn random_effects_mode(&self, scatter_mm: f64) -> DVector<f64> {
         let along = self.random_effect_terms.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
         &self.axes * DVector::from_iterator(self.random_effect_terms.len(), along)
     }
 
-    fn stated(&self, scatter_mm: f64, normals: &mut Normals) -> DVector<f64> {
+    fn sample_random_effects(&self, scatter_mm: f64, normals: &mut NormalGenerator) -> DVector<f64> {
         let scatter2 = scatter_mm * scatter_mm;
         let spread = self.random_effect_terms.iter().map(|[u, _]| (1.0 + u / scatter2).sqrt().recip() * normals.next());
         let spread = &self.axes * DVector::from_iterator(self.random_effect_terms.len(), spread);
-        self.stated_mean(scatter_mm) + spread
+        self.random_effects_mode(scatter_mm) + spread
     }
 }
 
@@ -599,12 +599,12 @@ mod tests {
 
     /// Returns observations of a field with known hyperparameters, plus a shift and a tilt that the model does not
     /// know.
-    fn drawn(hyperparameters: Hyperparameters, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observed {
+    fn simulated(hyperparameters: Hyperparameters, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observations {
         let n = places.len();
         let covariance = DMatrix::from_fn(n, n, |r, c| {
             hyperparameters.field.covariance_mm2(places[r], places[c]) + if r == c { 1e-14 } else { 0.0 }
         });
-        let mut normals = Normals::new(seed, 0);
+        let mut normals = NormalGenerator::new(seed, 0);
         let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
         let mut last = normals.next();
         let mut of = |k: usize| {
@@ -615,7 +615,7 @@ mod tests {
         };
         let deviations_mm = (0..n).map(&mut of).collect();
         let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-        Observed { fixed_effects: effects, path, ..Observed::without_effects(places, deviations_mm) }
+        Observations { fixed_effects: effects, path, ..Observations::without_effects(places, deviations_mm) }
     }
 
     const PLANTED: Hyperparameters =
@@ -627,7 +627,7 @@ mod tests {
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
             let found = Hyperparameters::estimate(
-                &drawn(PLANTED, places(300), Vec::new(), u64::from(seed)),
+                &simulated(PLANTED, places(300), Vec::new(), u64::from(seed)),
                 Some(&Prior::for_size(102.0)),
             )
             .unwrap();
@@ -641,11 +641,11 @@ mod tests {
     }
 
     /// Returns observations of points that are measured row by row, back and forth.
-    fn in_rows(hyperparameters: Hyperparameters, seed: u64) -> Observed {
+    fn in_rows(hyperparameters: Hyperparameters, seed: u64) -> Observations {
         let at = |k: usize| {
             [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
         };
-        drawn(hyperparameters, (0..540).map(at).collect(), (0..540).map(f64::from).collect(), seed)
+        simulated(hyperparameters, (0..540).map(at).collect(), (0..540).map(f64::from).collect(), seed)
     }
 
     #[test]
@@ -693,9 +693,9 @@ mod tests {
 
     #[test]
     fn the_scale_of_everything_is_the_scale_of_what_is_found() {
-        let observed = drawn(PLANTED, places(120), Vec::new(), 1);
+        let observed = simulated(PLANTED, places(120), Vec::new(), 1);
         let tenfold =
-            Observed { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
+            Observations { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
         let [a, b] = [observed, tenfold].map(|observed| Hyperparameters::estimate(&observed, None).unwrap());
         assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
@@ -710,10 +710,10 @@ mod tests {
     #[test]
     fn the_likelihood_is_that_of_the_covariance_that_the_waves_make() {
         for (count, near) in [(60, 1e-6), (500, 0.2)] {
-            let observed = drawn(PLANTED, places(count), Vec::new(), 3);
+            let observed = simulated(PLANTED, places(count), Vec::new(), 3);
             let n = observed.places.len();
             let fields = FieldHypotheses::over(&observed, NoiseKind::PLAIN).unwrap();
-            let posterior = Posterior::of(&fields, &observed, None, None);
+            let posterior = Posterior::new(&fields, &observed, None, None);
             let is_one = |node: &FieldHypothesis| node.smoothness == Smoothness::Matern2 && node.range_mm > 30.0;
             let number = fields.hypotheses.iter().position(is_one).unwrap();
             let node = &fields.hypotheses[number];

@@ -17,15 +17,15 @@
 use faer::Mat;
 use nalgebra::DMatrix;
 
-use super::form::Motions;
+use super::form::FreeMotions;
 use super::nelder_mead::maximize;
-use super::{DensePosterior, Field, Hyperparameters, ModelError, Observed, Prior, orthonormal_base};
+use super::{DensePosterior, Field, Hyperparameters, ModelError, Observations, Prior, orthonormal_base};
 use crate::registration::{Deviation, PointStatus, Registration};
 
 /// Observed points, and the session of each.
 #[derive(Clone, Debug)]
 pub struct Sessions {
-    observed: Observed,
+    observed: Observations,
     session_numbers: Vec<u32>,
 }
 
@@ -54,10 +54,10 @@ pub struct PredictionInterval {
 }
 
 /// Maximum number of points of which every pair is evaluated: in the search of hyperparameters, and in the prediction.
-const MOST_SEARCHED: usize = 300;
-const MOST_KNOWN: usize = 1500;
+const MAX_SEARCH_POINTS: usize = 300;
+const MAX_KNOWN_POINTS: usize = 1500;
 /// Minimum number of sessions: one alone contains no difference between sessions.
-const FEWEST_SESSIONS: usize = 2;
+const MIN_SESSIONS: usize = 2;
 /// Start values of the search: strengths of the session's field as shares of that of the part's field, and factors of
 /// the prior median of each range.
 const SHARES: [f64; 3] = [0.1, 0.5, 2.0];
@@ -67,12 +67,12 @@ const RANGES: [f64; 3] = [0.3, 1.0, 3.0];
 const ROUNDS: usize = 4;
 /// Prior of the session's field, as the median and the factor of one standard deviation of the logarithm: its strength
 /// as a share of that of the part's field, and its range divided by the prior median of the part's range.
-const OWN_SHARE: [f64; 2] = [0.5, 6.0];
-const OWN_RANGE: [f64; 2] = [3.0, 6.0];
+const SESSION_STRENGTH_PRIOR: [f64; 2] = [0.5, 6.0];
+const SESSION_RANGE_PRIOR: [f64; 2] = [3.0, 6.0];
 /// Distance from the maximum, in the logarithm of the strength, at which the likelihood is evaluated for its curvature.
 const STEP: f64 = 0.1;
 /// Minimum number of degrees of freedom; a smaller one counts as this.
-const LEAST_DEGREES: f64 = 2.0;
+const MIN_DEGREES_OF_FREEDOM: f64 = 2.0;
 
 impl Sessions {
     /// Joins observed points with the number of the session of each.
@@ -80,7 +80,7 @@ impl Sessions {
     /// # Errors
     /// Returns an error if the numbers of rows or of sessions differ from that of the points, or a number is not
     /// finite.
-    pub fn new(observed: Observed, of: Vec<u32>) -> Result<Self, ModelError> {
+    pub fn new(observed: Observations, of: Vec<u32>) -> Result<Self, ModelError> {
         observed.check()?;
         if of.len() != observed.places.len() {
             return Err(ModelError::Sessions { points: observed.places.len(), sessions: of.len() });
@@ -106,7 +106,7 @@ impl Sessions {
             if used.is_empty() {
                 return Err(ModelError::TooFewPoints { points: 0, min_points: 7 });
             }
-            parts.push(Motions::of(registration, used.iter().map(|d| d.point)).observed(&used));
+            parts.push(FreeMotions::from_registration(registration, used.iter().map(|d| d.point)).observed(&used));
             of.extend(numbers);
         }
         Self::new(joined(&parts), of)
@@ -127,11 +127,11 @@ impl Sessions {
         let mut numbers = self.session_numbers.clone();
         numbers.sort_unstable();
         numbers.dedup();
-        if numbers.len() < FEWEST_SESSIONS {
-            return Err(ModelError::TooFewSessions { sessions: numbers.len(), min_sessions: FEWEST_SESSIONS });
+        if numbers.len() < MIN_SESSIONS {
+            return Err(ModelError::TooFewSessions { sessions: numbers.len(), min_sessions: MIN_SESSIONS });
         }
-        let few = self.thinned(MOST_SEARCHED);
-        let (found, top) = few.searched(priors);
+        let few = self.thinned(MAX_SEARCH_POINTS);
+        let (found, top) = few.search_maximum(priors);
         let (hyperparameters, own, _) = few.scaled(found, priors)?;
         // The uncertainty of the strength follows from the curvature of the log-likelihood along it. The common scale
         // changes with it, so the change of ln(sigma) is taken from the fits.
@@ -152,14 +152,14 @@ impl Sessions {
 
     /// Searches the maximum from the best of several start values: over the common field, then over the session's
     /// field, in turns.
-    fn searched(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
+    fn search_maximum(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
         let mut best = ([[median_mm.ln(), 0.5_f64.ln()]; 2], f64::NEG_INFINITY);
         for range in RANGES {
             for share in SHARES {
                 for own in RANGES {
-                    let ranges_mm = [range * median_mm, own * OWN_RANGE[0] * median_mm];
+                    let ranges_mm = [range * median_mm, own * SESSION_RANGE_PRIOR[0] * median_mm];
                     let at = [[ranges_mm[0].ln(), 0.5_f64.ln()], [share.ln(), ranges_mm[1].ln()]];
                     let value = height(at);
                     if value > best.1 {
@@ -199,8 +199,8 @@ impl Sessions {
         let log_of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
         let value = model.log_likelihood() + 0.5 * squares - 0.5 * free - free * scale.ln()
             + priors.log_density(range_mm, ratio)
-            + log_of(share, OWN_SHARE)
-            + log_of(own_mm / priors.range_mm[0], OWN_RANGE);
+            + log_of(share, SESSION_STRENGTH_PRIOR)
+            + log_of(own_mm / priors.range_mm[0], SESSION_RANGE_PRIOR);
         let scaled = |field: Field| Field { sigma_mm: field.sigma_mm * scale, ..field };
         Ok((
             Hyperparameters { field: scaled(unit.field), noise_sigma_mm: ratio * scale, noise_autocorrelation: 0.0 },
@@ -211,8 +211,8 @@ impl Sessions {
 
     fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
-        let own = own.pairs();
-        DensePosterior::with(&self.observed, hyperparameters, |a, b| match self.session_numbers[a] == self.session_numbers[b] {
+        let own = own.pair_covariance();
+        DensePosterior::with_shared_covariance(&self.observed, hyperparameters, |a, b| match self.session_numbers[a] == self.session_numbers[b] {
             true => own.covariance_mm2(places[a], places[b]),
             false => 0.0,
         })
@@ -227,7 +227,7 @@ impl Sessions {
 }
 
 /// Joins the points of all parts in their order; each part has fixed effects of its own.
-fn joined(parts: &[Observed]) -> Observed {
+fn joined(parts: &[Observations]) -> Observations {
     let rows = parts.iter().map(|part| part.places.len()).sum();
     let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.fixed_effects.ncols()).sum());
     let (mut places, mut deviations_mm, mut column) = (Vec::new(), Vec::new(), 0);
@@ -237,7 +237,7 @@ fn joined(parts: &[Observed]) -> Observed {
         places.extend(&part.places);
         deviations_mm.extend(&part.deviations_mm);
     }
-    Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
+    Observations { fixed_effects: effects, ..Observations::without_effects(places, deviations_mm) }
 }
 
 impl BetweenSessionVariance {
@@ -250,25 +250,25 @@ impl BetweenSessionVariance {
     /// # Errors
     /// Those of [`DensePosterior::fit`].
     pub fn predict(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<PredictionInterval>, ModelError> {
-        let model = known.thinned(MOST_KNOWN).fit(self.hyperparameters, self.session_field)?;
-        let Observed { places, fixed_effects: effects, .. } = &unseen.observed;
+        let model = known.thinned(MAX_KNOWN_POINTS).fit(self.hyperparameters, self.session_field)?;
+        let Observations { places, fixed_effects: effects, .. } = &unseen.observed;
         let (means_mm, common) = model.predict_together(places);
-        let pairs = self.session_field.pairs();
+        let pairs = self.session_field.pair_covariance();
         let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.session_numbers[r] == unseen.session_numbers[c] {
             true => pairs.covariance_mm2(places[r], places[c]),
             false => 0.0,
         });
-        let base = BestFitBasis::of(effects);
+        let base = BestFitBasis::new(effects);
         let fitted_mm = base.after_best_fit(&means_mm);
         let [common, own] = [common, own].map(|covariance| base.variances_after(&covariance));
         let scatter_mm2 = self.hyperparameters.noise_sigma_mm.powi(2);
         let of = |k: usize| {
-            let steady_mm2 = common[k] + scatter_mm2 * base.free(k);
+            let steady_mm2 = common[k] + scatter_mm2 * base.remaining_share(k);
             let variance_mm2 = (steady_mm2 + own[k]).max(f64::MIN_POSITIVE);
             // Degrees of freedom of a total variance of which one part is uncertain (Satterthwaite 1946): the logarithm
             // of the session's variance has the standard uncertainty 2 u.
             let relative = 2.0 * self.session_log_sigma_u * own[k] / variance_mm2;
-            let degrees = (2.0 / relative.powi(2).max(f64::MIN_POSITIVE)).max(LEAST_DEGREES);
+            let degrees = (2.0 / relative.powi(2).max(f64::MIN_POSITIVE)).max(MIN_DEGREES_OF_FREEDOM);
             PredictionInterval { mean_mm: fitted_mm[k], sigma_mm: variance_mm2.sqrt(), degrees_of_freedom: degrees }
         };
         Ok((0..places.len()).map(of).collect())
@@ -279,13 +279,13 @@ impl PredictionInterval {
     /// Returns the half width of the 95 % prediction interval about the mean, in mm. It uses Student's t, because an
     /// uncertainty that is estimated from few sessions is uncertain itself.
     pub fn half_width_mm(&self) -> f64 {
-        self.sigma_mm * student(self.degrees_of_freedom)
+        self.sigma_mm * student_t_quantile(self.degrees_of_freedom)
     }
 }
 
 /// Returns the 97.5 % quantile of Student's t by an asymptotic expansion (Fisher and Cornish 1960). Its error is within
 /// 2 % at 2 degrees of freedom, within 0.4 % at 3, and vanishes for many.
-fn student(degrees: f64) -> f64 {
+fn student_t_quantile(degrees: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
     // Terms in powers of 1 / degrees: each is z times a polynomial in z^2, the highest power first.
     const TERMS: [(f64, [f64; 5]); 4] = [
@@ -296,7 +296,7 @@ fn student(degrees: f64) -> f64 {
     ];
     let mut power = 1.0;
     TERMS.iter().fold(Z, |sum, (under, factors)| {
-        power /= degrees.max(LEAST_DEGREES);
+        power /= degrees.max(MIN_DEGREES_OF_FREEDOM);
         sum + power * Z * factors.iter().fold(0.0, |value, factor| value * Z * Z + factor) / under
     })
 }
@@ -307,7 +307,7 @@ struct BestFitBasis {
 }
 
 impl BestFitBasis {
-    fn of(effects: &DMatrix<f64>) -> Self {
+    fn new(effects: &DMatrix<f64>) -> Self {
         Self { q: orthonormal_base(effects.clone()) }
     }
 
@@ -318,7 +318,7 @@ impl BestFitBasis {
     }
 
     /// Returns the share of the variance of independent points that the best fit leaves at one of them.
-    fn free(&self, point: usize) -> f64 {
+    fn remaining_share(&self, point: usize) -> f64 {
         1.0 - self.q.row(point).norm_squared()
     }
 

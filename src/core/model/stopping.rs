@@ -11,9 +11,9 @@
 //! the form can lie. One touch in ten goes to a random target, so that the measurement also finds what the model does
 //! not expect. Further touches go to the neighbours of outliers.
 
-use super::form::Motions;
-use super::normals::Normals;
-use super::{Form, IncrementalPosterior, ModelError, ModelInputs, Observed, Prediction};
+use super::form::FreeMotions;
+use super::random_normals::NormalGenerator;
+use super::{Form, IncrementalPosterior, ModelError, ModelInputs, Observations, Prediction};
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
 
@@ -95,19 +95,19 @@ pub const MAX_BATCHES: u32 = 60;
 /// Minimum and maximum number of touches of a batch.
 const BATCH: [usize; 2] = [20, 100];
 /// One touch in this many goes to a random target.
-const ANYWHERE: usize = 10;
+const RANDOM_INTERVAL: usize = 10;
 /// Number of standard deviations from which an innovation counts as an outlier, and number of neighbours that are
 /// examined around an outlier.
-const STANDS_OUT: f64 = 4.5;
+const OUTLIER_SIGMAS: f64 = 4.5;
 const NEIGHBOURS: usize = 6;
 /// Number of these neighbours that must have been tried.
-const SURROUNDED: usize = 4;
+const MIN_TRIED_NEIGHBOURS: usize = 4;
 /// Normal quantile of 99.9 %: by chance, the mean square of the innovations exceeds its bound in one batch of a
 /// thousand.
-const BY_CHANCE: f64 = 3.09;
+const INNOVATION_QUANTILE: f64 = 3.09;
 /// If the part is not accepted and another pass can help, the measurement ends at this share of the pattern, but not
 /// before this number of touches.
-const GIVEN_UP: (f64, usize) = (1.0 / 6.0, 120);
+const GIVE_UP_LIMITS: (f64, usize) = (1.0 / 6.0, 120);
 
 /// Returns the indices of at most `most` targets that lie as far apart as possible: each is the target farthest from
 /// all chosen before it.
@@ -137,17 +137,17 @@ pub fn decide(
     seed: u64,
 ) -> Result<StoppingDecision, ModelError> {
     let form = Form::estimate_with(registration, inputs, so_far.targets, false)?;
-    let mut growing = ExpectedTouches::of(registration, inputs, &form, so_far)?;
+    let mut growing = ExpectedTouches::new(registration, inputs, &form, so_far)?;
     let count = so_far.touched.len();
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
-    let around = growing.around(so_far);
+    let around = growing.untried_neighbours(so_far);
     let why = match () {
         () if left == 0 => Reason::AllTargetsTried,
         () if count < MIN_TOUCHES => Reason::TooFewTouches,
-        () if growing.feature(so_far) => Reason::NarrowFeature,
-        () if growing.is_surprised() => Reason::LargeInnovations,
+        () if growing.has_feature(so_far) => Reason::NarrowFeature,
+        () if growing.has_large_innovations() => Reason::LargeInnovations,
         () if !around.is_empty() => Reason::UnconfirmedOutlier,
-        () => settled(&form, purpose, (count, so_far.targets.len())),
+        () => reason_from_form(&form, purpose, (count, so_far.targets.len())),
     };
     let is_over = matches!(why, Reason::WithinLimits | Reason::FormKnown | Reason::CorrectionPreferred | Reason::BeyondLimit | Reason::AllTargetsTried);
     let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
@@ -157,7 +157,7 @@ pub fn decide(
         Reason::NarrowFeature | Reason::MaxBatchesReached => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
         _ => {
             let wanted = if count < MIN_TOUCHES { MIN_TOUCHES - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
-            growing.next(so_far, &around, wanted.max(around.len()).min(left), seed)?
+            growing.choose_next(so_far, &around, wanted.max(around.len()).min(left), seed)?
         }
     };
     let is_all = matches!(why, Reason::NarrowFeature | Reason::MaxBatchesReached);
@@ -168,7 +168,7 @@ pub fn decide(
 }
 
 /// Returns the reason that follows from the figures and from the uncertainty of the form.
-fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
+fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
         (form.figures.pv_998, purpose.pv_998_mm),
@@ -179,7 +179,7 @@ fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, us
     }
     let is_known = form.rms_smooth_sigma_mm <= purpose.correction_sigma_mm;
     let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
-    let (share, least) = GIVEN_UP;
+    let (share, least) = GIVE_UP_LIMITS;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
     // The final judgement is a single decision, so its limit is less strict than that of one decision among many. A
     // part that it can accept gets more touches, not another pass.
@@ -204,7 +204,7 @@ struct ExpectedTouches {
 impl ExpectedTouches {
     /// Conditions the model on all batches before the last, computes the standardized innovations of the last batch,
     /// and then conditions the model on that batch too.
-    fn of(
+    fn new(
         registration: &Registration,
         inputs: &ModelInputs,
         form: &Form,
@@ -213,22 +213,22 @@ impl ExpectedTouches {
         let PartialMeasurement { targets, tried, touched } = so_far;
         let all: Vec<_> = registration.deviations.iter().zip(touched.iter().copied()).collect();
         let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Inlier && d.in_fit);
-        let motions = Motions::of(registration, used().map(|(d, _)| d.point));
-        let stated = motions.stated(registration, inputs)?;
+        let motions = FreeMotions::from_registration(registration, used().map(|(d, _)| d.point));
+        let stated = motions.machine_effects(registration, inputs)?;
         let last = tried.iter().flatten().max().copied().unwrap_or(0);
-        let of = |is_last: bool| -> (Observed, Vec<usize>) {
+        let of = |is_last: bool| -> (Observations, Vec<usize>) {
             let chosen: Vec<_> = used().filter(|(_, target)| (tried[*target] == Some(last)) == is_last).collect();
             let rows: Vec<_> = chosen.iter().map(|(d, _)| *d).collect();
             let columns = stated.columns(rows.iter().map(|d| (d.point, d.normal)));
             (
-                Observed { random_effects: columns, ..motions.observed(&rows) },
+                Observations { random_effects: columns, ..motions.observed(&rows) },
                 chosen.iter().map(|(_, target)| *target).collect(),
             )
         };
         let ((before, _), (found, of_targets)) = (of(false), of(true));
         let places: Vec<[f64; 2]> = targets.iter().map(|(point, _)| [point.x, point.y]).collect();
         let (rows, columns) = (motions.rows(targets.iter().copied()), stated.columns(targets.iter().copied()));
-        let mut growing = IncrementalPosterior::over(&places, &rows, &columns, form.hyperparameters)?;
+        let mut growing = IncrementalPosterior::at_places(&places, &rows, &columns, form.hyperparameters)?;
         growing.update(&before)?;
         // With no more points than fixed effects the motions are not determined, so the model predicts nothing.
         let is_held = before.places.len() > before.fixed_effects.ncols();
@@ -240,25 +240,25 @@ impl ExpectedTouches {
     }
 
     /// Returns true if the innovations of the last batch without its outliers are larger than expected by chance.
-    fn is_surprised(&self) -> bool {
-        let squares: Vec<f64> = self.last_innovations.iter().filter(|(_, z)| z.abs() < STANDS_OUT).map(|(_, z)| z * z).collect();
+    fn has_large_innovations(&self) -> bool {
+        let squares: Vec<f64> = self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
         let n = squares.len() as f64;
         // Quantile of chi-squared divided by its degrees of freedom (Wilson and Hilferty 1931).
         let ninth = 2.0 / (9.0 * n);
-        n > 0.0 && squares.iter().sum::<f64>() / n > (1.0 - ninth + BY_CHANCE * ninth.sqrt()).powi(3)
+        n > 0.0 && squares.iter().sum::<f64>() / n > (1.0 - ninth + INNOVATION_QUANTILE * ninth.sqrt()).powi(3)
     }
 
-    fn standing_out(&self) -> impl Iterator<Item = usize> + '_ {
-        let off = self.last_innovations.iter().filter(|(_, z)| z.abs() >= STANDS_OUT).map(|(target, _)| *target);
+    fn all_outliers(&self) -> impl Iterator<Item = usize> + '_ {
+        let off = self.last_innovations.iter().filter(|(_, z)| z.abs() >= OUTLIER_SIGMAS).map(|(target, _)| *target);
         off.chain(self.outliers.iter().copied())
     }
 
     /// Returns the untried neighbours of outliers of which too few neighbours were tried.
-    fn around(&self, so_far: &PartialMeasurement) -> Vec<usize> {
+    fn untried_neighbours(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
-        for target in self.standing_out() {
+        for target in self.all_outliers() {
             let near = neighbours(so_far.targets, target);
-            if near.iter().filter(|&&k| so_far.tried[k].is_some()).count() < SURROUNDED.min(near.len()) {
+            if near.iter().filter(|&&k| so_far.tried[k].is_some()).count() < MIN_TRIED_NEIGHBOURS.min(near.len()) {
                 around.extend(near.into_iter().filter(|&k| so_far.tried[k].is_none()));
             }
         }
@@ -268,13 +268,13 @@ impl ExpectedTouches {
     }
 
     /// Returns true if two neighbours are both outliers: dust makes a single outlier.
-    fn feature(&self, so_far: &PartialMeasurement) -> bool {
+    fn has_feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
     /// Chooses the targets to touch next: `around` first, then random ones, then those of largest weighted variance.
-    fn next(
+    fn choose_next(
         &mut self,
         so_far: &PartialMeasurement,
         around: &[usize],
@@ -284,8 +284,8 @@ impl ExpectedTouches {
         let mut open: Vec<bool> = so_far.tried.iter().map(Option::is_none).collect();
         let mut chosen: Vec<usize> = around.iter().copied().filter(|&k| open[k]).collect();
         chosen.iter().for_each(|&k| open[k] = false);
-        let mut random = Normals::new(seed, so_far.touched.len() as u64);
-        for _ in 0..wanted.div_ceil(ANYWHERE).min(wanted.saturating_sub(chosen.len())) {
+        let mut random = NormalGenerator::new(seed, so_far.touched.len() as u64);
+        for _ in 0..wanted.div_ceil(RANDOM_INTERVAL).min(wanted.saturating_sub(chosen.len())) {
             // The phase of two independent normal numbers is uniformly distributed.
             let share = (random.next().atan2(random.next()) / std::f64::consts::TAU).rem_euclid(1.0);
             let free: Vec<usize> = (0..open.len()).filter(|&k| open[k]).collect();
@@ -297,7 +297,7 @@ impl ExpectedTouches {
             self.posterior.update_with_expected(place)?;
         }
         while chosen.len() < wanted {
-            let Some(best) = self.least_known(&open) else { break };
+            let Some(best) = self.max_variance_target(&open) else { break };
             self.posterior.update_with_expected(best)?;
             open[best] = false;
             chosen.push(best);
@@ -307,7 +307,7 @@ impl ExpectedTouches {
 
     /// Returns the open target with the largest weighted variance. The weight is 2 where the maximum or the minimum of
     /// the form can lie, otherwise 1.
-    fn least_known(&self, open: &[bool]) -> Option<usize> {
+    fn max_variance_target(&self, open: &[bool]) -> Option<usize> {
         let known: Vec<Prediction> = self.posterior.predictions().collect();
         let surely =
             |sign: f64| known.iter().map(|p| sign * p.mean_mm - 2.0 * p.sigma_mm).fold(f64::NEG_INFINITY, f64::max);

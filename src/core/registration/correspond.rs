@@ -4,11 +4,11 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::simd::{F64x4, LANES, Real, Vector3x4};
-use crate::surface::{Foot, FourFeet, OffsetSurface, Place, side_by_side};
+use crate::surface::{PointProjection, ProjectionX4, OffsetSurface, FacetIndex, points_x4};
 
 use super::deviation::PointStatus;
 use super::linearize::{FourSums, Scaling, Sums};
-use super::robust::ScaledLoss;
+use super::robust_loss::ScaledLoss;
 
 /// Points per task: enough to hide the cost of a task, few enough to share the work between threads.
 const CHUNK: usize = 512;
@@ -23,12 +23,12 @@ pub(crate) struct ResidualModel {
 }
 
 /// Tolerance for rounding, in steps of the sampling: a projection no farther than this beyond the edge is on the part.
-pub(super) const ON_PART_STEPS: f32 = 1e-3;
+pub(super) const EDGE_TOLERANCE_STEPS: f32 = 1e-3;
 
 /// State of a measured point that passes from one iteration to the next.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Correspondence {
-    pub(crate) facet: Place,
+    pub(crate) facet: FacetIndex,
     pub(crate) distance_mm: f64,
     /// Distance of the projection beyond the edge, in steps of the sampling.
     pub(crate) beyond_steps: f32,
@@ -48,10 +48,10 @@ impl Correspondence {
 
     /// Returns true if the projection is beyond the edge. The surface is unknown there, however near the point is.
     pub(crate) fn is_off_part(&self) -> bool {
-        self.beyond_steps > ON_PART_STEPS
+        self.beyond_steps > EDGE_TOLERANCE_STEPS
     }
 
-    pub(crate) const NEW: Self = Self { facet: Place::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
+    pub(crate) const INITIAL: Self = Self { facet: FacetIndex::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
 }
 
 /// Projects all points under a pose and returns the sums of the linear problem at the projections.
@@ -67,7 +67,7 @@ pub(crate) fn correspond(
     cmm_from_model: &Pose,
     scaling: &Scaling,
 ) -> Sums {
-    let pass = Pass { surface, residual, model_from_cmm: cmm_from_model.inverse(), scaling };
+    let pass = ProjectionPass { surface, residual, model_from_cmm: cmm_from_model.inverse(), scaling };
     let arch = pulp::Arch::new();
     let task = |(points, correspondences)| arch.dispatch(Chunk { projection_pass: &pass, points, correspondences });
     if measured.len() <= 2 * CHUNK {
@@ -79,7 +79,7 @@ pub(crate) fn correspond(
 
 /// Work of one task, in a form that is compiled once for each set of vector instructions.
 struct Chunk<'a> {
-    projection_pass: &'a Pass<'a>,
+    projection_pass: &'a ProjectionPass<'a>,
     points: &'a [Point],
     correspondences: &'a mut [Correspondence],
 }
@@ -95,22 +95,22 @@ impl pulp::NullaryFnOnce for Chunk<'_> {
 }
 
 /// One pass over the points: the data that all of them share.
-struct Pass<'a> {
+struct ProjectionPass<'a> {
     surface: &'a OffsetSurface<'a>,
     residual: &'a ResidualModel,
     model_from_cmm: Pose,
     scaling: &'a Scaling,
 }
 
-impl Pass<'_> {
+impl ProjectionPass<'_> {
     /// Returns the sums of one chunk of points. Processes four points together if they stay on their facets or move to
     /// new facets together, and single points otherwise.
     #[inline(always)]
     fn sum_chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
         let mut fours = FourSums::zero();
-        let mut last = Place::UNKNOWN;
-        let mut recent = [[Place::UNKNOWN; LANES]; 2];
+        let mut last = FacetIndex::UNKNOWN;
+        let mut recent = [[FacetIndex::UNKNOWN; LANES]; 2];
         let in_fours = self.surface.supports_project_x4() && self.surface.nominal().outline().is_none();
         let (four_points, rest_points) = points.as_chunks::<LANES>();
         let (four_correspondences, rest_correspondences) = correspondences.as_chunks_mut::<LANES>();
@@ -147,10 +147,10 @@ impl Pass<'_> {
     /// Returns the last places of four points, or places extrapolated from the eight points before them; `None` if
     /// neither is known.
     #[inline(always)]
-    fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
+    fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[FacetIndex; LANES]; 2]) -> Option<[FacetIndex; LANES]> {
         let places =
             [correspondences[0].facet, correspondences[1].facet, correspondences[2].facet, correspondences[3].facet];
-        if !places.contains(&Place::UNKNOWN) {
+        if !places.contains(&FacetIndex::UNKNOWN) {
             return Some(places);
         }
         self.surface.extrapolate_x4(&recent[0], &recent[1])
@@ -163,10 +163,10 @@ impl Pass<'_> {
         &self,
         points: &[Point; LANES],
         correspondences: &mut [Correspondence; LANES],
-        mut places: [Place; LANES],
+        mut places: [FacetIndex; LANES],
         sums: &mut FourSums,
     ) -> bool {
-        let p = four_moved(&self.model_from_cmm, &side_by_side(points));
+        let p = transform_x4(&self.model_from_cmm, &points_x4(points));
         let Some(feet) = self.surface.project_x4(&p, &mut places) else { return false };
         let distance = feet.distance_mm - F64x4::splat(self.residual.subtract_mm);
         let (mut weight, mut loss, mut used) = ([0.0; LANES], [0.0; LANES], 0);
@@ -184,10 +184,10 @@ impl Pass<'_> {
     }
 
     #[inline]
-    fn project_one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut Place, sums: &mut Sums) {
+    fn project_one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut FacetIndex, sums: &mut Sums) {
         let p = self.model_from_cmm.transform_point(point); // g^-1 Y
         // A point without an earlier place starts at the place of the point before it in the file, if there is one.
-        let start = if correspondence.facet == Place::UNKNOWN { *last } else { correspondence.facet };
+        let start = if correspondence.facet == FacetIndex::UNKNOWN { *last } else { correspondence.facet };
         let foot = self.surface.project(&p, start);
         *last = foot.facet;
         correspondence.facet = foot.facet;
@@ -202,7 +202,7 @@ impl Pass<'_> {
 
 /// Returns the distance of a point's projection beyond the edge, in steps of the sampling. Outside the outline it is at
 /// least one, because the outline can end the part before the nominal points end.
-pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f32 {
+pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProjection) -> f32 {
     let is_outside = surface.nominal().outline().is_some_and(|outline| {
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
         !outline.contains(contact.x, contact.y)
@@ -213,7 +213,7 @@ pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f
 
 /// Returns four points transformed by a pose.
 #[inline(always)]
-fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
+fn transform_x4(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     let (r, t) = (&pose.rotation, &pose.translation_mm);
     let row = |k: usize| {
         let part = |c: usize| F64x4::splat(r[(k, c)]) * w[c];
@@ -224,14 +224,14 @@ fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
 
 /// Four measured points at the end: their projections, and the rows of A there.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct FourFinal {
+pub(crate) struct FinalProjectionX4 {
     pub(crate) centre: Vector3x4,
-    pub(crate) projections: FourFeet,
+    pub(crate) projections: ProjectionX4,
     pub(crate) row: [F64x4; 6],
 }
 
 /// Conversion of four points and their projections to the reported items.
-pub(crate) trait Report: Sync {
+pub(crate) trait ProjectionReporter: Sync {
     /// Reported item of one point.
     type Item: Copy + Send;
 
@@ -240,14 +240,14 @@ pub(crate) trait Report: Sync {
 
     /// Returns the reported items of four points. Inlined, so that it is compiled with the caller's vector
     /// instructions.
-    fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Self::Item; LANES];
+    fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Self::Item; LANES];
 }
 
 /// Groups of four points per task of [`at_feet`].
-const FOURS: usize = 8;
+const GROUPS_PER_TASK: usize = 8;
 
 /// Projects all points once more and returns one reported item per point, in the order of the points.
-pub(crate) fn at_feet<R: Report>(
+pub(crate) fn report_projections<R: ProjectionReporter>(
     surface: &OffsetSurface,
     measured: &[Point],
     correspondences: &[Correspondence],
@@ -256,13 +256,13 @@ pub(crate) fn at_feet<R: Report>(
     report: &R,
 ) -> Vec<R::Item> {
     let at_end =
-        AtEnd { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, reporter: report };
+        FinalPass { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, reporter: report };
     let arch = pulp::Arch::new();
     // Whole blocks, written in place. The last block is padded with the last point.
-    let blocks: Vec<[[R::Item; LANES]; FOURS]> = (0..measured.len().div_ceil(LANES * FOURS))
+    let blocks: Vec<[[R::Item; LANES]; GROUPS_PER_TASK]> = (0..measured.len().div_ceil(LANES * GROUPS_PER_TASK))
         .into_par_iter()
-        .with_min_len(CHUNK / (LANES * FOURS))
-        .map(|block| arch.dispatch(EndBlock { final_pass: &at_end, block }))
+        .with_min_len(CHUNK / (LANES * GROUPS_PER_TASK))
+        .map(|block| arch.dispatch(FinalBlock { final_pass: &at_end, block }))
         .collect();
     let mut items = blocks.into_flattened().into_flattened();
     items.truncate(measured.len());
@@ -270,7 +270,7 @@ pub(crate) fn at_feet<R: Report>(
 }
 
 /// Data that all points share at the end.
-struct AtEnd<'a, R> {
+struct FinalPass<'a, R> {
     surface: &'a OffsetSurface<'a>,
     measured: &'a [Point],
     correspondences: &'a [Correspondence],
@@ -279,25 +279,25 @@ struct AtEnd<'a, R> {
     reporter: &'a R,
 }
 
-struct EndBlock<'a, R> {
-    final_pass: &'a AtEnd<'a, R>,
+struct FinalBlock<'a, R> {
+    final_pass: &'a FinalPass<'a, R>,
     block: usize,
 }
 
-impl<R: Report> pulp::NullaryFnOnce for EndBlock<'_, R> {
-    type Output = [[R::Item; LANES]; FOURS];
+impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
+    type Output = [[R::Item; LANES]; GROUPS_PER_TASK];
 
     #[inline(always)]
     fn call(self) -> Self::Output {
-        let mut items = [[R::BLANK; LANES]; FOURS];
+        let mut items = [[R::BLANK; LANES]; GROUPS_PER_TASK];
         for (four, items) in items.iter_mut().enumerate() {
-            *items = self.final_pass.report_group((self.block * FOURS + four) * LANES);
+            *items = self.final_pass.report_group((self.block * GROUPS_PER_TASK + four) * LANES);
         }
         items
     }
 }
 
-impl<R: Report> AtEnd<'_, R> {
+impl<R: ProjectionReporter> FinalPass<'_, R> {
     /// Reports four points from the index `first` on. Past the end it repeats the last point.
     #[inline(always)]
     fn report_group(&self, first: usize) -> [R::Item; LANES] {
@@ -306,27 +306,27 @@ impl<R: Report> AtEnd<'_, R> {
         let correspondences =
             [&self.correspondences[a], &self.correspondences[b], &self.correspondences[c], &self.correspondences[d]];
         let points = [self.measured[a], self.measured[b], self.measured[c], self.measured[d]];
-        let centre = four_moved(&self.model_from_cmm, &side_by_side(&points));
+        let centre = transform_x4(&self.model_from_cmm, &points_x4(&points));
         let mut places =
             [correspondences[0].facet, correspondences[1].facet, correspondences[2].facet, correspondences[3].facet];
-        let together = self.surface.supports_project_x4() && !places.contains(&Place::UNKNOWN);
+        let together = self.surface.supports_project_x4() && !places.contains(&FacetIndex::UNKNOWN);
         let feet = match if together { self.surface.project_x4(&centre, &mut places) } else { None } {
             Some(feet) => feet,
             None => self.project_individually(&centre, correspondences),
         };
         self.reporter
-            .report_x4(correspondences, &FourFinal { centre, projections: feet, row: self.scaling.four_rows(&centre, &feet.normal) })
+            .report_x4(correspondences, &FinalProjectionX4 { centre, projections: feet, row: self.scaling.four_rows(&centre, &feet.normal) })
     }
 
     /// Returns the projections of four points, each searched on its own.
     #[cold]
-    fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> FourFeet {
+    fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> ProjectionX4 {
         let foot = |l: usize| {
             let p = Point::new(centre[0].0[l], centre[1].0[l], centre[2].0[l]);
             self.surface.project(&p, correspondences[l].facet)
         };
         let feet: [_; LANES] = std::array::from_fn(foot);
-        FourFeet {
+        ProjectionX4 {
             distance_mm: F64x4(feet.map(|f| f.distance_mm)),
             normal: [0, 1, 2].map(|c| F64x4(feet.map(|f| f.normal[c]))),
         }
@@ -334,7 +334,7 @@ impl<R: Report> AtEnd<'_, R> {
 }
 
 /// Returns the centroid of a cloud and the rms distance of its points from it, in mm.
-pub(crate) fn middle_and_size(points: &[Point]) -> (Point, f64) {
+pub(crate) fn centroid_and_size(points: &[Point]) -> (Point, f64) {
     let n = points.len() as f64;
     // Chunks are added in order, so the bits are the same on any number of threads.
     let parts: Vec<Vector> = points.par_chunks(1 << 14).map(|c| c.iter().map(|p| p.coords).sum()).collect();

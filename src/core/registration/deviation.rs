@@ -36,14 +36,14 @@ pub enum PointStatus {
 
 /// Number of points of each status.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Counts {
+pub(super) struct StatusCounts {
     pub(super) outliers: usize,
     pub(super) off_part: usize,
     /// Points on the part that were left out of the fit.
     pub(super) left_out_of_fit: usize,
 }
 
-impl Counts {
+impl StatusCounts {
     /// Counts the points on all threads: with many points, memory access takes most of the time.
     pub(super) fn count(deviations: &[Deviation]) -> Self {
         let of_one = |d: &Deviation| Self {

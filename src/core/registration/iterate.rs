@@ -58,18 +58,18 @@ pub(crate) struct Descent {
 }
 
 /// Length of a step that moves no point by more than rounding.
-const STILL: f64 = 1e-14;
+const MIN_STEP: f64 = 1e-14;
 
 /// Share of the tolerance below which a promised decrease is not tried. A pass over all points would only confirm that
 /// nothing decreases.
-const NO_GAIN: f64 = 1e-2;
+const MIN_DECREASE_SHARE: f64 = 1e-2;
 
 /// Length below which a step that raises the objective is noise, from rounding or from the edge of one triangle, and
 /// not a wrong direction.
-const SETTLED: f64 = 1e-7;
+const NOISE_STEP: f64 = 1e-7;
 
 /// A pose, and the linear problem at the projections under it.
-struct Standing {
+struct LinearizedPose {
     pose: Pose,
     scaling: Scaling,
     sums: Sums,
@@ -102,7 +102,7 @@ impl Problem<'_> {
         trace: &mut Vec<Iteration>,
     ) -> Result<Descent, RegistrationError> {
         let mut at = match known {
-            Some(sums) => Standing { pose: start, scaling: self.scaling_at(&start), sums },
+            Some(sums) => LinearizedPose { pose: start, scaling: self.scaling_at(&start), sums },
             None => self.linearize_at(start, correspondences),
         };
         let (mut ball_radius, mut rank, mut converged) = (self.ball_radius, 0, false);
@@ -127,7 +127,7 @@ impl Problem<'_> {
                 }
                 at = candidate;
             } else {
-                converged = step.length < SETTLED;
+                converged = step.length < NOISE_STEP;
                 ball_radius = step.length.min(ball_radius) * 0.25;
             }
             if converged {
@@ -137,24 +137,24 @@ impl Problem<'_> {
         if !current {
             at = self.linearize_at(at.pose, correspondences);
         }
-        let Standing { pose, scaling, sums } = at;
+        let LinearizedPose { pose, scaling, sums } = at;
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
     /// Projects all points under a pose and sums the linear problem there.
-    fn linearize_at(&self, pose: Pose, correspondences: &mut [Correspondence]) -> Standing {
+    fn linearize_at(&self, pose: Pose, correspondences: &mut [Correspondence]) -> LinearizedPose {
         let scaling = self.scaling_at(&pose);
-        Standing { pose, scaling, sums: self.project_all(correspondences, &pose, &scaling) }
+        LinearizedPose { pose, scaling, sums: self.project_all(correspondences, &pose, &scaling) }
     }
 
     /// Returns the best step of the linear problem within the ball, along the free directions that the surface
     /// determines; eq. (15).
-    fn step_within(&self, ball_radius: f64, at: &Standing) -> Result<BallStep, RegistrationError> {
+    fn step_within(&self, ball_radius: f64, at: &LinearizedPose) -> Result<BallStep, RegistrationError> {
         let sums = &at.sums;
         if sums.points < self.locked.iter().filter(|locked| !**locked).count() {
             return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
         }
-        let free = free_directions(&self.locked, &at.scaling);
+        let free = free_projector(&self.locked, &at.scaling);
         let spectrum = Spectrum::new(&(free * sums.gram() * free));
         let rank = spectrum.rank(self.min_singular_share, sums.gram().trace());
         let right = free * sums.right();
@@ -165,8 +165,8 @@ impl Problem<'_> {
 
     /// Returns true if a step is not worth a trial. The first step of a registration is tried if it moves anything.
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
-        let little = !is_first && step.predicted_decrease_mm2 <= NO_GAIN * self.tolerance * sums.objective_mm2;
-        step.length < STILL || sums.objective_mm2 == 0.0 || little
+        let little = !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
+        step.length < MIN_STEP || sums.objective_mm2 == 0.0 || little
     }
 
     /// Returns the centre and the size to which the twist of a step from a pose refers.
@@ -181,7 +181,7 @@ impl Problem<'_> {
 }
 
 /// Returns the projector onto the scaled steps that leave the locked coordinates of the twist at zero.
-pub(crate) fn free_directions(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
+pub(crate) fn free_projector(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
     let to_twist = scaling.to_twist();
     let mut projector = Matrix6::identity();
     // Gram-Schmidt over the locked rows.
@@ -203,7 +203,7 @@ mod tests {
     fn free_steps_leave_the_locked_coordinates_alone() {
         let scaling = Scaling { centre: Point::new(10.0, 20.0, -5.0), size_mm: 30.0 };
         let locked = [true, false, false, false, true, true];
-        let free = free_directions(&locked, &scaling);
+        let free = free_projector(&locked, &scaling);
         assert!((free * free - free).amax() < 1e-12);
         for k in 0..6 {
             let twist = scaling.twist(&free.column(k).into());

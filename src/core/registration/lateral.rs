@@ -69,7 +69,7 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
 /// Returns in words why a registration does not allow a map; `None` if it does.
 ///
 /// The module documentation gives the criterion.
-pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
+pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
     let rms_mm = found.quality.rms_mm;
     let limit_mm = limits.max_error_share * rms_mm;
@@ -144,15 +144,15 @@ fn slope(used: &[&Deviation]) -> f64 {
 mod tests {
     use super::*;
 
-    fn of(found: &Registration, coverage_factor: f64) -> LateralError {
+    fn lateral_error_of(found: &Registration, coverage_factor: f64) -> LateralError {
         lateral_error(found, &found.quality.covariance, coverage_factor)
     }
 
-    fn weak(found: &Registration, limits: &MapLimits) -> Option<String> {
-        weak_for_compensation(found, &found.quality.covariance, limits)
+    fn obstacle_of(found: &Registration, limits: &MapLimits) -> Option<String> {
+        map_obstacle(found, &found.quality.covariance, limits)
     }
     use crate::geometry::{Point, Pose};
-    use crate::registration::{Verdict, WeakDirection};
+    use crate::registration::{RegistrationQuality, WeakDirection};
     use crate::surface::Side;
     use nalgebra::{Matrix6, Vector6};
 
@@ -187,7 +187,7 @@ mod tests {
         let n = deviations.len() as f64;
         let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
         let words = "x and y position repeats only to 3.4 mm".to_owned();
-        let verdict = Verdict {
+        let verdict = RegistrationQuality {
             inliers: deviations.len(),
             objective_mm2,
             rms_mm: (objective_mm2 / n).sqrt(),
@@ -207,21 +207,21 @@ mod tests {
 
     #[test]
     fn the_error_of_a_map_is_lateral_uncertainty_times_slope() {
-        let e = of(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
+        let e = lateral_error_of(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
         assert!((e.lateral_mm - 3.4).abs() < 1e-12, "{e:?}");
         // The steepest slope of the wave is h / w; patches see a little less of it.
         let steepest = HEIGHT_MM / WAVE_MM;
         assert!(e.slope > 0.85 * steepest && e.slope <= steepest, "{e:?}");
         assert!((e.error_mm - 2.0 * e.lateral_mm * e.slope).abs() < 1e-15);
         // A turn about z moves the corners most; turns about x and y move nothing along a flat part through the origin.
-        let e = of(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
+        let e = lateral_error_of(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
         assert!((e.lateral_mm - 2e-4 * HALF_MM * 2f64.sqrt()).abs() < 1e-9, "{e:?}");
     }
 
     #[test]
     fn noise_of_points_that_lie_close_together_is_no_slope() {
-        let plain = of(&waved([1.0; 6], false), 2.0).slope;
-        let twins = of(&waved([1.0; 6], true), 2.0).slope;
+        let plain = lateral_error_of(&waved([1.0; 6], false), 2.0).slope;
+        let twins = lateral_error_of(&waved([1.0; 6], true), 2.0).slope;
         assert!((twins / plain - 1.0).abs() < 0.25, "{twins} against {plain}");
     }
 
@@ -229,16 +229,16 @@ mod tests {
     fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
         let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
         let limits = MapLimits { max_lateral_mm: 1e3, ..MapLimits::default() };
-        let unit = of(&at(1.0), limits.coverage_factor).error_mm;
+        let unit = lateral_error_of(&at(1.0), limits.coverage_factor).error_mm;
         let border = limits.max_error_share * at(1.0).quality.rms_mm / unit;
-        assert_eq!(weak(&at(0.999 * border), &limits), None);
-        let why = weak(&at(1.001 * border), &limits).unwrap();
+        assert_eq!(obstacle_of(&at(0.999 * border), &limits), None);
+        let why = obstacle_of(&at(1.001 * border), &limits).unwrap();
         assert!(why.contains("repeats only to 3.4 mm") && why.contains("Lock these directions in the recipe"), "{why}");
         let near = MapLimits { max_error_share: 1e3, ..MapLimits::default() };
-        assert_eq!(weak(&at(0.499), &near), None);
-        let why = weak(&at(0.501), &near).unwrap();
+        assert_eq!(obstacle_of(&at(0.499), &near), None);
+        let why = obstacle_of(&at(0.501), &near).unwrap();
         assert!(why.contains("may be displaced by 1.00 mm, limit 1.00 mm"), "{why}");
         // Locked directions have no variance.
-        assert_eq!(weak(&at(0.0), &limits), None);
+        assert_eq!(obstacle_of(&at(0.0), &limits), None);
     }
 }

@@ -14,46 +14,46 @@
 //! measured points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and
 //! radians.
 
-mod alone;
+mod isolated_touches;
 mod correspond;
 mod deviation;
-mod doubt;
+mod plausibility;
 mod error;
 mod iterate;
 mod lateral;
 mod linearize;
-mod narrow;
+mod degenerate;
 mod options;
 mod part;
 mod radius;
 mod refit;
 mod result;
-mod robust;
-mod sampling;
+mod robust_loss;
+mod sampling_directions;
 mod solve;
 mod start;
-mod verdict;
+mod quality;
 
 use rayon::prelude::*;
 
 use crate::geometry::Point;
 use crate::surface::Nominal;
 
-use correspond::{Correspondence, at_feet};
+use correspond::{Correspondence, report_projections};
 pub use deviation::{Deviation, PointStatus};
 pub use error::RegistrationError;
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
-pub use lateral::{LateralError, MapLimits, lateral_error, weak_for_compensation};
+pub use lateral::{LateralError, MapLimits, lateral_error, map_obstacle};
 pub use options::{Coordinate, Method, Options, ProbeSide, Start};
 use part::Part;
-pub(crate) use refit::LEAST_SIGMA_MM;
+pub(crate) use refit::MIN_SIGMA_MM;
 use refit::trim_and_refit;
-pub use result::{Registration, WithLeftOut};
-pub use robust::Loss;
-pub(crate) use robust::robust_sigma;
-use start::{InitialPose, free_rms, initial_pose, mirror_image, mirrored_rms};
-pub use verdict::{Verdict, WeakDirection};
+pub use result::{Registration, FiguresWithOutliers};
+pub use robust_loss::Loss;
+pub(crate) use robust_loss::robust_median_and_sigma;
+use start::{InitialPose, free_rms, initial_pose, detect_mirror_image, mirrored_rms};
+pub use quality::{RegistrationQuality, WeakDirection};
 
 /// Registers measured points to a nominal surface and returns the pose, the deviations and the verdict.
 ///
@@ -65,11 +65,11 @@ pub use verdict::{Verdict, WeakDirection};
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     let part = Part::new(nominal, measured, options)?;
-    narrow::check_thread(measured, options)?;
+    degenerate::check_scan_line(measured, options)?;
     let mut registration =
-        fit(&part, measured, options).map_err(|error| or_mirrored(&part, measured, options, error))?;
-    confirm(&part, &registration, measured, options)?;
-    let doubts = doubt::doubts(&part, &registration, measured, options);
+        fit(&part, measured, options).map_err(|error| explain_by_mirror_image(&part, measured, options, error))?;
+    check_fit(&part, &registration, measured, options)?;
+    let doubts = plausibility::plausibility_warnings(&part, &registration, measured, options);
     registration.quality.warnings.extend(doubts);
     Ok(registration)
 }
@@ -85,30 +85,30 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
     }
     let problem = part.problem(measured, options, initial.side);
     let mut trace = Vec::new();
-    let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::NEW).collect();
+    let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::INITIAL).collect();
     let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
-    if let Some(least_share) = sampling::least_share(&problem, &descent, &correspondences) {
+    if let Some(least_share) = sampling_directions::sampling_share(&problem, &descent, &correspondences) {
         return fit(&Part { min_singular_share: least_share, ..*part }, measured, options);
     }
-    report(part, &problem, descent, correspondences, trace, &initial, options)
+    build_registration(part, &problem, descent, correspondences, trace, &initial, options)
 }
 
 /// Replaces an error by [`RegistrationError::Mirrored`] if a mirrored cloud is the cause.
 ///
 /// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
-fn or_mirrored(part: &Part, measured: &[Point], options: &Options, error: RegistrationError) -> RegistrationError {
+fn explain_by_mirror_image(part: &Part, measured: &[Point], options: &Options, error: RegistrationError) -> RegistrationError {
     use RegistrationError::{NotConverged, TooFewUsed, Undetermined, WrongSide};
     if !matches!(error, TooFewUsed { .. } | NotConverged { .. } | WrongSide { .. } | Undetermined) {
         return error;
     }
-    match mirror_image(part, measured, options) {
+    match detect_mirror_image(part, measured, options) {
         Some((rms_mm, mirrored_rms_mm)) => RegistrationError::Mirrored { rms_mm, mirrored_rms_mm },
         None => error,
     }
 }
 
 /// Converts the end of the iteration to the reported result.
-fn report(
+fn build_registration(
     part: &Part,
     problem: &Problem,
     descent: Descent,
@@ -120,14 +120,14 @@ fn report(
     if let Some(fold) = problem.surface.find_fold_among(correspondences.iter().map(|t| t.facet)) {
         return Err(fold.into());
     }
-    let mut verdict = verdict::judge(problem, &descent, &correspondences, initial, trace.len());
-    let reporter = verdict::Reporter::new(part, &descent.scaling, &verdict, options);
+    let mut verdict = quality::assess_quality(problem, &descent, &correspondences, initial, trace.len());
+    let reporter = quality::DeviationReporter::new(part, &descent.scaling, &verdict, options);
     let pose = &descent.cmm_from_model;
     let mut deviations =
-        at_feet(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
-    alone::count_what_agrees(&mut deviations, &mut verdict, options.outlier_sigmas);
-    verdict.coverage = verdict::coverage(part.nominal, &deviations);
-    let trace = with_the_end(trace, &verdict, options);
+        report_projections(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
+    isolated_touches::count_confirmed_outliers(&mut deviations, &mut verdict, options.outlier_sigmas);
+    verdict.coverage = quality::coverage(part.nominal, &deviations);
+    let trace = with_final_state(trace, &verdict, options);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, quality: verdict })
 }
 
@@ -136,8 +136,8 @@ const ROUNDING_MM: f64 = 1e-12;
 
 /// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
 /// more points count than at the last accepted step.
-fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options) -> Vec<Iteration> {
-    let Verdict { objective_mm2, inliers: used, .. } = *verdict;
+fn with_final_state(mut trace: Vec<Iteration>, verdict: &RegistrationQuality, options: &Options) -> Vec<Iteration> {
+    let RegistrationQuality { objective_mm2, inliers: used, .. } = *verdict;
     let is_told = |taken: &&Iteration| {
         let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();
         // Sums in another order differ by rounding. If the points lie on the surface, the sums contain nothing else.
@@ -156,11 +156,11 @@ fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options)
 ///
 /// # Errors
 /// A strip that is too narrow, a mirror image, or an rms above the limit.
-fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
-    narrow::check_strip(&found.deviations, options)?;
+fn check_fit(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+    degenerate::check_strip(&found.deviations, options)?;
     let rms_mm = found.quality.rms_mm;
     let limit_mm = part.rms_limit_mm(options);
-    let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * part.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);
+    let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * part.nominal.relief_mm()).max(10.0 * MIN_SIGMA_MM);
     if !doubtful {
         return Ok(());
     }
@@ -184,7 +184,7 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
                 )
             })
         };
-        let remedy = doubt::of_radius(part, found, measured, options)
+        let remedy = plausibility::radius_warning(part, found, measured, options)
             .or_else(elsewhere)
             .unwrap_or_else(|| "check part, units and probe radius, or raise the limit".to_owned());
         return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm, remedy });

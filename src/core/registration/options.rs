@@ -1,9 +1,9 @@
 //! Options of a registration.
 
 use crate::geometry::Pose;
-use crate::surface::{Distance, Side};
+use crate::surface::{DistanceModel, Side};
 
-use super::robust::Loss;
+use super::robust_loss::Loss;
 
 /// Meaning of the measured points.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -103,7 +103,7 @@ pub struct Options {
     /// Meaning of the measured points.
     pub method: Method,
     /// Shape of the nominal surface between its points.
-    pub distance_model: Distance,
+    pub distance_model: DistanceModel,
     /// Start of the search for the pose.
     pub start: Start,
     /// Side of the nominal surface on which the probe centres lie.
@@ -131,7 +131,7 @@ impl Options {
         Self {
             probe_radius_mm,
             method: Method::default(),
-            distance_model: Distance::default(),
+            distance_model: DistanceModel::default(),
             start: Start::default(),
             side: ProbeSide::default(),
             locked: [false; 6],

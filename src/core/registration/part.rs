@@ -2,14 +2,14 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{Point, far_off};
+use crate::geometry::{Point, find_far_off};
 use crate::surface::{Lookup, Nominal, OffsetSurface, Side};
 
-use super::correspond::{ResidualModel, middle_and_size};
+use super::correspond::{ResidualModel, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
 use super::options::{Method, Options, Start};
-use super::robust::{Loss, ScaledLoss};
+use super::robust_loss::{Loss, ScaledLoss};
 
 /// Nominal surface, and the sizes that the limits refer to.
 pub(super) struct Part<'a> {
@@ -56,12 +56,12 @@ impl<'a> Part<'a> {
             return Err(RegistrationError::Collinear { points: measured.len() });
         }
         check_repeats(measured)?;
-        let (middle, size_mm) = middle_and_size(measured);
+        let (middle, size_mm) = centroid_and_size(measured);
         let nominal_mm = nominal.size_mm();
         // A fully locked pose needs only one point, and one point has no size.
         let size_mm = if is_held { size_mm.max(1e-3 * nominal_mm) } else { size_mm };
         if !is_held {
-            check_sizes(size_mm, nominal_mm).map_err(|error| or_one_far_off(nominal, measured, error))?;
+            check_sizes(size_mm, nominal_mm).map_err(|error| explain_by_far_point(nominal, measured, error))?;
         }
         let radius_mm = options.probe_radius_mm;
         let limit_mm = 0.5 * nominal_mm;
@@ -141,12 +141,12 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
 }
 
 /// Replaces an error of the size by the name of the one distant point that causes it, if there is one.
-fn or_one_far_off(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
-    if let Some((index, distance_mm)) = far_off(measured) {
+fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
+    if let Some((index, distance_mm)) = find_far_off(measured) {
         return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };
     }
     let nominal: Vec<Point> = nominal.points().copied().collect();
-    match far_off(&nominal) {
+    match find_far_off(&nominal) {
         Some((index, distance_mm)) => RegistrationError::NominalFarOff { at: nominal[index].into(), distance_mm },
         None => error,
     }

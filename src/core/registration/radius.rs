@@ -17,7 +17,7 @@ use super::result::Registration;
 
 /// Estimate of the probe radius from the registered points.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ToldRadius {
+pub(super) struct RadiusEstimate {
     /// Estimated radius minus the given one, in mm.
     pub(super) difference_mm: f64,
     /// Standard uncertainty of the estimate in mm, from the remaining residuals, which are assumed independent.
@@ -32,7 +32,7 @@ impl Registration {
     /// ```text
     ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
     /// ```
-    pub(super) fn estimate_radius(&self) -> Option<ToldRadius> {
+    pub(super) fn estimate_radius(&self) -> Option<RadiusEstimate> {
         let variance = self.quality.residual_sigma_mm.powi(2);
         let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let sum: Vector6<f64> = used().map(row).sum();
@@ -48,7 +48,7 @@ impl Registration {
         let more_mm = cross / lever;
         let rest = (squares - cross * more_mm).max(0.0);
         let sigma_mm = (rest / f64::from((points - 7).max(1)) / lever).sqrt();
-        let told = ToldRadius { difference_mm: more_mm, sigma_mm, rms_share: (rest / squares).sqrt() };
+        let told = RadiusEstimate { difference_mm: more_mm, sigma_mm, rms_share: (rest / squares).sqrt() };
         (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_share.is_finite()).then_some(told)
     }
 

@@ -2,14 +2,14 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{Nearest, Point, Pose};
+use crate::geometry::{PointTree, Point, Pose};
 
-use super::correspond::{Correspondence, ON_PART_STEPS, beyond_steps, middle_and_size};
+use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::{Descent, Iteration, Problem};
 use super::options::Options;
-use super::robust::{Loss, ScaledLoss, robust_sigma};
-use super::start::{InitialPose, spread};
+use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
+use super::start::{InitialPose, sample_evenly};
 
 /// Descends, rejects the points that are off the part or outliers, and repeats until nothing changes.
 ///
@@ -32,20 +32,20 @@ pub(super) fn trim_and_refit(
         problem.ball_radius = problem.ball_radius.min(0.05);
     }
     let counts: &[usize] =
-        if problem.surface.has_lazy_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
+        if problem.surface.has_lazy_normals() { &COARSE_COUNTS_WITH_FITTED_NORMALS } else { &COARSE_COUNTS };
     for few in counts.iter().filter(|few| problem.measured.len() >= 2 * **few) {
         pose = descend_coarsely(&problem, pose, *few, if initial.is_refined { Some(options) } else { None }, trace)?;
     }
     prefetch(&problem, correspondences, &pose);
     let sums = problem.project_all(correspondences, &pose, &problem.scaling_at(&pose));
-    let mut changed = find_again(&problem, correspondences, &pose);
+    let mut changed = reproject_far_points(&problem, correspondences, &pose);
     if initial.is_refined {
-        changed += screen(&problem, options, correspondences, true);
+        changed += select_fit_points(&problem, options, correspondences, true);
     }
     let mut known = (changed == 0 && options.loss == Loss::None).then_some(sums);
     let mut round = 0;
     loop {
-        rescale(&mut problem, options, correspondences, round > 0 || initial.is_refined);
+        rescale_loss(&mut problem, options, correspondences, round > 0 || initial.is_refined);
         let descent = problem.descend(pose, known.take(), correspondences, trace)?;
         if !descent.converged {
             let (iterations, objective_mm2) = (options.max_iterations, descent.objective_mm2);
@@ -53,11 +53,11 @@ pub(super) fn trim_and_refit(
         }
         pose = descent.cmm_from_model;
         round += 1;
-        let changed = find_again(&problem, correspondences, &pose)
-            + screen(&problem, options, correspondences, round < REVERSIBLE_ROUNDS);
+        let changed = reproject_far_points(&problem, correspondences, &pose)
+            + select_fit_points(&problem, options, correspondences, round < REVERSIBLE_ROUNDS);
         let robust_settling = options.loss != Loss::None && round < 4;
         if (changed == 0 && !robust_settling) || round == MAX_ROUNDS {
-            return finish(descent, correspondences.len(), options.locked == [true; 6]);
+            return check_descent(descent, correspondences.len(), options.locked == [true; 6]);
         }
     }
 }
@@ -68,7 +68,7 @@ const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 
 /// The same if the surface must be fitted at every place touched. Fewer points touch fewer places, and the rest then
 /// touch only the places near the end.
-const COARSE_COUNTS_WHERE_NORMALS_COST: [usize; 1] = [2048];
+const COARSE_COUNTS_WITH_FITTED_NORMALS: [usize; 1] = [2048];
 
 /// Sets the start places of the projections near the points, and fits the normals there all at once.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
@@ -94,20 +94,20 @@ fn descend_coarsely(
     screened: Option<&Options>,
     trace: &mut Vec<Iteration>,
 ) -> Result<Pose, RegistrationError> {
-    let few: Vec<Point> = spread(problem.measured, count).copied().collect();
-    let mut correspondences = vec![Correspondence::NEW; few.len()];
-    let (middle, size_mm) = middle_and_size(&few);
+    let few: Vec<Point> = sample_evenly(problem.measured, count).copied().collect();
+    let mut correspondences = vec![Correspondence::INITIAL; few.len()];
+    let (middle, size_mm) = centroid_and_size(&few);
     let coarse = Problem { measured: &few, centroid: middle, size_mm, ..*problem };
     prefetch(&coarse, &mut correspondences, &pose);
     if let Some(options) = screened {
         coarse.project_all(&mut correspondences, &pose, &coarse.scaling_at(&pose));
-        screen(&coarse, options, &mut correspondences, true);
+        select_fit_points(&coarse, options, &mut correspondences, true);
     }
     Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
 }
 
 /// Rejects an end with too few points in the fit, or with none of the six directions determined.
-fn finish(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
+fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
     if descent.sums.points * 2 < points {
         return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
     }
@@ -118,36 +118,36 @@ fn finish(descent: Descent, points: usize, is_held: bool) -> Result<Descent, Reg
 }
 
 /// Sets the scale of a robust loss to the robust sigma of the current distances.
-fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
+fn rescale_loss(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
-        problem.residual.loss = ScaledLoss::new(options.loss, sigma_of(correspondences).1);
+        problem.residual.loss = ScaledLoss::new(options.loss, robust_distance_sigma(correspondences).1);
     }
 }
 
 /// Smallest noise in mm: no CMM repeats better, and rounding in a file can be all the noise there is.
-pub(crate) const LEAST_SIGMA_MM: f64 = 1e-5;
+pub(crate) const MIN_SIGMA_MM: f64 = 1e-5;
 
-fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
+fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
     // A sample gives the sigma of many points to a percent.
     let stride = correspondences.len().div_ceil(1 << 16);
     let on_part = correspondences.iter().step_by(stride).filter(|t| !t.is_off_part()).map(|t| t.distance_mm);
-    let (median, sigma) = robust_sigma(on_part);
-    (median, sigma.max(LEAST_SIGMA_MM))
+    let (median, sigma) = robust_median_and_sigma(on_part);
+    (median, sigma.max(MIN_SIGMA_MM))
 }
 
 /// Projects again the points that are beyond the edge or implausibly far away. Returns how many have a better
 /// projection elsewhere.
 ///
 /// A walk over the facets ends at the edge of a gap, and all of the part can lie beyond the gap.
-fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
+fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
     /// Distance in mm that no touch on the part exceeds, once the part is near its pose.
     const FAR_MM: f64 = 0.2;
     let may_be = |t: &Correspondence| t.is_off_part() || t.distance_mm.abs() > FAR_MM;
     if !correspondences.par_chunks(1 << 13).any(|some| some.iter().any(may_be)) {
         return 0;
     }
-    let (median, sigma) = sigma_of(correspondences);
+    let (median, sigma) = robust_distance_sigma(correspondences);
     let far = |t: &Correspondence| (t.distance_mm - median).abs() > FAR_MM.max(6.0 * sigma);
     let model_from_cmm = pose.inverse();
     let again = |(t, p): (&mut Correspondence, &Point)| {
@@ -158,7 +158,7 @@ fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &
         let foot = problem.surface.project_without_start(&p);
         let distance_mm = foot.distance_mm - problem.residual.subtract_mm;
         let beyond_steps = beyond_steps(&problem.surface, &p, &foot);
-        let is_on_part = beyond_steps <= ON_PART_STEPS;
+        let is_on_part = beyond_steps <= EDGE_TOLERANCE_STEPS;
         let is_nearer = is_on_part && (t.is_off_part() || distance_mm.abs() < 0.5 * t.distance_mm.abs());
         if is_nearer {
             (t.facet, t.distance_mm, t.beyond_steps) = (foot.facet, distance_mm, beyond_steps);
@@ -173,15 +173,15 @@ fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &
 ///
 /// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
 /// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.
-fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
-    let (median, sigma) = sigma_of(correspondences);
+fn select_fit_points(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
+    let (median, sigma) = robust_distance_sigma(correspondences);
     let limit = options.outlier_sigmas * sigma;
     let far = |t: &Correspondence| (t.distance_mm - median).abs() > limit;
     let suspects: Vec<usize> = (0..correspondences.len()).filter(|&k| far(&correspondences[k])).collect();
     let isolated = if suspects.is_empty() {
         Vec::new()
     } else {
-        isolated(problem.measured, correspondences, &suspects, 0.5 * limit)
+        isolated_flags(problem.measured, correspondences, &suspects, 0.5 * limit)
     };
     let mut outlier = vec![false; if suspects.is_empty() { 0 } else { correspondences.len() }];
     for (&k, isolated) in suspects.iter().zip(isolated) {
@@ -202,12 +202,12 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
 ///
 /// Neighbours nearer than half the mean spacing are twins: repeats of the same place with the same fault. They are left
 /// out. A suspect with only twins around it is isolated.
-fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
+fn isolated_flags(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
     const NEIGHBOURS: usize = 8;
     const SEARCHED: u32 = 64;
-    let tree = Nearest::new(measured.iter().copied());
+    let tree = PointTree::new(measured.iter().copied());
     // Points spread over a square of rms size s are s sqrt(6 / n) apart.
-    let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
+    let twin_mm = 0.5 * centroid_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
     let is_isolated = |&k: &usize| {
         let others = tree.nearest(&measured[k], SEARCHED).filter(|(_, square)| *square > twin_mm * twin_mm);
         let mut around: Vec<f64> = others.take(NEIGHBOURS).map(|(n, _)| correspondences[n].distance_mm).collect();

@@ -3,9 +3,9 @@
 use crate::geometry::Pose;
 use crate::surface::Side;
 
-use super::deviation::{Counts, Deviation, PointStatus};
+use super::deviation::{StatusCounts, Deviation, PointStatus};
 use super::iterate::Iteration;
-use super::verdict::Verdict;
+use super::quality::RegistrationQuality;
 
 /// Result of a registration.
 #[derive(Clone, Debug)]
@@ -19,12 +19,12 @@ pub struct Registration {
     /// Side of the nominal surface on which the probe was.
     pub side: Side,
     /// Uncertainty of the pose, figures and warnings.
-    pub quality: Verdict,
+    pub quality: RegistrationQuality,
 }
 
 /// Figures of the deviations that include the outliers on the part.
 #[derive(Clone, Debug, PartialEq)]
-pub struct WithLeftOut {
+pub struct FiguresWithOutliers {
     /// Number of outliers.
     pub outliers: usize,
     /// Root mean square of the deviations of all points on the part, in millimetres.
@@ -36,7 +36,7 @@ pub struct WithLeftOut {
 }
 
 /// Number of outliers that are named one by one; the rest are counted.
-const NAMED: usize = 5;
+const MAX_NAMED: usize = 5;
 
 impl Registration {
     /// Returns the outliers, each with its index.
@@ -45,20 +45,20 @@ impl Registration {
     }
 
     /// Returns the figures that include the outliers; `None` if there are no outliers.
-    pub fn figures_with_outliers(&self) -> Option<WithLeftOut> {
-        let points = Counts::count(&self.deviations).outliers;
+    pub fn figures_with_outliers(&self) -> Option<FiguresWithOutliers> {
+        let points = StatusCounts::count(&self.deviations).outliers;
         if points == 0 {
             return None;
         }
-        let named = self.outliers().take(NAMED).map(|(k, d)| {
+        let named = self.outliers().take(MAX_NAMED).map(|(k, d)| {
             format!("point {k} at ({:.1}, {:.1}) mm by {:+.1} µm", d.point.x, d.point.y, 1e3 * d.deviation_mm)
         });
-        let more = (points > NAMED).then(|| format!("and {} more", points - NAMED));
+        let more = (points > MAX_NAMED).then(|| format!("and {} more", points - MAX_NAMED));
         let places = named.chain(more).collect::<Vec<_>>().join(", ");
         let on_part = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).map(|d| d.deviation_mm);
         let add =
             |(low, high, squares, n): (f64, f64, f64, usize), d: f64| (low.min(d), high.max(d), squares + d * d, n + 1);
         let (low, high, squares, n) = on_part.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
-        Some(WithLeftOut { outliers: points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, description: places })
+        Some(FiguresWithOutliers { outliers: points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, description: places })
     }
 }

@@ -9,14 +9,14 @@
 use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
-use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
+use crate::surface::{CurvatureFeature, OffsetSurface, FacetIndex, Side, fit_features, principal_axes};
 
-use super::correspond::{Correspondence, ON_PART_STEPS, beyond_steps, middle_and_size};
+use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
 use super::options::{Options, Start};
 use super::part::Part;
-use super::robust::{Loss, ScaledLoss, robust_sigma};
+use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
 
 /// Initial pose of a registration.
 #[derive(Clone, Debug)]
@@ -54,25 +54,25 @@ impl Candidate {
 }
 
 /// Numbers of points for the first look at a candidate, its score, its refinement and the comparison.
-const GLANCED: usize = 10;
-const SCORED: usize = 40;
-const REFINED: usize = 160;
-const COMPARED: usize = 640;
+const FIRST_SCORE_POINTS: usize = 10;
+const SCORE_POINTS: usize = 40;
+const REFINE_POINTS: usize = 160;
+const COMPARE_POINTS: usize = 640;
 /// Number of candidates after the first look.
-const PROMISING: usize = 300;
+const MAX_SCORED: usize = 300;
 /// Number of measured places to lay on the surface, and of places of the surface for each.
-const LAID: usize = 24;
-const PLACES: usize = 36;
+const MEASURED_FEATURES: usize = 24;
+const MATCHES_PER_FEATURE: usize = 36;
 /// Number of candidates to refine.
-const KEPT: usize = 24;
+const MAX_REFINED: usize = 24;
 /// Most candidates to compare on both sides.
-const COMPARED_AT_MOST: usize = 6;
+const MAX_COMPARED: usize = 6;
 
 /// Smallest ratio of the two rms at which one side fits better. Form error alone gives a smaller ratio.
-const SIDE_RATIO: f64 = 2.0;
+const MIN_SIDE_RATIO: f64 = 2.0;
 
 /// Largest excess of the share of points off the part at which a side still fits better.
-const SIDE_OFF_PART: f64 = 0.05;
+const MAX_OFF_PART_EXCESS: f64 = 0.05;
 
 /// Returns the initial pose and the side of the probe.
 ///
@@ -97,18 +97,18 @@ pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, s
 
 /// Returns the rms in mm of the best fit of the cloud as measured, with nothing locked.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
-    let some: Vec<Point> = spread(measured, 4 * COMPARED).copied().collect();
+    let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
 }
 
 /// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
-pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
+pub(crate) fn detect_mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
     let sides = options.side.side().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
     let best = |points: &[Point]| {
         sides.iter().filter_map(|side| searched_rms(part, points, options, *side)).min_by(f64::total_cmp)
     };
     let mirrored_rms_mm = best(&mirrored(measured)).filter(|rms| *rms <= part.rms_limit_mm(options))?;
-    let some: Vec<Point> = spread(measured, 4 * COMPARED).copied().collect();
+    let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     let rms_mm = best(&some)?;
     (mirrored_rms_mm < 0.3 * rms_mm).then_some((rms_mm, mirrored_rms_mm))
 }
@@ -116,7 +116,7 @@ pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -
 /// Returns a sample of the points, mirrored in the plane x = 0 of the CMM frame. The choice of the plane does not
 /// matter to a search over all poses.
 fn mirrored(measured: &[Point]) -> Vec<Point> {
-    spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect()
+    sample_evenly(measured, 4 * COMPARE_POINTS).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
 /// Returns the rms in mm of the best fit on one side over all poses, with nothing locked.
@@ -128,7 +128,7 @@ fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) ->
 
 /// Returns a sample of the points, evenly along their order. The sample is jittered, so that it does not follow one
 /// column of a grid.
-pub(super) fn spread(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
+pub(super) fn sample_evenly(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
     let n = points.len();
     let take = count.min(n);
     let jitter = move |k: usize| (k.wrapping_mul(0x9E37_79B9) >> 7) % (n / take.max(1)).max(1);
@@ -146,8 +146,8 @@ struct Search<'a> {
 
 impl<'a> Search<'a> {
     fn new(part: &'a Part, measured: &'a [Point], options: &'a Options) -> Self {
-        let sample = |count| spread(measured, count).copied().collect();
-        Self { part, options, measured, few: sample(SCORED), some: sample(REFINED), many: sample(COMPARED) }
+        let sample = |count| sample_evenly(measured, count).copied().collect();
+        Self { part, options, measured, few: sample(SCORE_POINTS), some: sample(REFINE_POINTS), many: sample(COMPARE_POINTS) }
     }
 
     /// Keeps a given pose and determines the side on which the points fit.
@@ -171,7 +171,7 @@ impl<'a> Search<'a> {
     fn nearer_side(&self, pose: &Pose) -> Side {
         let nominal = OffsetSurface::new(self.part.nominal, 0.0, Side::Normal).expect("0 is a radius");
         let inverse = pose.inverse();
-        let above = self.many.iter().filter(|p| nominal.project(&inverse.transform_point(p), Place::UNKNOWN).distance_mm >= 0.0);
+        let above = self.many.iter().filter(|p| nominal.project(&inverse.transform_point(p), FacetIndex::UNKNOWN).distance_mm >= 0.0);
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
@@ -210,8 +210,8 @@ impl<'a> Search<'a> {
         // Without an offset the two sides are one surface.
         let told = |better: &Candidate, worse: &Candidate| {
             // The distance of the points beyond the edge says nothing about the side.
-            let is_nearer = better.on_part_rms_mm * SIDE_RATIO < worse.on_part_rms_mm;
-            self.part.offset_mm == 0.0 || is_nearer && better.off_part_share <= worse.off_part_share + SIDE_OFF_PART
+            let is_nearer = better.on_part_rms_mm * MIN_SIDE_RATIO < worse.on_part_rms_mm;
+            self.part.offset_mm == 0.0 || is_nearer && better.off_part_share <= worse.off_part_share + MAX_OFF_PART_EXCESS
         };
         match self.options.side.side() {
             None if self.part.offset_mm > 0.0 && told(&opposite, &normal) => Ok((Side::Opposite, opposite, true)),
@@ -219,7 +219,7 @@ impl<'a> Search<'a> {
             Some(side) => {
                 let (given, other) = if side == Side::Normal { (normal, opposite) } else { (opposite, normal) };
                 // Much better on the other side, by more than a form error explains.
-                if other.rms_mm * 4.0 * SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {
+                if other.rms_mm * 4.0 * MIN_SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {
                     return Err(RegistrationError::WrongSide { rms_mm: given.rms_mm, other_rms_mm: other.rms_mm });
                 }
                 Ok((side, given, true))
@@ -247,11 +247,11 @@ impl<'a> Search<'a> {
             scored.sort_by(|a, b| a.0.total_cmp(&b.0));
             scored.into_iter().map(|(_, pose)| pose)
         };
-        let glanced = self.few.iter().step_by(self.few.len().div_ceil(GLANCED)).copied().collect::<Vec<_>>();
-        let promising = scored(starts, &glanced).take(PROMISING).collect();
+        let glanced = self.few.iter().step_by(self.few.len().div_ceil(FIRST_SCORE_POINTS)).copied().collect::<Vec<_>>();
+        let promising = scored(starts, &glanced).take(MAX_SCORED).collect();
         let mut kept: Vec<Pose> = Vec::new();
         for pose in scored(promising, &self.few) {
-            if kept.len() < KEPT && kept.iter().all(|k| self.pose_distance(k, &pose) > 0.1) {
+            if kept.len() < MAX_REFINED && kept.iter().all(|k| self.pose_distance(k, &pose) > 0.1) {
                 kept.push(pose);
             }
         }
@@ -263,7 +263,7 @@ impl<'a> Search<'a> {
 
     /// Refines the best candidates fully on one side. Returns them with the best first, each pose once.
     fn refine_and_compare(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
-        let best = &candidates[..candidates.len().min(COMPARED_AT_MOST)];
+        let best = &candidates[..candidates.len().min(MAX_COMPARED)];
         let mut compared: Vec<Candidate> =
             best.par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 4, 10)).collect();
         compared.sort_by(Candidate::by_fit);
@@ -303,10 +303,10 @@ impl<'a> Search<'a> {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
         for p in points.iter().map(|p| inverse.transform_point(p)) {
-            let foot = surface.project(&p, Place::UNKNOWN);
+            let foot = surface.project(&p, FacetIndex::UNKNOWN);
             let square = (foot.distance_mm - self.part.subtract_mm).powi(2);
             all.push(square + foot.beyond_edge_mm.powi(2));
-            if beyond_steps(surface, &p, &foot) <= ON_PART_STEPS {
+            if beyond_steps(surface, &p, &foot) <= EDGE_TOLERANCE_STEPS {
                 on_part.push(square);
             }
         }
@@ -330,14 +330,14 @@ impl<'a> Search<'a> {
         let model_from_cmm = cmm_from_model.inverse();
         let subtract_mm = self.part.subtract_mm;
         points.iter().map(move |p| {
-            let foot = surface.project(&model_from_cmm.transform_point(p), Place::UNKNOWN);
+            let foot = surface.project(&model_from_cmm.transform_point(p), FacetIndex::UNKNOWN);
             (foot.distance_mm - subtract_mm).powi(2) + foot.beyond_edge_mm.powi(2)
         })
     }
 
     /// Descends under a loss that ignores gross outliers. Its scale follows the distances as they decrease.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
-        let (middle, size_mm) = middle_and_size(points);
+        let (middle, size_mm) = centroid_and_size(points);
         let mut problem = Problem {
             centroid: middle,
             size_mm,
@@ -347,13 +347,13 @@ impl<'a> Search<'a> {
             ..self.part.problem(points, self.options, side)
         };
         let mut pose = start;
-        let mut correspondences = vec![Correspondence::NEW; points.len()];
+        let mut correspondences = vec![Correspondence::INITIAL; points.len()];
         let mut trace = Vec::new();
         for round in 0..rounds {
             if round > 0 {
-                let (_, sigma) = robust_sigma(correspondences.iter().map(|t| t.distance_mm));
+                let (_, sigma) = robust_median_and_sigma(correspondences.iter().map(|t| t.distance_mm));
                 problem.residual.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
-                leave_out_what_is_off_the_part(&mut correspondences);
+                exclude_off_part(&mut correspondences);
             }
             match problem.descend(pose, None, &mut correspondences, &mut trace) {
                 Ok(descent) => pose = descent.cmm_from_model,
@@ -374,7 +374,7 @@ impl<'a> Search<'a> {
         const MAX_UNCONVERGED_RATIO: f64 = 3.0;
         /// Difference below which two poses are the same.
         const MAX_POSE_DISTANCE: f64 = 0.01;
-        let nominal = self.part.nominal.sample(REFINED);
+        let nominal = self.part.nominal.sample(REFINE_POINTS);
         let middle_of = |points: &[Point]| points.iter().map(|p| p.coords).sum::<Vector>() / points.len().max(1) as f64;
         let offset = self.part.nominal.mean_normal() * (best.side.sign() * self.part.offset_mm);
         let centred = middle_of(&self.many) - middle_of(&nominal) - offset;
@@ -438,18 +438,18 @@ impl<'a> Search<'a> {
     /// Returns poses that lay measured places on places of the offset surface with similar curvature.
     fn by_curvature(&self, side: Side) -> Vec<Pose> {
         let on_nominal = self.part.nominal.features();
-        if on_nominal.len() < PLACES {
+        if on_nominal.len() < MATCHES_PER_FEATURE {
             return Vec::new();
         }
-        let offset: Vec<Feature> = on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
-        let sample: Vec<Point> = spread(self.measured, 2000).copied().collect();
-        let measured = most_telling(features(&sample, None));
-        measured.iter().flat_map(|m| [*m, m.flipped()]).flat_map(|m| laid_on(&m, &offset)).collect()
+        let offset: Vec<CurvatureFeature> = on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
+        let sample: Vec<Point> = sample_evenly(self.measured, 2000).copied().collect();
+        let measured = most_anisotropic(fit_features(&sample, None));
+        measured.iter().flat_map(|m| [*m, m.flipped()]).flat_map(|m| poses_by_feature(&m, &offset)).collect()
     }
 }
 
 /// Rejects the points beyond the edge, unless the pose is so far off that at least half of them are beyond it.
-fn leave_out_what_is_off_the_part(correspondences: &mut [Correspondence]) {
+fn exclude_off_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
     correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
@@ -457,21 +457,21 @@ fn leave_out_what_is_off_the_part(correspondences: &mut [Correspondence]) {
 
 /// Returns the features whose two curvatures differ most, because their directions are certain: a sample spread over
 /// the better half.
-fn most_telling(mut features: Vec<Feature>) -> Vec<Feature> {
+fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
-    features.truncate((features.len() / 2).max(LAID));
-    let stride = features.len().div_ceil(LAID).max(1);
+    features.truncate((features.len() / 2).max(MEASURED_FEATURES));
+    let stride = features.len().div_ceil(MEASURED_FEATURES).max(1);
     features.into_iter().step_by(stride).collect()
 }
 
 /// Returns poses that lay a measured feature on the places of the surface with the most similar curvature, in both
 /// directions.
-fn laid_on(measured: &Feature, offset: &[Feature]) -> Vec<Pose> {
-    let unlike = |f: &Feature| {
+fn poses_by_feature(measured: &CurvatureFeature, offset: &[CurvatureFeature]) -> Vec<Pose> {
+    let unlike = |f: &CurvatureFeature| {
         (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
     };
-    let mut places: Vec<(f64, &Feature)> = offset.iter().map(|f| (unlike(f), f)).collect();
-    let count = PLACES.min(places.len());
+    let mut places: Vec<(f64, &CurvatureFeature)> = offset.iter().map(|f| (unlike(f), f)).collect();
+    let count = MATCHES_PER_FEATURE.min(places.len());
     if count < places.len() {
         places.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0));
     }

@@ -11,51 +11,51 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::grid_order::NO_POINT;
+use crate::geometry::grid_recognition::NO_POINT;
 use crate::geometry::{Point, Vector, bounds, recognise_grid};
 
 use super::error::SurfaceError;
 use super::facet::Side;
 use super::nominal::{Nominal, check_grid};
 use super::normals::tangents;
-use super::offset::{Distance, OffsetSurface, Place};
-use super::projection::{Map, Projection, is_line};
+use super::offset::{DistanceModel, OffsetSurface, FacetIndex};
+use super::plane_projection::{Projector, PlaneProjection, is_line};
 
 /// Spacings of the two coarser samplings of a grid, in spacings of the whole grid.
-const OF_GRID: [usize; 2] = [3, 6];
+const GRID_STRIDES: [usize; 2] = [3, 6];
 
 /// Scattered points are thinned to one point in 4 and one in 16. Clouds of less than `FEW` points are thinned as in
 /// `OF_FEW`.
-const OF_SCATTERED: [usize; 2] = [4, 16];
-const OF_FEW: [usize; 2] = [2, 4];
-const FEW: usize = 600;
+const THINNING_FACTORS: [usize; 2] = [4, 16];
+const THINNING_FACTORS_OF_FEW: [usize; 2] = [2, 4];
+const FEW_POINTS: usize = 600;
 
 /// Range of the order p that the estimate uses; an observed order is clamped to it. If the observed order is lower, the
 /// spacing is not the main cause of the error.
-const ORDERS: [f64; 2] = [1.5, 4.5];
+const ORDER_RANGE: [f64; 2] = [1.5, 4.5];
 
 /// Lowest plausible orders of the flat and of the curved distance. They are the orders on a smooth surface, reduced for
 /// a form with features of many sizes.
-const LEAST_ORDER: [f64; 2] = [1.2, 1.8];
+const MIN_PLAUSIBLE_ORDERS: [f64; 2] = [1.2, 1.8];
 
 /// Maximum number of withheld points that are measured.
-const MEASURED: usize = 150_000;
+const MAX_MEASURED: usize = 150_000;
 
 /// Width of the border, in spacings. A place is inside if the sampling continues at least this far in all directions.
-const BORDER: f64 = 2.0;
+const BORDER_SPACINGS: f64 = 2.0;
 
 /// Minimum number of places inside that an estimate needs.
-const LEAST_INSIDE: usize = 30;
+const MIN_INSIDE: usize = 30;
 
 /// Points that a nominal surface is made from.
 #[derive(Clone, Copy, Debug)]
-pub enum Samples<'a> {
+pub enum NominalPoints<'a> {
     /// Points in any order, on a grid or scattered; also the vertices of a mesh.
     Points {
         /// The points in the model frame, in millimetres.
         points: &'a [Point],
         /// Projection in which scattered points are triangulated.
-        projection: Projection,
+        projection: PlaneProjection,
     },
     /// Grid with known normals, row by row; NaN at a node that does not exist.
     Grid {
@@ -78,26 +78,26 @@ pub struct Accuracy {
     /// Mean spacing of the points, in millimetres.
     pub spacing_mm: f64,
     /// Errors of the flat distance, eq. (2).
-    pub flat: Estimate,
+    pub flat: ErrorEstimate,
     /// Errors of the curved distance.
-    pub curved: Estimate,
+    pub curved: ErrorEstimate,
 }
 
 /// Estimated errors of one kind of distance, flat or curved.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Estimate {
+pub struct ErrorEstimate {
     /// Errors away from the border.
-    pub inside: Figures,
+    pub inside: ErrorFigures,
     /// Errors within two spacings of the border of the sampling.
-    pub border: Figures,
+    pub border: ErrorFigures,
     /// Place of the largest error.
-    pub max_error: Worst,
+    pub max_error: MaxError,
     /// Order p that the estimate uses: the error is proportional to the p-th power of the spacing.
     pub order: f64,
     /// Order as observed, before it is clamped.
     pub observed_order: f64,
     /// Reliability of the estimate.
-    pub reliability: Trust,
+    pub reliability: Reliability,
     spacing_mm: f64,
     /// Spacing of the coarser of the two samplings, in millimetres.
     coarsest_mm: f64,
@@ -105,7 +105,7 @@ pub struct Estimate {
 
 /// Errors of a distance, in millimetres.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Figures {
+pub struct ErrorFigures {
     /// Peak to valley: the largest error minus the smallest.
     pub pv_mm: f64,
     /// Root mean square.
@@ -116,7 +116,7 @@ pub struct Figures {
 
 /// Place of the largest error.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Worst {
+pub struct MaxError {
     /// Position in the model frame.
     pub point: Point,
     /// Signed error, in millimetres.
@@ -127,7 +127,7 @@ pub struct Worst {
 
 /// Reliability of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Trust {
+pub enum Reliability {
     /// The error falls with the spacing as expected.
     Extrapolated,
     /// The error hardly falls with the spacing: the points contain rounding or noise, and the estimate is the size of
@@ -137,12 +137,12 @@ pub enum Trust {
     TooCoarse,
 }
 
-impl Estimate {
+impl ErrorEstimate {
     /// Returns the spacing at which the PV error inside equals `wanted_pv_mm`, in millimetres. Returns `None` if the
     /// points are not exact enough for it at any spacing. The result is never coarser than the coarser of the two
     /// samplings.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
-        if self.reliability == Trust::Rounding {
+        if self.reliability == Reliability::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
         }
         let ratio = wanted_pv_mm / self.inside.pv_mm.max(f64::MIN_POSITIVE);
@@ -156,69 +156,69 @@ impl Estimate {
 ///
 /// # Errors
 /// Returns an error if the points make no surface, or if there are too few points to withhold most of them.
-pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
+pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceError> {
     let (points, [factor, coarsest], [mut fine, mut coarse]) = match samples {
-        Samples::Grid { columns, rows, points, normals } => {
+        NominalPoints::Grid { columns, rows, points, normals } => {
             check_grid(columns, rows, points.len().min(normals.len()))?;
-            let level = |stride| defined_grid_level(columns, rows, points, normals, stride);
-            (points, OF_GRID.map(|stride| stride as f64), [level(OF_GRID[0])?, level(OF_GRID[1])?])
+            let level = |stride| strided_grid_errors(columns, rows, points, normals, stride);
+            (points, GRID_STRIDES.map(|stride| stride as f64), [level(GRID_STRIDES[0])?, level(GRID_STRIDES[1])?])
         }
-        Samples::Points { points, projection } => {
+        NominalPoints::Points { points, projection } => {
             // Check all points here, so that an error refers to the whole list and not to the points that are kept.
             if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
                 return Err(SurfaceError::NotFinite { index });
             }
-            let (factors, kept) = kept_of_points(points, projection)?;
-            (points, factors, [kept_level(points, &kept[0], projection)?, kept_level(points, &kept[1], projection)?])
+            let (factors, kept) = choose_coarse_points(points, projection)?;
+            (points, factors, [subset_errors(points, &kept[0], projection)?, subset_errors(points, &kept[1], projection)?])
         }
     };
     let count = points.iter().filter(|p| p.x.is_finite()).count();
     let least = count.max(1).saturating_mul(4);
-    let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE);
+    let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < MIN_INSIDE);
     if is_border {
         // With few points nearly all places are near the border, so the estimate includes the border.
-        [&mut fine, &mut coarse].into_iter().for_each(Errors::merge_border);
+        [&mut fine, &mut coarse].into_iter().for_each(WithheldErrors::merge_border);
     }
-    if [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE) {
+    if [&fine, &coarse].iter().any(|errors| errors.inside.len() < MIN_INSIDE) {
         return Err(SurfaceError::TooFewPoints { points: count, min_points: least });
     }
     let spacing_mm = fine.spacing_mm / factor;
     let [flat, curved] = [0, 1].map(|kind| {
-        let told = estimate(&fine, &coarse, kind, [factor, coarsest / factor], spacing_mm);
-        let trust = if is_border && told.reliability == Trust::Extrapolated { Trust::TooCoarse } else { told.reliability };
-        Estimate { reliability: trust, ..told }
+        let told = extrapolate_errors(&fine, &coarse, kind, [factor, coarsest / factor], spacing_mm);
+        let trust = if is_border && told.reliability == Reliability::Extrapolated { Reliability::TooCoarse } else { told.reliability };
+        ErrorEstimate { reliability: trust, ..told }
     });
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
 
 /// Errors measured at the points that a coarser sampling withholds.
-struct Errors {
-    inside: Vec<Measured>,
-    border: Vec<Measured>,
+struct WithheldErrors {
+    inside: Vec<WithheldPoint>,
+    border: Vec<WithheldPoint>,
     /// Mean spacing of the coarser sampling, in millimetres.
     spacing_mm: f64,
 }
 
-impl Errors {
+impl WithheldErrors {
     fn merge_border(&mut self) {
         self.inside.append(&mut self.border);
     }
 }
 
 /// Withheld point with its errors by the flat and by the curved distance.
-struct Measured {
+struct WithheldPoint {
     point: Point,
     errors_mm: [f64; 2],
 }
 
 /// Measures the errors of the sampling by every n-th node along both axes, with the normals of the whole grid.
-fn defined_grid_level(
+fn strided_grid_errors(
     columns: usize,
     rows: usize,
     points: &[Point],
     normals: &[Vector],
     stride: usize,
-) -> Result<Errors, SurfaceError> {
+) -> Result<WithheldErrors, SurfaceError> {
     let nodes: Vec<usize> = coarse_nodes(columns, rows, stride).collect();
     let (coarse_columns, coarse_rows) = ((columns - 1) / stride + 1, (rows - 1) / stride + 1);
     let coarse_points = nodes.iter().map(|&n| points[n]).collect();
@@ -226,7 +226,7 @@ fn defined_grid_level(
     let coarse = Nominal::from_grid_with_normals(coarse_columns, coarse_rows, coarse_points, coarse_normals)?;
     let mut left_out = vec![true; points.len()];
     nodes.iter().for_each(|&n| left_out[n] = false);
-    Ok(measure(&coarse, points, &left_out))
+    Ok(measure_withheld(&coarse, points, &left_out))
 }
 
 /// Returns the nodes that remain when every n-th node along both axes is kept.
@@ -236,14 +236,14 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
 
 /// Chooses the points of the two coarser samplings. Returns their spacings, in spacings of the whole sampling, and the
 /// indices of the points they keep.
-fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
-    let on_plane = matches!(projection, Projection::Auto | Projection::Xy);
+fn choose_coarse_points(points: &[Point], projection: PlaneProjection) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
+    let on_plane = matches!(projection, PlaneProjection::Auto | PlaneProjection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
-        let kept = OF_GRID.map(|stride| {
+        let kept = GRID_STRIDES.map(|stride| {
             let nodes = coarse_nodes(order.columns, order.rows, stride).map(|node| order.point_indices[node]);
             nodes.filter(|&point| point != NO_POINT).collect()
         });
-        return Ok((OF_GRID.map(|stride| stride as f64), kept));
+        return Ok((GRID_STRIDES.map(|stride| stride as f64), kept));
     }
     if points.len() < 9 {
         return Err(SurfaceError::TooFewPoints { points: points.len(), min_points: 9 });
@@ -252,15 +252,15 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2],
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let (_, map) = projection.choose(points)?;
-    let order = along_the_plane(points, &map);
-    let of = if points.len() < FEW { OF_FEW } else { OF_SCATTERED };
+    let order = morton_order(points, &map);
+    let of = if points.len() < FEW_POINTS { THINNING_FACTORS_OF_FEW } else { THINNING_FACTORS };
     let every = |one_of: usize| order.iter().copied().skip(one_of.isqrt() / 2).step_by(one_of).collect();
     Ok((of.map(|one_of| (one_of as f64).sqrt()), of.map(every)))
 }
 
 /// Returns the indices of the points in the order of a Morton curve in the plane of the projection. Neighbours on the
 /// curve are neighbours in the plane, so that every fourth point gives a well spread quarter of them.
-fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
+fn morton_order(points: &[Point], map: &Projector) -> Vec<u32> {
     let placed: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
     let [low, high] = bounds(placed.iter().copied());
     let size = (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
@@ -278,61 +278,61 @@ fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
 }
 
 /// Measures the errors of the sampling by the kept points. Its normals are fitted like those of the whole sampling.
-fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<Errors, SurfaceError> {
+fn subset_errors(points: &[Point], kept: &[u32], projection: PlaneProjection) -> Result<WithheldErrors, SurfaceError> {
     let coarse = Nominal::from_points(kept.iter().map(|&k| points[k as usize]).collect(), projection)?;
     let mut left_out = vec![true; points.len()];
     kept.iter().for_each(|&k| left_out[k as usize] = false);
-    Ok(measure(&coarse, points, &left_out))
+    Ok(measure_withheld(&coarse, points, &left_out))
 }
 
 /// Measures the distances of the withheld points from a coarser sampling.
-fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
+fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> WithheldErrors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
-    let (flat, curved) = (surface.with_distance_model(Distance::Triangle), surface.with_distance_model(Distance::Curved));
+    let (flat, curved) = (surface.with_distance_model(DistanceModel::Triangle), surface.with_distance_model(DistanceModel::Curved));
     // Odd, so that the stride does not divide a common number of columns.
-    let stride = (points.len() / MEASURED) | 1;
+    let stride = (points.len() / MAX_MEASURED) | 1;
     let one = |k: usize| {
         let at = points[k];
-        let foot = curved.project(&at, Place::UNKNOWN);
+        let foot = curved.project(&at, FacetIndex::UNKNOWN);
         if foot.beyond_edge_mm > 0.0 {
             return None;
         }
         let errors_mm = [flat.project(&at, foot.facet).distance_mm, foot.distance_mm];
         let spacing_mm = curved.spacing_mm(foot.facet);
-        let reach = BORDER * spacing_mm;
+        let reach = BORDER_SPACINGS * spacing_mm;
         let [u, v] = tangents(&foot.normal);
         let around = (0..8).map(|k| std::f64::consts::FRAC_PI_4 * f64::from(k)).map(|a| u * a.cos() + v * a.sin());
         let inside = around.into_iter().all(|d| curved.project(&(at + d * reach), foot.facet).beyond_edge_mm == 0.0);
-        Some((inside, spacing_mm, Measured { point: at, errors_mm }))
+        Some((inside, spacing_mm, WithheldPoint { point: at, errors_mm }))
     };
     let chosen = (0..points.len()).into_par_iter().step_by(stride);
     let measured: Vec<_> = chosen.filter(|&k| left_out[k] && points[k].x.is_finite()).filter_map(one).collect();
     let spacing_mm = measured.iter().map(|m| m.1).sum::<f64>() / measured.len().max(1) as f64;
     let (inside, border): (Vec<_>, Vec<_>) = measured.into_iter().partition(|m| m.0);
-    let strip = |set: Vec<(bool, f64, Measured)>| set.into_iter().map(|m| m.2).collect();
-    Errors { inside: strip(inside), border: strip(border), spacing_mm }
+    let strip = |set: Vec<(bool, f64, WithheldPoint)>| set.into_iter().map(|m| m.2).collect();
+    WithheldErrors { inside: strip(inside), border: strip(border), spacing_mm }
 }
 
 /// Extrapolates the errors of two coarser samplings to the whole sampling.
-fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2], spacing_mm: f64) -> Estimate {
-    let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| figures(&errors.inside, kind));
-    let [border_fine, border_coarse] = [fine, coarse].map(|errors| figures(&errors.border, kind));
-    let observed_order = observed(&inside_fine, &inside_coarse, step);
-    let trust = trust(observed_order, LEAST_ORDER[kind], inside_fine.rms_mm, spacing_mm);
-    let order = observed_order.clamp(ORDERS[0], ORDERS[1]);
-    let scale = |order: f64| if trust == Trust::Rounding { 1.0 } else { factor.powf(-order) };
+fn extrapolate_errors(fine: &WithheldErrors, coarse: &WithheldErrors, kind: usize, [factor, step]: [f64; 2], spacing_mm: f64) -> ErrorEstimate {
+    let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| error_figures(&errors.inside, kind));
+    let [border_fine, border_coarse] = [fine, coarse].map(|errors| error_figures(&errors.border, kind));
+    let observed_order = observed_order(&inside_fine, &inside_coarse, step);
+    let trust = assess_reliability(observed_order, MIN_PLAUSIBLE_ORDERS[kind], inside_fine.rms_mm, spacing_mm);
+    let order = observed_order.clamp(ORDER_RANGE[0], ORDER_RANGE[1]);
+    let scale = |order: f64| if trust == Reliability::Rounding { 1.0 } else { factor.powf(-order) };
     let (inside_scale, border_scale) =
-        (scale(order), scale(observed(&border_fine, &border_coarse, step).clamp(ORDERS[0], ORDERS[1])));
-    let worst = |set: &[Measured], scale: f64, near_border: bool| {
+        (scale(order), scale(observed_order(&border_fine, &border_coarse, step).clamp(ORDER_RANGE[0], ORDER_RANGE[1])));
+    let worst = |set: &[WithheldPoint], scale: f64, near_border: bool| {
         let largest = set.iter().max_by(|a, b| a.errors_mm[kind].abs().total_cmp(&b.errors_mm[kind].abs()));
-        largest.map(|m| Worst { point: m.point, error_mm: m.errors_mm[kind] * scale, near_border })
+        largest.map(|m| MaxError { point: m.point, error_mm: m.errors_mm[kind] * scale, near_border })
     };
     let inside_worst = worst(&fine.inside, inside_scale, false).expect("there are places inside");
     let worst = match worst(&fine.border, border_scale, true) {
         Some(at_border) if at_border.error_mm.abs() > inside_worst.error_mm.abs() => at_border,
         _ => inside_worst,
     };
-    Estimate {
+    ErrorEstimate {
         inside: inside_fine.scaled(inside_scale),
         border: border_fine.scaled(border_scale),
         max_error: worst,
@@ -346,35 +346,35 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2
 
 /// Returns the order at which the error fell from the coarse to the fine sampling; `step` is the ratio of their
 /// spacings.
-fn observed(fine: &Figures, coarse: &Figures, step: f64) -> f64 {
+fn observed_order(fine: &ErrorFigures, coarse: &ErrorFigures, step: f64) -> f64 {
     let ratio = coarse.rms_mm / fine.rms_mm;
-    if ratio > 0.0 && ratio.is_finite() { ratio.log2() / step.log2() } else { ORDERS[0] }
+    if ratio > 0.0 && ratio.is_finite() { ratio.log2() / step.log2() } else { ORDER_RANGE[0] }
 }
 
-fn trust(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Trust {
+fn assess_reliability(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Reliability {
     /// Upper limit of the tilt that rounding and noise cause; features between the points cause more.
     const MAX_TILT: f64 = 1e-4;
     /// Limit of the floating-point accuracy on a part of one metre.
     const EXACT_MM: f64 = 1e-11;
     match observed_order {
-        _ if rms_mm < EXACT_MM => Trust::Extrapolated,
-        p if p < least && rms_mm < MAX_TILT * spacing_mm => Trust::Rounding,
-        p if p < least || p > ORDERS[1] + 0.5 => Trust::TooCoarse,
-        _ => Trust::Extrapolated,
+        _ if rms_mm < EXACT_MM => Reliability::Extrapolated,
+        p if p < least && rms_mm < MAX_TILT * spacing_mm => Reliability::Rounding,
+        p if p < least || p > ORDER_RANGE[1] + 0.5 => Reliability::TooCoarse,
+        _ => Reliability::Extrapolated,
     }
 }
 
-fn figures(set: &[Measured], kind: usize) -> Figures {
+fn error_figures(set: &[WithheldPoint], kind: usize) -> ErrorFigures {
     if set.is_empty() {
-        return Figures::default();
+        return ErrorFigures::default();
     }
     let errors = set.iter().map(|m| m.errors_mm[kind]);
     let (low, high, sum) = errors
         .fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), e| (low.min(e), high.max(e), sum + e * e));
-    Figures { pv_mm: high - low, rms_mm: (sum / set.len() as f64).sqrt(), max_mm: high.max(-low) }
+    ErrorFigures { pv_mm: high - low, rms_mm: (sum / set.len() as f64).sqrt(), max_mm: high.max(-low) }
 }
 
-impl Figures {
+impl ErrorFigures {
     fn scaled(self, by: f64) -> Self {
         Self { pv_mm: self.pv_mm * by, rms_mm: self.rms_mm * by, max_mm: self.max_mm * by }
     }

@@ -4,12 +4,12 @@ use std::collections::HashMap;
 
 use rayon::prelude::*;
 
-use crate::geometry::{Point, bounds, far_off};
+use crate::geometry::{Point, bounds, find_far_off};
 
-use super::edges::{SortedSites, Triangulation};
+use super::triangulation::{SortedSites, Triangulation};
 use super::error::SurfaceError;
-use super::mesh::BORDER;
-use super::projection::Map;
+use super::mesh_topology::BORDER;
+use super::plane_projection::Projector;
 
 /// Triangles and, for each corner, the neighbour across the opposite edge.
 pub(crate) struct Triangles {
@@ -31,7 +31,7 @@ const WIDE: f64 = 100.0;
 const TWINS: f64 = 1e-4;
 
 /// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
-const LARGEST: f64 = 3.2e60;
+const MAX_COORDINATE: f64 = 3.2e60;
 
 /// Triangulates scattered points in the plane of a map, and removes the needles at the hull and the bridges over holes.
 ///
@@ -41,12 +41,12 @@ const LARGEST: f64 = 3.2e60;
 /// # Errors
 /// Returns an error if a coordinate is not finite or too large, if two points coincide or nearly coincide in the plane,
 /// if all points lie on one line, or if one point is far off the others.
-pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Triangles), SurfaceError> {
-    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(lifted)).collect();
-    if let Some(index) = places.iter().position(|p| !(p[0].abs() <= LARGEST && p[1].abs() <= LARGEST)) {
+pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Point>, Triangles), SurfaceError> {
+    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(flushed_to_zero)).collect();
+    if let Some(index) = places.iter().position(|p| !(p[0].abs() <= MAX_COORDINATE && p[1].abs() <= MAX_COORDINATE)) {
         return Err(SurfaceError::NotFinite { index });
     }
-    let along = along_a_z_curve(&places);
+    let along = z_curve_order(&places);
     let keys: Vec<u64> = along.par_iter().map(|(key, _)| *key).collect();
     let ordered: Vec<[f64; 2]> = along.par_iter().map(|(_, index)| places[*index as usize]).collect();
     if ordered.windows(2).any(|w| w[0] == w[1]) {
@@ -57,8 +57,8 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let triangles = Triangles { corners, neighbours };
-    let lengths = Lengths::new(&triangles, &ordered);
-    if let Some(twins) = twins(&triangles, &lengths, &ordered) {
+    let lengths = EdgeLengths::new(&triangles, &ordered);
+    if let Some(twins) = find_near_duplicates(&triangles, &lengths, &ordered) {
         let [first, second] = twins.map(|k| along[k as usize].1 as usize);
         let apart_mm = (points[first] - points[second]).norm();
         let (first, second) = (first.min(second), first.max(second));
@@ -66,7 +66,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
     }
     let [low, high] = bounds(ordered.iter().copied());
     if (high[0] - low[0]).max(high[1] - low[1]) > WIDE * lengths.median_max_edge * (points.len() as f64).sqrt()
-        && let Some((index, distance_mm)) = far_off(points)
+        && let Some((index, distance_mm)) = find_far_off(points)
     {
         return Err(SurfaceError::FarOff { index, at: points[index].into(), distance_mm });
     }
@@ -76,7 +76,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
 
 /// Returns the keys and the indices of the places in the order of a Z-curve. Places with equal keys are ordered by u,
 /// then by v.
-pub(crate) fn along_a_z_curve(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
+pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
     let key = |p: &[f64; 2]| {
@@ -108,7 +108,7 @@ fn spread_bits(bits: u32) -> u64 {
 
 /// Returns 0 for a coordinate closer to zero than 1e-40, whose products would underflow, and for -0; returns other
 /// coordinates unchanged.
-fn lifted(coordinate: f64) -> f64 {
+fn flushed_to_zero(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
 
@@ -121,13 +121,13 @@ fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
 }
 
 /// Shortest and longest edge of each triangle, and the median of the longest edges.
-struct Lengths {
+struct EdgeLengths {
     min_edge: Vec<f64>,
     max_edge: Vec<f64>,
     median_max_edge: f64,
 }
 
-impl Lengths {
+impl EdgeLengths {
     fn new(t: &Triangles, places: &[[f64; 2]]) -> Self {
         let of = |corners: &[u32; 3]| {
             let [a, b, c] = squared_lengths(corners, places);
@@ -139,7 +139,7 @@ impl Lengths {
 }
 
 /// Returns two points so near each other that the surface between them consists of rounding errors.
-fn twins(t: &Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
+fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
     let least = TWINS * lengths.median_max_edge;
     let facet = lengths.min_edge.par_iter().position_first(|shortest| *shortest < least)?;
     let corners = t.corners[facet];
@@ -148,10 +148,10 @@ fn twins(t: &Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Option<[u32; 
     Some([corners[(across + 1) % 3], corners[(across + 2) % 3]])
 }
 
-fn without_bridges_and_needles(mut t: Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Triangles {
+fn without_bridges_and_needles(mut t: Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Triangles {
     let mut dropped = vec![false; t.corners.len()];
     let mut open: Vec<u32> = Vec::new();
-    for facet in bridges(&t, lengths) {
+    for facet in find_bridges(&t, lengths) {
         drop_facet(&mut t, &mut dropped, facet, &mut open);
     }
     let at_border = |f: &u32| t.neighbours[*f as usize].contains(&BORDER);
@@ -161,7 +161,7 @@ fn without_bridges_and_needles(mut t: Triangles, lengths: &Lengths, places: &[[f
             drop_facet(&mut t, &mut dropped, facet, &mut open);
         }
     }
-    compacted(t, &dropped)
+    compact(t, &dropped)
 }
 
 fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Vec<u32>) {
@@ -186,7 +186,7 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
 }
 
 /// Returns the triangles that are far longer than is usual around their corners.
-fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
+fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
         .filter(|&f| lengths.max_edge[f as usize] > BRIDGE * lengths.median_max_edge)
@@ -194,7 +194,7 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
     if suspects.is_empty() {
         return suspects;
     }
-    let usual = usual_around(t, lengths, &suspects);
+    let usual = usual_lengths(t, lengths, &suspects);
     suspects
         .into_iter()
         .filter(|&f| {
@@ -210,7 +210,7 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
 /// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller compares
 /// with the largest value of the three corners. A stray point would justify its own bridges. Therefore the value of a
 /// corner is limited to the second largest value of its neighbours.
-fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u32, f64> {
+fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> HashMap<u32, f64> {
     let neighbours = triangles_at(t, suspects.iter().flat_map(|&f| t.corners[f as usize]));
     let around = triangles_at(t, neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]));
     let quartile = |facets: &Vec<u32>| {
@@ -251,7 +251,7 @@ fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {
     (0..3).any(|k| t.neighbours[facet as usize][k] == BORDER && double_area < NEEDLE * squared[k])
 }
 
-fn compacted(t: Triangles, dropped: &[bool]) -> Triangles {
+fn compact(t: Triangles, dropped: &[bool]) -> Triangles {
     if !dropped.contains(&true) {
         return t;
     }
@@ -292,7 +292,7 @@ fn median(values: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::Projection;
+    use crate::surface::PlaneProjection;
 
     fn sunflower(count: usize, inner: f64) -> Vec<Point> {
         (0..count)
@@ -310,7 +310,7 @@ mod tests {
     }
 
     fn triangulated(points: &[Point]) -> (Vec<Point>, Triangles) {
-        triangulate(points, &Projection::Xy.choose(points).unwrap().1).unwrap()
+        triangulate(points, &PlaneProjection::Xy.choose(points).unwrap().1).unwrap()
     }
 
     #[test]
@@ -369,7 +369,7 @@ mod tests {
 
     #[test]
     fn degenerate_clouds_are_named() {
-        let map = Map::Plane {
+        let map = Projector::Plane {
             origin: Point::origin(),
             axes: [crate::geometry::Vector::x(), crate::geometry::Vector::y(), crate::geometry::Vector::z()],
         };

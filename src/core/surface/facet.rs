@@ -177,7 +177,7 @@ fn weighted<T: Real>(v: &[[T; 3]; 3], b: &[T; 3]) -> [T; 3] {
 
 /// Moves a vertex onto the offset surface, eq. (3), and turns its normal to the probe's side.
 #[inline(always)]
-pub(crate) fn corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius_mm: T) -> Corner<T> {
+pub(crate) fn offset_corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius_mm: T) -> Corner<T> {
     let normal = times(&normal, sign);
     ([point[0] + normal[0] * radius_mm, point[1] + normal[1] * radius_mm, point[2] + normal[2] * radius_mm], normal)
 }
@@ -187,18 +187,18 @@ pub(crate) fn corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius
 /// Every vector is built from registers. If it were built through an array in memory, it would wait for four narrow
 /// stores.
 #[inline(always)]
-pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
+pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
     let normal = [
         F64x4([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
         F64x4([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
         F64x4([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
     ];
-    (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
+    (points_x4(&[a.point, b.point, c.point, d.point]), normal)
 }
 
 /// Packs four points into lanes.
 #[inline(always)]
-pub(crate) fn side_by_side(points: &[Point; LANES]) -> Vector3x4 {
+pub(crate) fn points_x4(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;
     [F64x4([a.x, b.x, c.x, d.x]), F64x4([a.y, b.y, c.y, d.y]), F64x4([a.z, b.z, c.z, d.z])]
 }

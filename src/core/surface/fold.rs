@@ -5,21 +5,21 @@ use rayon::prelude::*;
 use crate::geometry::Vector;
 
 use super::error::SurfaceError;
-use super::facet::{Facets, Vertex, four_vertices};
-use super::grid::GridLattice;
-use super::offset::{OffsetSurface, Place};
-use super::patch::{Lattice, Patch};
+use super::facet::{Facets, Vertex, vertices_x4};
+use super::grid_topology::GridTopology;
+use super::offset::{OffsetSurface, FacetIndex};
+use super::patch::{Topology, Patch};
 use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
 
 /// Maximum number of facets of a mesh that are checked in addition to the touched ones. It is limited because a mesh
 /// fits its normals only where they are needed.
-const LOOKED_AT: usize = 2048;
+const MAX_CHECKED_FACETS: usize = 2048;
 
 /// Step of the first check of a grid, in nodes. This check uses a probe `DOUBT` times as large; every facet is checked
 /// only if that probe nearly folds somewhere. A surface whose curvature changes by a third between neighbouring nodes
 /// is sampled too coarsely to be known.
 const STEP: usize = 2;
-const DOUBT: f64 = 1.4;
+const PROBE_ENLARGEMENT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
     /// Returns the worst place where the offset surface folds, if there is one. Checks a whole grid, and up to
@@ -34,9 +34,9 @@ impl OffsetSurface<'_> {
 
     /// Returns the worst place where the offset surface folds among the touched places of a mesh.
     /// [`OffsetSurface::fold`] checks a grid as a whole.
-    pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
+    pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = FacetIndex>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
-        let is_mesh = |patch: &Patch| matches!(patch.topology, Lattice::Mesh(_));
+        let is_mesh = |patch: &Patch| matches!(patch.topology, Topology::Mesh(_));
         if self.radius_mm() == 0.0 || !patches.iter().any(is_mesh) {
             return None;
         }
@@ -57,7 +57,7 @@ impl OffsetSurface<'_> {
     /// Returns the folded facets of a patch, among those that are checked.
     fn folded_facets(&self, patch: &Patch) -> Vec<u32> {
         match &patch.topology {
-            Lattice::Grid(grid) => {
+            Topology::Grid(grid) => {
                 let (arch, nodes) = (pulp::Arch::new(), patch.nodes());
                 let doubtful = (0..(grid.rows() - 1).div_ceil(STEP))
                     .into_par_iter()
@@ -71,8 +71,8 @@ impl OffsetSurface<'_> {
                     .map(|(facet, _)| facet)
                     .collect()
             }
-            Lattice::Mesh(mesh) => {
-                let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
+            Topology::Mesh(mesh) => {
+                let stride = (mesh.facet_count() as usize).div_ceil(MAX_CHECKED_FACETS);
                 let looked_at: Vec<u32> = (0..mesh.facet_count()).step_by(stride).collect();
                 patch.fit_normals(&looked_at.iter().flat_map(|&f| mesh.corners(f)).collect::<Vec<_>>());
                 looked_at.into_par_iter().filter(|&f| self.is_folded(patch, mesh.corners(f))).collect()
@@ -81,13 +81,13 @@ impl OffsetSurface<'_> {
     }
 
     /// Returns the wide facets along a row of nodes.
-    fn wide_row<'a>(&self, grid: &GridLattice, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
+    fn wide_row<'a>(&self, grid: &GridTopology, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
         WideRow {
             nodes: &nodes[row * columns..][..columns],
             above: &nodes[(row + up) * columns..][..columns],
-            reach: self.radius_mm() * self.side().sign() * DOUBT,
+            reach: self.radius_mm() * self.side().sign() * PROBE_ENLARGEMENT,
         }
     }
 
@@ -97,7 +97,7 @@ impl OffsetSurface<'_> {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
         let reach = self.radius_mm() * self.side().sign();
         let edges = (q.point - p.point, t.point - p.point);
-        not_positive(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
+        is_not_positive_definite(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
     /// Returns the smallest normal curvature of a facet in 1/mm, negative where it is concave as seen from the probe's
@@ -143,9 +143,9 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
         let mut doubtful = false;
         while k + LANES * STEP < nodes.len() {
             let (a, b, c) = (k + STEP, k + 2 * STEP, k + 3 * STEP);
-            let here = four_vertices(&[nodes[k], nodes[a], nodes[b], nodes[c]]);
-            let next = four_vertices(&[nodes[a], nodes[b], nodes[c], nodes[c + STEP]]);
-            let up = four_vertices(&[above[k], above[a], above[b], above[c]]);
+            let here = vertices_x4(&[nodes[k], nodes[a], nodes[b], nodes[c]]);
+            let next = vertices_x4(&[nodes[a], nodes[b], nodes[c], nodes[c + STEP]]);
+            let up = vertices_x4(&[above[k], above[a], above[b], above[c]]);
             doubtful |= self.any_folds_x4(&here, &next, &up);
             k += LANES * STEP;
         }
@@ -153,7 +153,7 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
             let (p, q, t) = (nodes[k], nodes[k + STEP], above[k]);
             let edges = (q.point - p.point, t.point - p.point);
             let changes = ((q.normal - p.normal) * self.reach, (t.normal - p.normal) * self.reach);
-            doubtful |= not_positive(edges.0, edges.1, changes.0, changes.1);
+            doubtful |= is_not_positive_definite(edges.0, edges.1, changes.0, changes.1);
             k += STEP;
         }
         doubtful
@@ -187,7 +187,7 @@ impl WideRow<'_> {
 /// Returns true if E + r B is not positive definite; returns false for NaN. `e1` and `e2` are two edges; `d1` and `d2`
 /// are r times the change of the normal along each.
 #[inline(always)]
-fn not_positive(e1: Vector, e2: Vector, d1: Vector, d2: Vector) -> bool {
+fn is_not_positive_definite(e1: Vector, e2: Vector, d1: Vector, d2: Vector) -> bool {
     let e = e1.dot(&(e1 + d1));
     let g = e2.dot(&(e2 + d2));
     let f = e1.dot(&e2) + 0.5 * (e1.dot(&d2) + e2.dot(&d1));

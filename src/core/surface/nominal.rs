@@ -4,20 +4,20 @@ use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
-use crate::geometry::grid_order::grid_in_order;
-use crate::geometry::{Aperture, Nearest, Point, Vector, recognise_grid};
+use crate::geometry::grid_recognition::recognise_ordered_grid;
+use crate::geometry::{Aperture, PointTree, Point, Vector, recognise_grid};
 
 use super::delaunay;
 use super::error::SurfaceError;
 use super::facet::Vertex;
-use super::feature::{Feature, features};
-use super::grid::{GridLattice, grid_nodes, in_grid_order};
-use super::mesh::MeshLattice;
+use super::curvature_feature::{CurvatureFeature, fit_features};
+use super::grid_topology::{GridTopology, fit_grid_nodes, reorder_to_grid};
+use super::mesh_topology::MeshTopology;
 use super::normals;
-use super::offset::Place;
-use super::patch::{Lattice, Patch};
-use super::projection::{Projection, is_line, principal_axes};
-use super::roughness;
+use super::offset::FacetIndex;
+use super::patch::{Topology, Patch};
+use super::plane_projection::{PlaneProjection, is_line, principal_axes};
+use super::nominal_noise;
 
 /// Nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
@@ -26,11 +26,11 @@ pub struct Nominal {
     kind: NominalKind,
     outline: Option<Aperture>,
     /// Curvature features at some places; computed when a pose is searched for.
-    features: OnceLock<Vec<Feature>>,
+    features: OnceLock<Vec<CurvatureFeature>>,
     /// Rms distances of the points from their centroid and from their best-fit plane.
     extent_mm: OnceLock<[f64; 2]>,
     /// Some of the points and a facet at each; made when a search for a foot has no start.
-    start_facets: OnceLock<(Nearest, Vec<Place>)>,
+    start_facets: OnceLock<(PointTree, Vec<FacetIndex>)>,
 }
 
 /// Source that a nominal surface was made from.
@@ -46,7 +46,7 @@ pub enum NominalKind {
     /// Scattered points, triangulated in a projection.
     Scattered {
         /// The projection, never `Auto`.
-        projection: Projection,
+        projection: PlaneProjection,
     },
     /// A mesh that came with its triangles.
     Mesh,
@@ -65,21 +65,21 @@ impl Nominal {
     /// # Errors
     /// Returns an error if there are too few points, a coordinate is not finite, two points coincide, the points lie on
     /// one line, one point is far off the others, or no projection is one-to-one.
-    pub fn from_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+    pub fn from_points(points: Vec<Point>, projection: PlaneProjection) -> Result<Self, SurfaceError> {
         const MIN_POINTS: usize = 9;
         if points.len() < MIN_POINTS {
             return Err(SurfaceError::TooFewPoints { points: points.len(), min_points: MIN_POINTS });
         }
-        let may_be_grid = matches!(projection, Projection::Auto | Projection::Xy);
-        if may_be_grid && let Some(found) = grid_in_order(&points) {
-            return Ok(Self::from_grid_topology(GridLattice::from_ordered_grid(&found), &points));
+        let may_be_grid = matches!(projection, PlaneProjection::Auto | PlaneProjection::Xy);
+        if may_be_grid && let Some(found) = recognise_ordered_grid(&points) {
+            return Ok(Self::from_grid_topology(GridTopology::from_ordered_grid(&found), &points));
         }
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
         }
         if may_be_grid && let Some(order) = recognise_grid(&points) {
-            let points = in_grid_order(points, &order);
-            return Ok(Self::from_grid_topology(GridLattice::new(order.columns, order.rows, &points, true), &points));
+            let points = reorder_to_grid(points, &order);
+            return Ok(Self::from_grid_topology(GridTopology::new(order.columns, order.rows, &points, true), &points));
         }
         Self::from_triangulated_points(points, projection)
     }
@@ -88,13 +88,13 @@ impl Nominal {
     ///
     /// # Errors
     /// Returns the same errors as [`Nominal::from_points`].
-    pub fn from_triangulated_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+    pub fn from_triangulated_points(points: Vec<Point>, projection: PlaneProjection) -> Result<Self, SurfaceError> {
         if points.len() > 3 && is_line(&points) {
             return Err(SurfaceError::Collinear { points: points.len() });
         }
         let (projection, map) = projection.choose(&points)?;
         let (points, triangles) = delaunay::triangulate(&points, &map)?;
-        let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
+        let lattice = MeshTopology::from_parts(&points, triangles.corners, triangles.neighbours)?;
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
 
@@ -107,7 +107,7 @@ impl Nominal {
     /// Returns an error if the number of points is not `columns * rows`, or if an axis has fewer than 3 nodes.
     pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len())?;
-        Ok(Self::from_grid_topology(GridLattice::new(columns, rows, &points, false), &points))
+        Ok(Self::from_grid_topology(GridTopology::new(columns, rows, &points, false), &points))
     }
 
     /// Makes a surface from a regular xy grid of points whose unit normals are known.
@@ -121,7 +121,7 @@ impl Nominal {
         normals: Vec<Vector>,
     ) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len().min(normals.len()))?;
-        let lattice = GridLattice::new(columns, rows, &points, true);
+        let lattice = GridTopology::new(columns, rows, &points, true);
         let nodes = points.into_par_iter().zip(normals).map(|(point, normal)| Vertex { point, normal }).collect();
         Ok(Self::new(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
@@ -135,7 +135,7 @@ impl Nominal {
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
         }
-        let lattice = MeshLattice::new(&points, triangles)?;
+        let lattice = MeshTopology::new(&points, triangles)?;
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Mesh))
     }
 
@@ -164,9 +164,9 @@ impl Nominal {
         Self { outline: Some(outline), ..self }
     }
 
-    fn from_grid_topology(lattice: GridLattice, points: &[Point]) -> Self {
+    fn from_grid_topology(lattice: GridTopology, points: &[Point]) -> Self {
         let kind = NominalKind::Grid { columns: lattice.columns(), rows: lattice.rows() };
-        Self::new(Patch::grid(grid_nodes(points, &lattice), lattice), kind)
+        Self::new(Patch::grid(fit_grid_nodes(points, &lattice), lattice), kind)
     }
 
     fn new(patch: Patch, kind: NominalKind) -> Self {
@@ -286,7 +286,7 @@ impl Nominal {
     pub(crate) fn normal_error_rad(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
-            let Lattice::Mesh(mesh) = &patch.topology else { continue };
+            let Topology::Mesh(mesh) = &patch.topology else { continue };
             for vertex in patch.sample(256) {
                 let wider = normals::fit_to_ring(patch.mesh_points(), mesh, vertex, 2 * normals::NEIGHBOURS);
                 sum += (wider.normal - patch.normal(vertex)).norm_squared();
@@ -299,23 +299,23 @@ impl Nominal {
     /// Returns the standard deviation of the noise of the points along the normal, about a smooth surface, in
     /// millimetres; 0 if the points show no noise.
     pub(crate) fn noise_sigma_mm(&self) -> f64 {
-        roughness::scatter_mm(&self.patches)
+        nominal_noise::noise_sigma_mm(&self.patches)
     }
 
     /// Returns facets at the points of the surface that are nearest to a place, by distance in space and not along a
     /// projection.
-    pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = Place> {
+    pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = FacetIndex> {
         /// Number of points in the search tree, and number of places returned.
         const TREE_POINTS: usize = 20_000;
         const RETURNED: u32 = 3;
         let (nearest, places) = self.start_facets.get_or_init(|| {
             let share = (TREE_POINTS / self.patches.len()).max(1);
             let of_patch = |(number, patch): (usize, &Patch)| {
-                let place = move |vertex| (*patch.point(vertex), Place::new(number as u32, patch.facet_at(vertex)));
+                let place = move |vertex| (*patch.point(vertex), FacetIndex::new(number as u32, patch.facet_at(vertex)));
                 patch.sample(share).map(place).collect::<Vec<_>>()
             };
-            let (points, places): (Vec<Point>, Vec<Place>) = self.patches.iter().enumerate().flat_map(of_patch).unzip();
-            (Nearest::new(points.into_iter()), places)
+            let (points, places): (Vec<Point>, Vec<FacetIndex>) = self.patches.iter().enumerate().flat_map(of_patch).unzip();
+            (PointTree::new(points.into_iter()), places)
         });
         nearest.nearest(p, RETURNED).map(|(k, _)| places[k])
     }
@@ -324,19 +324,19 @@ impl Nominal {
     /// few nodes.
     pub(crate) fn coarsened(&self) -> Option<Self> {
         let [patch] = &self.patches[..] else { return None };
-        let Lattice::Grid(grid) = &patch.topology else { return None };
+        let Topology::Grid(grid) = &patch.topology else { return None };
         let [columns, rows] = [grid.columns(), grid.rows()].map(|nodes| nodes.div_ceil(2));
         let node = |k: usize| *patch.point((2 * (k / columns) * grid.columns() + 2 * (k % columns)) as u32);
         let points: Vec<Point> = (0..columns * rows).map(node).collect();
         check_grid(columns, rows, points.len()).ok()?;
-        Some(Self::from_grid_topology(GridLattice::new(columns, rows, &points, grid.is_regular()), &points))
+        Some(Self::from_grid_topology(GridTopology::new(columns, rows, &points, grid.is_regular()), &points))
     }
 
     /// Returns the curvature features at some places spread over the surface.
-    pub(crate) fn features(&self) -> &[Feature] {
+    pub(crate) fn features(&self) -> &[CurvatureFeature] {
         self.features.get_or_init(|| {
             let (points, normals): (Vec<_>, Vec<_>) = self.sampled_vertices(FEATURES).into_iter().unzip();
-            features(&points, Some(&normals))
+            fit_features(&points, Some(&normals))
         })
     }
 }

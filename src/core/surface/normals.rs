@@ -3,7 +3,7 @@
 use crate::geometry::{Point, Vector};
 
 use super::facet::Facets;
-use super::mesh::MeshLattice;
+use super::mesh_topology::MeshTopology;
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 
 /// Number of neighbours that a fit asks for: nine unknowns and a margin. Two rings of a triangulation have eighteen; at
@@ -11,7 +11,7 @@ use super::simd::{F64x4, LANES, Real, Vector3x4};
 pub(crate) const NEIGHBOURS: usize = 14;
 
 /// Maximum number of neighbours in a fit.
-const MOST: usize = 64;
+const MAX_NEIGHBOURS: usize = 64;
 
 /// Smallest accepted ratio of a pivot to the largest diagonal entry. A smaller pivot means that the neighbours do not
 /// determine the cubic.
@@ -34,20 +34,20 @@ pub(crate) struct LocalFit {
 /// Frame: the mean normal of the facets around the vertex and two tangents. Weights fall with distance s as 1/(1 +
 /// (s/h)^2), where h is the mean distance, so that a far neighbour in an uneven ring affects the fit less. If the
 /// neighbours do not determine a cubic (at a border, on a line), the fit is a quadric, then a plane.
-pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshLattice, vertex: u32, wanted: usize) -> LocalFit {
-    let mut ring = [0u32; MOST];
-    let found = neighbours(mesh, vertex, wanted, &mut ring);
+pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wanted: usize) -> LocalFit {
+    let mut ring = [0u32; MAX_NEIGHBOURS];
+    let found = collect_rings(mesh, vertex, wanted, &mut ring);
     let mean = mean_facet_normal(points, mesh, vertex);
-    fit(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
+    fit_to_neighbours(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
 /// Fits like [`fit_to_ring`] to neighbours from another source, about an approximate normal.
-pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
+pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
-    let mut local = [[0.0; 3]; MOST];
+    let mut local = [[0.0; 3]; MAX_NEIGHBOURS];
     let mut count = 0;
     let mut spread = 0.0;
-    for p in neighbours.take(MOST) {
+    for p in neighbours.take(MAX_NEIGHBOURS) {
         let d = p - at;
         local[count] = [d.dot(&tu), d.dot(&tv), d.dot(&mean)];
         spread += (local[count][0].powi(2) + local[count][1].powi(2)).sqrt();
@@ -66,8 +66,8 @@ pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Poin
 /// Fits the normals of four vertices in parallel lanes. Each agrees with [`fit_to_ring`] to rounding and does not
 /// depend on the other three vertices.
 #[inline(always)]
-pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32; LANES]) -> [Vector; LANES] {
-    let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MOST], max_count: 0 };
+pub(crate) fn fit_normals_x4(points: &[Point], mesh: &MeshTopology, vertices: &[u32; LANES]) -> [Vector; LANES] {
+    let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MAX_NEIGHBOURS], max_count: 0 };
     let mut last = (None, [Vector::zeros(); 3]);
     let frames: [[Vector; 3]; LANES] = std::array::from_fn(|l| {
         if last.0 == Some(vertices[l]) {
@@ -91,16 +91,16 @@ pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32
 /// Neighbours of four vertices, each in the frame of its vertex and in units of their mean distance; shorter rings are
 /// padded with zeros.
 struct Rings {
-    local: [Vector3x4; MOST],
+    local: [Vector3x4; MAX_NEIGHBOURS],
     max_count: usize,
 }
 
 impl Rings {
     /// Writes the neighbours of a vertex into a lane; returns its mean normal and tangents.
     #[inline(always)]
-    fn add(&mut self, points: &[Point], mesh: &MeshLattice, vertex: u32, lane: usize) -> [Vector; 3] {
-        let mut ring = [0u32; MOST];
-        let count = neighbours(mesh, vertex, NEIGHBOURS, &mut ring);
+    fn add(&mut self, points: &[Point], mesh: &MeshTopology, vertex: u32, lane: usize) -> [Vector; 3] {
+        let mut ring = [0u32; MAX_NEIGHBOURS];
+        let count = collect_rings(mesh, vertex, NEIGHBOURS, &mut ring);
         let mean = mean_facet_normal(points, mesh, vertex);
         let [tu, tv] = tangents(&mean);
         let at = points[vertex as usize];
@@ -151,7 +151,7 @@ impl Rings {
             moments[(of_u + of_v) * (of_u + of_v + 1) / 2 - 3 + of_v]
         };
         let gram = std::array::from_fn(|i| std::array::from_fn(|j| moment(i, j)));
-        solve_side_by_side(gram, right)
+        solve_x4(gram, right)
     }
 }
 
@@ -179,7 +179,7 @@ fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4;
 
 /// Solves four systems for their first two unknowns, and returns true for each system that has a solution.
 #[inline(always)]
-fn solve_side_by_side<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
+fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
     let least_pivot: [f64; LANES] =
         std::array::from_fn(|l| WEAK_PIVOT * (0..N).map(|i| m[i][i].0[l]).fold(0.0, f64::max));
     let mut determined = [true; LANES];
@@ -311,23 +311,23 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
 }
 
 /// Returns at least `wanted` neighbours of a vertex, ring by ring: fewer if there are no more, and at most `MOST`.
-pub(super) fn ring_around(mesh: &MeshLattice, vertex: u32, wanted: usize) -> Vec<u32> {
-    let mut ring = [0; MOST];
-    let found = neighbours(mesh, vertex, wanted, &mut ring);
+pub(super) fn ring_around(mesh: &MeshTopology, vertex: u32, wanted: usize) -> Vec<u32> {
+    let mut ring = [0; MAX_NEIGHBOURS];
+    let found = collect_rings(mesh, vertex, wanted, &mut ring);
     ring[..found].to_vec()
 }
 
 /// Collects whole rings of neighbours around a vertex until there are at least `wanted`; returns their number.
-fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
+fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u32; MAX_NEIGHBOURS]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
         Some([first, _]) if first >= wanted => return first,
         Some([first, both]) => (first, both),
-        None => (0, add_around(mesh, vertex, vertex, ring, 0)),
+        None => (0, add_ring(mesh, vertex, vertex, ring, 0)),
     };
     while count < wanted && begin < count {
         let end = count;
         for k in begin..end {
-            count = add_around(mesh, ring[k], vertex, ring, count);
+            count = add_ring(mesh, ring[k], vertex, ring, count);
         }
         begin = end;
     }
@@ -336,9 +336,9 @@ fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; M
 
 /// Adds the neighbours of one vertex that are not in the ring yet; returns the new number.
 #[inline(always)]
-fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], mut count: usize) -> usize {
+fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIGHBOURS], mut count: usize) -> usize {
     mesh.visit_neighbours(of, |candidate| {
-        if candidate != vertex && count < MOST && !ring[..count].contains(&candidate) {
+        if candidate != vertex && count < MAX_NEIGHBOURS && !ring[..count].contains(&candidate) {
             ring[count] = candidate;
             count += 1;
         }
@@ -347,7 +347,7 @@ fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], 
 }
 
 /// Returns the unit mean of the normals of the facets around a vertex, weighted by area; z if there is none.
-fn mean_facet_normal(points: &[Point], mesh: &MeshLattice, vertex: u32) -> Vector {
+fn mean_facet_normal(points: &[Point], mesh: &MeshTopology, vertex: u32) -> Vector {
     let mut sum = Vector::zeros();
     mesh.visit_facets_around(vertex, |facet, _| {
         let [a, b, c] = mesh.corners(facet).map(|i| points[i as usize]);
@@ -376,7 +376,7 @@ mod tests {
         let z = |x: f64, y: f64| 0.4 * x - 0.2 * y + 0.05 * x * x - 0.02 * x * y + 0.01 * y * y * y;
         let at = Point::new(1.0, 2.0, z(1.0, 2.0));
         let exact = Vector::new(-(0.4 + 0.1 - 0.04), -(-0.2 - 0.02 + 0.12), 1.0).normalize();
-        let fitted = fit(at, Vector::z(), around(at, z, 24).into_iter());
+        let fitted = fit_to_neighbours(at, Vector::z(), around(at, z, 24).into_iter());
         assert!((fitted.normal - exact).norm() < 1e-12, "{}", fitted.normal);
     }
 
@@ -385,7 +385,7 @@ mod tests {
         let radius = 40.0f64;
         let z = |x: f64, y: f64| radius - (radius * radius - x * x - y * y).sqrt();
         let at = Point::new(6.0, -3.0, z(6.0, -3.0));
-        let fitted = fit(at, Vector::z(), around(at, z, 24).into_iter());
+        let fitted = fit_to_neighbours(at, Vector::z(), around(at, z, 24).into_iter());
         for k in fitted.curvatures {
             assert!((k - 1.0 / radius).abs() < 2e-5, "{k}");
         }
@@ -396,7 +396,7 @@ mod tests {
     fn the_first_direction_of_a_cylinder_is_its_axis_when_it_bulges_towards_the_normal_least() {
         // A gutter along x: it bends towards +z in y (curvature 1/20) and not at all in x.
         let z = |_x: f64, y: f64| y * y / 40.0;
-        let fitted = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 24).into_iter());
+        let fitted = fit_to_neighbours(Point::origin(), Vector::z(), around(Point::origin(), z, 24).into_iter());
         assert!(fitted.curvatures[0].abs() < 1e-12 && (fitted.curvatures[1] - 0.05).abs() < 1e-12);
         assert!(fitted.direction.x.abs() > 1.0 - 1e-12);
     }
@@ -405,26 +405,26 @@ mod tests {
     fn neighbours_that_do_not_determine_a_cubic_get_less() {
         // Points on a line do not determine even a plane: the fit returns the mean normal.
         let line = (1..30).map(|k| Point::new(f64::from(k) * 0.1, 0.0, 0.0));
-        assert_eq!(fit(Point::origin(), Vector::z(), line).normal, Vector::z());
+        assert_eq!(fit_to_neighbours(Point::origin(), Vector::z(), line).normal, Vector::z());
         // Six points: a quadric.
         let z = |x: f64, y: f64| 0.1 * x + 0.02 * x * y;
-        let few = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 6).into_iter());
+        let few = fit_to_neighbours(Point::origin(), Vector::z(), around(Point::origin(), z, 6).into_iter());
         assert!((few.normal - Vector::new(-0.1, 0.0, 1.0).normalize()).norm() < 1e-12);
-        assert_eq!(fit(Point::origin(), Vector::z(), std::iter::empty()).normal, Vector::z());
+        assert_eq!(fit_to_neighbours(Point::origin(), Vector::z(), std::iter::empty()).normal, Vector::z());
     }
 
     #[test]
     fn the_rings_are_those_of_going_round_every_neighbour() {
         let points: Vec<Point> = around(Point::origin(), |x, y| 0.1 * x * y, 600);
-        let map = crate::surface::projection::Projection::Xy.choose(&points).unwrap().1;
+        let map = crate::surface::plane_projection::PlaneProjection::Xy.choose(&points).unwrap().1;
         let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
-        let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
+        let mesh = MeshTopology::from_parts(&points, t.corners, t.neighbours).unwrap();
         let mut inside = 0;
         for v in 0..points.len() as u32 {
-            let mut plain = [0; MOST];
-            let first = add_around(&mesh, v, v, &mut plain, 0);
-            let both = (0..first).fold(first, |count, k| add_around(&mesh, plain[k], v, &mut plain, count));
-            let mut ring = [0; MOST];
+            let mut plain = [0; MAX_NEIGHBOURS];
+            let first = add_ring(&mesh, v, v, &mut plain, 0);
+            let both = (0..first).fold(first, |count, k| add_ring(&mesh, plain[k], v, &mut plain, count));
+            let mut ring = [0; MAX_NEIGHBOURS];
             let Some(counts) = mesh.two_rings(v, &mut ring) else { continue };
             inside += 1;
             assert_eq!(counts, [first, both], "{v}");
@@ -444,16 +444,16 @@ mod tests {
     fn four_normals_are_those_of_one_at_a_time() {
         let z = |x: f64, y: f64| 0.3 * x - 0.02 * x * y + 0.01 * y * y * y;
         let points: Vec<Point> = around(Point::origin(), z, 400);
-        let map = crate::surface::projection::Projection::Xy.choose(&points).unwrap().1;
+        let map = crate::surface::plane_projection::PlaneProjection::Xy.choose(&points).unwrap().1;
         let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
-        let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
+        let mesh = MeshTopology::from_parts(&points, t.corners, t.neighbours).unwrap();
         for v in 0..points.len() as u32 {
-            let four = four_normals(&points, &mesh, &[v, v / 2, v, 0]);
+            let four = fit_normals_x4(&points, &mesh, &[v, v / 2, v, 0]);
             let one = fit_to_ring(&points, &mesh, v, NEIGHBOURS).normal;
             assert!((four[0] - one).norm() < 1e-9, "{v}: {}", four[0] - one);
             // The result does not depend on the other lanes.
             assert_eq!(four[0], four[2]);
-            assert_eq!(four[0], four_normals(&points, &mesh, &[v; LANES])[3]);
+            assert_eq!(four[0], fit_normals_x4(&points, &mesh, &[v; LANES])[3]);
         }
     }
 }

@@ -4,16 +4,16 @@
 use crate::geometry::{Point, Vector};
 
 use super::error::SurfaceError;
-use super::facet::{Facet, Facets, Side, corner};
+use super::facet::{Facet, Facets, Side, offset_corner};
 use super::nominal::Nominal;
-use super::patch::{Lattice, Patch};
+use super::patch::{Topology, Patch};
 use super::simd::{dot, minus};
 
 /// Shape of the surface between the corners of a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
-pub enum Distance {
+pub enum DistanceModel {
     /// The cubic that its corners and normals define.
     #[default]
     Curved,
@@ -38,18 +38,18 @@ pub struct OffsetSurface<'a> {
     /// Distance from the nominal surface along the outward normal, in millimetres.
     radius_mm: f64,
     side: Side,
-    distance_model: Distance,
+    distance_model: DistanceModel,
     lookup: Lookup,
 }
 
 /// Start of a search for a foot: the facet where the last search ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct FacetIndex {
     patch: u32,
     facet: u32,
 }
 
-impl Place {
+impl FacetIndex {
     /// Unknown place: the search chooses its own start.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
@@ -74,9 +74,9 @@ impl Place {
 
 /// Foot of a point on the offset surface.
 #[derive(Clone, Copy, Debug)]
-pub struct Foot {
+pub struct PointProjection {
     /// Facet that holds the foot.
-    pub facet: Place,
+    pub facet: FacetIndex,
     /// Signed distance of the point from the offset surface, in millimetres; positive on the probe's side.
     pub distance_mm: f64,
     /// Unit normal at the foot, towards the probe's side.
@@ -87,7 +87,7 @@ pub struct Foot {
     pub beyond_edge_steps: f64,
 }
 
-impl Foot {
+impl PointProjection {
     /// Orders feet by their distance beyond an edge, then by the absolute distance of the point.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
         self.beyond_edge_mm.total_cmp(&other.beyond_edge_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
@@ -96,14 +96,14 @@ impl Foot {
 
 /// Largest distance beyond the edge, in steps of the sampling, at which the curved facet is continued. A foot within it
 /// counts as on the part.
-const EDGE_REACH: f64 = 0.5;
+const MAX_CONTINUATION_STEPS: f64 = 0.5;
 
 /// Maximum number of steps of a search; then it takes the facet it has reached. A search that converges needs far
 /// fewer.
-const MOST_STEPS: usize = 4096;
+const MAX_STEPS: usize = 4096;
 
 /// Weights count as inside down to this negative value.
-pub(super) const INSIDE: f64 = -1e-10;
+pub(super) const MIN_INSIDE_WEIGHT: f64 = -1e-10;
 
 impl<'a> OffsetSurface<'a> {
     /// Offsets a nominal surface by a probe radius.
@@ -116,11 +116,11 @@ impl<'a> OffsetSurface<'a> {
         if !(radius_mm >= 0.0 && radius_mm.is_finite()) {
             return Err(SurfaceError::ProbeRadius { radius_mm });
         }
-        Ok(Self { nominal, radius_mm, side, distance_model: Distance::default(), lookup: Lookup::default() })
+        Ok(Self { nominal, radius_mm, side, distance_model: DistanceModel::default(), lookup: Lookup::default() })
     }
 
     /// Sets how the surface runs between the corners.
-    pub fn with_distance_model(self, distance: Distance) -> Self {
+    pub fn with_distance_model(self, distance: DistanceModel) -> Self {
         Self { distance_model: distance, ..self }
     }
 
@@ -139,7 +139,7 @@ impl<'a> OffsetSurface<'a> {
         self.radius_mm
     }
 
-    pub(crate) fn distance_model(&self) -> Distance {
+    pub(crate) fn distance_model(&self) -> DistanceModel {
         self.distance_model
     }
 
@@ -154,7 +154,7 @@ impl<'a> OffsetSurface<'a> {
 
     /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square with the area of two
     /// of its facets.
-    pub(crate) fn spacing_mm(&self, place: Place) -> f64 {
+    pub(crate) fn spacing_mm(&self, place: FacetIndex) -> f64 {
         let patch = &self.nominal.patches()[place.patch as usize];
         let [a, b, c] = patch.corners(place.facet).map(|v| *patch.point(v));
         (b - a).cross(&(c - a)).norm().sqrt()
@@ -165,7 +165,7 @@ impl<'a> OffsetSurface<'a> {
     /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
     /// plane at the nearest point of the edge.
     #[inline]
-    pub fn project(&self, p: &Point, start: Place) -> Foot {
+    pub fn project(&self, p: &Point, start: FacetIndex) -> PointProjection {
         match self.nominal.patches() {
             [only] => self.project_onto_patch(only, 0, p, start),
             patches => self.nearest_projection(patches, p, start),
@@ -177,18 +177,18 @@ impl<'a> OffsetSurface<'a> {
     ///
     /// The offsets of patches that only touch leave a gap over a convex seam. If a foot is slightly beyond two patches
     /// at about the same height, it lies in that gap, and therefore on the part.
-    fn nearest_projection(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
-        let feet: Vec<Foot> =
+    fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
+        let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
-        let best = feet.iter().copied().min_by(Foot::by_nearness).expect("a nominal surface has at least one patch");
-        let is_at_seam = |other: &Foot| {
+        let best = feet.iter().copied().min_by(PointProjection::by_nearness).expect("a nominal surface has at least one patch");
+        let is_at_seam = |other: &PointProjection| {
             let apart_mm = (other.distance_mm - best.distance_mm).abs();
             other.facet.patch != best.facet.patch
-                && other.beyond_edge_steps <= EDGE_REACH
-                && apart_mm <= EDGE_REACH * self.spacing_mm(best.facet)
+                && other.beyond_edge_steps <= MAX_CONTINUATION_STEPS
+                && apart_mm <= MAX_CONTINUATION_STEPS * self.spacing_mm(best.facet)
         };
-        if best.beyond_edge_steps > 0.0 && best.beyond_edge_steps <= EDGE_REACH && feet.iter().any(is_at_seam) {
-            return Foot { beyond_edge_mm: 0.0, beyond_edge_steps: 0.0, ..best };
+        if best.beyond_edge_steps > 0.0 && best.beyond_edge_steps <= MAX_CONTINUATION_STEPS && feet.iter().any(is_at_seam) {
+            return PointProjection { beyond_edge_mm: 0.0, beyond_edge_steps: 0.0, ..best };
         }
         best
     }
@@ -199,20 +199,20 @@ impl<'a> OffsetSurface<'a> {
     /// A search walks downhill. In a gutter that starts from the wrong wall, it ends at a foot on the other side, where
     /// no neighbour is nearer.
     #[cold]
-    pub(crate) fn project_without_start(&self, p: &Point) -> Foot {
+    pub(crate) fn project_without_start(&self, p: &Point) -> PointProjection {
         let found = self
             .nominal
             .facets_near(p)
             .map(|start| self.project_onto_patch(&self.nominal.patches()[start.patch as usize], start.patch, p, start));
-        found.min_by(Foot::by_nearness).unwrap_or_else(|| self.project(p, Place::UNKNOWN))
+        found.min_by(PointProjection::by_nearness).unwrap_or_else(|| self.project(p, FacetIndex::UNKNOWN))
     }
 
     #[inline]
-    fn project_onto_patch(&self, patch: &Patch, number: u32, p: &Point, start: Place) -> Foot {
+    fn project_onto_patch(&self, patch: &Patch, number: u32, p: &Point, start: FacetIndex) -> PointProjection {
         let start = if start.patch == number { start.facet } else { u32::MAX };
         match &patch.topology {
-            Lattice::Grid(grid) => self.search_projection(patch, grid, number, p, start),
-            Lattice::Mesh(mesh) => self.search_projection(patch, mesh, number, p, start),
+            Topology::Grid(grid) => self.search_projection(patch, grid, number, p, start),
+            Topology::Mesh(mesh) => self.search_projection(patch, mesh, number, p, start),
         }
     }
 
@@ -225,7 +225,7 @@ impl<'a> OffsetSurface<'a> {
             return facet;
         }
         let mut before = u32::MAX;
-        for _ in 0..MOST_STEPS {
+        for _ in 0..MAX_STEPS {
             let [a, b, c] = facets.corners(facet).map(|v| *patch.point(v));
             let (e1, e2) = (b - a, c - a);
             let turned = e1.cross(&e2);
@@ -243,19 +243,19 @@ impl<'a> OffsetSurface<'a> {
     }
 
     /// Finds a facet of the first patch near the foot of a point, without fitting its normals.
-    pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
-        Place { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
+    pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: FacetIndex) -> FacetIndex {
+        FacetIndex { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
     /// Walks from facet to facet until one holds the foot, then measures the distance there.
     #[inline]
-    fn search_projection<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
+    fn search_projection<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> PointProjection {
         let mut facet = self.approach(patch, facets, p, start);
         let mut before = u32::MAX;
-        for _ in 0..MOST_STEPS {
+        for _ in 0..MAX_STEPS {
             let here = self.facet(patch, facets.corners(facet));
             let weights = self.weights(&here, p);
-            let inside = weights[0].min(weights[1]).min(weights[2]) >= INSIDE;
+            let inside = weights[0].min(weights[1]).min(weights[2]) >= MIN_INSIDE_WEIGHT;
             let next = if inside { None } else { facets.advance(facet, &weights) };
             match next {
                 // Two facets point at each other: the foot lies on their common edge, in the gap between the prisms
@@ -266,14 +266,14 @@ impl<'a> OffsetSurface<'a> {
                 }
                 _ => {
                     // At the border this holds only along the common edge: a foot beyond a border edge is not inside.
-                    let is_beyond = |k: usize| weights[k] < INSIDE && facets.ends_at(facet, k);
+                    let is_beyond = |k: usize| weights[k] < MIN_INSIDE_WEIGHT && facets.ends_at(facet, k);
                     let inside = inside || next.is_some() && !(0..3).any(is_beyond);
-                    return self.project_in_facet(&here, p, weights, inside, Place { patch: number, facet });
+                    return self.project_in_facet(&here, p, weights, inside, FacetIndex { patch: number, facet });
                 }
             }
         }
         let here = self.facet(patch, facets.corners(facet));
-        self.project_in_facet(&here, p, self.weights(&here, p), true, Place { patch: number, facet })
+        self.project_in_facet(&here, p, self.weights(&here, p), true, FacetIndex { patch: number, facet })
     }
 
     /// Returns a facet with its corners on the offset surface.
@@ -281,7 +281,7 @@ impl<'a> OffsetSurface<'a> {
     fn facet(&self, patch: &Patch, corners: [u32; 3]) -> Facet<f64> {
         let sign = self.side.sign();
         let [a, b, c] = corners.map(|k| patch.vertex(k)).map(|v| (v.point.coords.into(), v.normal.into()));
-        Facet::new([a, b, c].map(|vertex| corner(vertex, sign, self.radius_mm)), sign)
+        Facet::new([a, b, c].map(|vertex| offset_corner(vertex, sign, self.radius_mm)), sign)
     }
 
     /// Returns the barycentric weights of the foot on the plane of the flat facet.
@@ -295,24 +295,24 @@ impl<'a> OffsetSurface<'a> {
     }
 
     #[inline(always)]
-    fn project_in_facet(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: Place) -> Foot {
+    fn project_in_facet(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: FacetIndex) -> PointProjection {
         let w = facet.vector_from_corner(0, &p.coords.into());
         let (mut beyond_mm, mut beyond_steps) = (0.0, 0.0);
         if !inside {
-            let clamped = clamped(facet, &p.coords.into(), &weights);
+            let clamped = clamped_weights(facet, &p.coords.into(), &weights);
             let beyond = minus(&facet.point(&clamped), &facet.point(&weights));
             beyond_mm = dot(&beyond, &beyond).sqrt();
             beyond_steps = beyond_mm / facet.area_normal_squared.sqrt().sqrt();
-            if beyond_steps > EDGE_REACH {
+            if beyond_steps > MAX_CONTINUATION_STEPS {
                 let (distance_mm, normal) = self.tangent_plane_distance(facet, p, &clamped);
-                return Foot { facet: place, distance_mm, normal, beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps };
+                return PointProjection { facet: place, distance_mm, normal, beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps };
             }
         }
         let (distance_mm, normal) = match self.distance_model {
-            Distance::Triangle => facet.flat_distance(&w),
-            Distance::Curved => facet.curved_distance(&w, &weights),
+            DistanceModel::Triangle => facet.flat_distance(&w),
+            DistanceModel::Curved => facet.curved_distance(&w, &weights),
         };
-        Foot { facet: place, distance_mm, normal: normal.into(), beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps }
+        PointProjection { facet: place, distance_mm, normal: normal.into(), beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps }
     }
 
     /// Returns the distance from the tangent plane at a place of the edge, and the normal of that plane.
@@ -320,15 +320,15 @@ impl<'a> OffsetSurface<'a> {
     fn tangent_plane_distance(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
         let (on_flat, flat) = (Vector::from(facet.point(at)), Vector::from(facet.flat_normal()));
         let (anchor, normal) = match self.distance_model {
-            Distance::Triangle => (on_flat, flat),
-            Distance::Curved => (on_flat + flat * facet.height(at), facet.normal(at).into()),
+            DistanceModel::Triangle => (on_flat, flat),
+            DistanceModel::Curved => (on_flat + flat * facet.height(at), facet.normal(at).into()),
         };
         ((p.coords - anchor).dot(&normal), normal)
     }
 }
 
 /// Returns the weights of the nearest place of a facet for a point that lies beyond its most negative edge.
-fn clamped(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+fn clamped_weights(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);
     let edge = facet.edge(i, j);

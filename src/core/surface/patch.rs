@@ -11,25 +11,25 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Vector};
 
 use super::facet::{Facets, Vertex};
-use super::grid::GridLattice;
-use super::mesh::MeshLattice;
+use super::grid_topology::GridTopology;
+use super::mesh_topology::MeshTopology;
 use super::normals;
 use super::simd::LANES;
 
 /// Smooth piece of surface that one lattice of triangles covers.
 #[derive(Debug)]
 pub(crate) struct Patch {
-    pub(crate) topology: Lattice,
+    pub(crate) topology: Topology,
     vertices: Vertices,
 }
 
 /// Triangles of a patch.
 #[derive(Debug)]
-pub(crate) enum Lattice {
+pub(crate) enum Topology {
     /// Two triangles per cell, by arithmetic.
-    Grid(GridLattice),
+    Grid(GridTopology),
     /// Triangles and their neighbours in flat arrays.
-    Mesh(MeshLattice),
+    Mesh(MeshTopology),
 }
 
 #[derive(Debug)]
@@ -40,22 +40,22 @@ enum Vertices {
 
 impl Patch {
     /// Makes a patch from a grid and its nodes, whose normals are all known.
-    pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridLattice) -> Self {
-        Self { topology: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
+    pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridTopology) -> Self {
+        Self { topology: Topology::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
     /// Returns the number of triangles of a mesh that has no border; `None` for other patches.
     pub(crate) fn closed_triangles(&self) -> Option<usize> {
         match &self.topology {
-            Lattice::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
+            Topology::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
             _ => None,
         }
     }
 
     /// Makes a patch from a mesh whose normals are fitted when a triangle is first touched.
-    pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
+    pub(crate) fn mesh(points: Vec<Point>, lattice: MeshTopology) -> Self {
         let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
-        Self { topology: Lattice::Mesh(lattice), vertices: Vertices::Lazy(points, cells) }
+        Self { topology: Topology::Mesh(lattice), vertices: Vertices::Lazy(points, cells) }
     }
 
     /// Returns the number of vertices, holes of a grid included.
@@ -98,11 +98,11 @@ impl Patch {
     pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
         let n = self.len();
         let (columns, step_i, step_j) = match &self.topology {
-            Lattice::Grid(grid) => {
+            Topology::Grid(grid) => {
                 let step = ((n as f64 / count as f64).sqrt() as usize).clamp(1, grid.columns().min(grid.rows()) / 3);
                 (grid.columns(), step, step)
             }
-            Lattice::Mesh(_) => (n, n.div_ceil(count), 1),
+            Topology::Mesh(_) => (n, n.div_ceil(count), 1),
         };
         (0..n / columns)
             .step_by(step_j)
@@ -113,8 +113,8 @@ impl Patch {
     /// Returns a facet at a vertex, or near a vertex that has no facet.
     pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
         match &self.topology {
-            Lattice::Grid(grid) => grid.facet_near(vertex),
-            Lattice::Mesh(mesh) => mesh.start(self.point(vertex)),
+            Topology::Grid(grid) => grid.facet_near(vertex),
+            Topology::Mesh(mesh) => mesh.start(self.point(vertex)),
         }
     }
 
@@ -142,8 +142,8 @@ impl Patch {
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.topology {
-            Lattice::Mesh(mesh) => pulp::Arch::new().dispatch(Four { patch: self, mesh, vertices: [vertex; LANES] })[0],
-            Lattice::Grid(_) => unreachable!("a grid has its normals ready"),
+            Topology::Mesh(mesh) => pulp::Arch::new().dispatch(NormalFitX4 { patch: self, mesh, vertices: [vertex; LANES] })[0],
+            Topology::Grid(_) => unreachable!("a grid has its normals ready"),
         }
     }
 
@@ -152,13 +152,13 @@ impl Patch {
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
         /// Number of vertices per task.
         const CHUNK: usize = 256;
-        let (Vertices::Lazy(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.topology) else { return };
+        let (Vertices::Lazy(_, cells), Topology::Mesh(mesh)) = (&self.vertices, &self.topology) else { return };
         let arch = pulp::Arch::new();
         vertices.par_chunks(CHUNK).for_each(|chunk| {
             let unknown: Vec<u32> = chunk.iter().copied().filter(|&v| cells[v as usize].get().is_none()).collect();
             for few in unknown.chunks(LANES) {
                 let vertices = std::array::from_fn(|l| few[l.min(few.len() - 1)]);
-                let normals = arch.dispatch(Four { patch: self, mesh, vertices });
+                let normals = arch.dispatch(NormalFitX4 { patch: self, mesh, vertices });
                 for (&vertex, normal) in few.iter().zip(normals) {
                     cells[vertex as usize].set(normal);
                 }
@@ -169,26 +169,26 @@ impl Patch {
     /// Returns the corners of a facet that exists.
     pub(crate) fn corners(&self, facet: u32) -> [u32; 3] {
         match &self.topology {
-            Lattice::Grid(grid) => grid.corners(facet),
-            Lattice::Mesh(mesh) => mesh.corners(facet),
+            Topology::Grid(grid) => grid.corners(facet),
+            Topology::Mesh(mesh) => mesh.corners(facet),
         }
     }
 }
 
 /// Fit of the normals of four vertices, in a form that is compiled once for each set of vector instructions.
-struct Four<'a> {
+struct NormalFitX4<'a> {
     patch: &'a Patch,
-    mesh: &'a MeshLattice,
+    mesh: &'a MeshTopology,
     vertices: [u32; LANES],
 }
 
-impl pulp::NullaryFnOnce for Four<'_> {
+impl pulp::NullaryFnOnce for NormalFitX4<'_> {
     type Output = [Vector; LANES];
 
     // This must be inlined into the caller that has the instructions: a function that is called runs code without them.
     #[inline(always)]
     fn call(self) -> Self::Output {
-        normals::four_normals(self.patch.mesh_points(), self.mesh, &self.vertices)
+        normals::fit_normals_x4(self.patch.mesh_points(), self.mesh, &self.vertices)
     }
 }
 

@@ -8,8 +8,8 @@ use rayon::prelude::*;
 use crate::geometry::Point;
 
 use super::facet::Facets;
-use super::offset::{OffsetSurface, Place};
-use super::patch::Lattice;
+use super::offset::{OffsetSurface, FacetIndex};
+use super::patch::Topology;
 
 /// Number of points per task.
 const CHUNK: usize = 512;
@@ -25,22 +25,22 @@ impl OffsetSurface<'_> {
 
     /// Fits the normals that the feet of some points in the model frame will need, all together. Returns a start place
     /// for each point. Returns an empty list if the normals are ready already, or if there are several patches.
-    pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<Place> {
+    pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<FacetIndex> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
-        let Lattice::Mesh(mesh) = &patch.topology else { return Vec::new() };
-        let walk = |chunk: &[Point]| -> Vec<Place> {
-            let mut last = (Place::UNKNOWN, Point::origin(), 0.0);
+        let Topology::Mesh(mesh) = &patch.topology else { return Vec::new() };
+        let walk = |chunk: &[Point]| -> Vec<FacetIndex> {
+            let mut last = (FacetIndex::UNKNOWN, Point::origin(), 0.0);
             let mut found = Vec::with_capacity(chunk.len());
             for p in chunk {
                 let (place, from, reach_mm) = last;
-                let near = place != Place::UNKNOWN && (p - from).norm_squared() < reach_mm * reach_mm;
-                let place = self.facet_near(patch, mesh, p, if near { place } else { Place::UNKNOWN });
+                let near = place != FacetIndex::UNKNOWN && (p - from).norm_squared() < reach_mm * reach_mm;
+                let place = self.facet_near(patch, mesh, p, if near { place } else { FacetIndex::UNKNOWN });
                 last = (place, *p, NEAR_STEPS * self.spacing_mm(place));
                 found.push(place);
             }
             found
         };
-        let places: Vec<Place> = points.par_chunks(CHUNK).flat_map_iter(walk).collect();
+        let places: Vec<FacetIndex> = points.par_chunks(CHUNK).flat_map_iter(walk).collect();
         let mut touched: Vec<u32> = places.par_iter().flat_map_iter(|place| mesh.corners(place.facet())).collect();
         touched.par_sort_unstable();
         touched.dedup();

@@ -16,7 +16,7 @@ use super::lines::ReceivedLine;
 use super::list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
 use crate::words::{Job, Outcome, State, hex};
-use regrind_formats::AddedLines;
+use regrind_formats::JsonlAppender;
 
 /// Number of refused lines kept for a person: the last ones.
 const MAX_REFUSED_SHOWN: usize = 4;
@@ -39,7 +39,7 @@ pub(super) struct RequestedMeasurement {
     pub(super) plan_identity: [u8; 32],
     pub(super) list: TargetList,
     /// File that stores each line as it came.
-    pub(super) line_log: Option<AddedLines>,
+    pub(super) line_log: Option<JsonlAppender>,
     pub(super) begun: Instant,
     pub(super) last_line: Instant,
     /// Number of lines since it began.
@@ -89,7 +89,7 @@ impl RequestedMeasurement {
         (job, sequence): (Job, u32),
         plan_identity: [u8; 32],
         list: TargetList,
-        kept: Option<AddedLines>,
+        kept: Option<JsonlAppender>,
     ) -> Self {
         let (now, refused) = (Instant::now(), VecDeque::new());
         Self {
@@ -109,7 +109,7 @@ impl RequestedMeasurement {
     fn log_line(&self, line: &str, target: Option<u32>, passed_over: Option<&str>, refused: Option<&str>) {
         let at_s = self.begun.elapsed().as_secs_f64();
         if let Some(kept) = &self.line_log {
-            kept.add(&LoggedLine { at_s, line, target, passed_over, refused });
+            kept.append(&LoggedLine { at_s, line, target, passed_over, refused });
         }
     }
 

@@ -24,7 +24,7 @@ use crate::words::{
     Answer, Armed, Command, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, State,
     Status, digest, hex,
 };
-use regrind_formats::{AddedLines, FormatError, ResultFolder, write_atomic};
+use regrind_formats::{JsonlAppender, FormatError, ResultFolder, write_atomic};
 
 /// Measuring machine that prints a line for each hit.
 #[derive(Debug)]
@@ -202,12 +202,12 @@ fn batch_suffix(job: Job) -> String {
 }
 
 /// Writes the list into the folder of the run, and opens the file that stores the lines.
-fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<AddedLines, FormatError> {
+fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<JsonlAppender, FormatError> {
     let path = settings.run_folder.join(plan_file(job));
     ResultFolder::prepare(path.parent().unwrap_or(&settings.run_folder))?.keep();
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
     write_atomic(&path, text.as_bytes())?;
-    AddedLines::open(&settings.run_folder.join(hits_file(job)))
+    JsonlAppender::open(&settings.run_folder.join(hits_file(job)))
 }
 
 /// Writes the list where the machine's part program reads it.

@@ -19,13 +19,13 @@ use super::check::Check;
 use super::control::{AXES, Act, Control, all};
 use super::map::{MapBase, ProgramMap, identity_in};
 use super::number::{push_fixed, rounded};
-use super::read::{Block, Refusal, Word, block};
+use super::read::{Block, Refusal, GcodeWord, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
 use crate::is_same_file;
 use crate::registration::Draft;
 use crate::whole::read_whole;
-use regrind_core::compensation::path::{Field, Wanted, displaced};
+use regrind_core::compensation::path::{HeightField, TargetSurface, ball_displacement};
 use regrind_core::geometry::{Point, Vector};
 
 /// Largest program that is read, in bytes.
@@ -35,7 +35,7 @@ const MOST_POINTS: f64 = 2e6;
 
 /// Maximum share of a program that can lie outside the map; a larger share means that the map belongs to another
 /// program or has another unit.
-const MOST_BESIDE: f64 = 0.95;
+const MAX_SHARE_OUTSIDE_MAP: f64 = 0.95;
 
 /// An arc stays an arc if its ends are displaced equally to within this, in millimetres.
 const MOST_WOUND_MM: f64 = 1e-3;
@@ -47,7 +47,7 @@ const ROUNDING_MM: f64 = 2e-6;
 pub struct Amendment<'a> {
     /// Displacement of the surface along its normal over x and y in the program's frame, in millimetres; positive away
     /// from the part.
-    pub shift: &'a Field,
+    pub shift: &'a HeightField,
     /// Nominal surface, for a ball that grinds it; `None` to move the program's points along z.
     pub along_normals: Option<AlongNormals<'a>>,
     /// Maximum distance between the new program and the corrected path, in millimetres.
@@ -57,14 +57,14 @@ pub struct Amendment<'a> {
     /// Factor by which the map was multiplied.
     pub gain: f64,
     /// Maximum displacement of a point, in millimetres; a larger one is rejected.
-    pub largest_mm: f64,
+    pub max_shift_mm: f64,
 }
 
 /// The nominal surface under a program, for corrections along its normals.
 #[derive(Clone, Copy, Debug)]
 pub struct AlongNormals<'a> {
     /// The nominal surface, without a correction.
-    pub nominal: &'a Wanted,
+    pub nominal: &'a TargetSurface,
     /// Height of the ball's centre above the program's point: 0 if the program moves the centre, the radius if it moves
     /// the tip.
     pub centre_above_mm: f64,
@@ -147,7 +147,7 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
             "check that it is the program of the pass",
         ));
     }
-    if done.beside_map_mm > MOST_BESIDE * done.feed_mm {
+    if done.beside_map_mm > MAX_SHARE_OUTSIDE_MAP * done.feed_mm {
         let over_mm = done.feed_mm - done.beside_map_mm;
         let what = format!("only {over_mm:.3} mm of {:.3} mm at feed lie over the map", done.feed_mm);
         let remedy =
@@ -290,7 +290,7 @@ impl<'a> Rewriter<'a> {
             self.text.push(b'\n');
             return Ok(());
         }
-        let act = self.control.take(block)?;
+        let act = self.control.execute_block(block)?;
         // If a word of this line makes the position of an axis unknown, it is unknown in the corrected program too.
         (0..3).filter(|&k| self.control.at[k].is_none()).for_each(|k| self.actual[k] = None);
         self.copy_words(block, |w| !is_of_the_move(w, &act) && !takes_effect_after(w));
@@ -339,7 +339,7 @@ impl<'a> Rewriter<'a> {
         }
         let begin = self.text.len();
         let by = by.map(|motion| format!("G{motion}"));
-        let words = |wanted: fn(&Word) -> bool| block.words.iter().filter(move |w| wanted(w)).map(|w| w.text);
+        let words = |wanted: fn(&GcodeWord) -> bool| block.words.iter().filter(move |w| wanted(w)).map(|w| w.text);
         let axes = words(|w| AXES.contains(&w.letter));
         for piece in words(is_machine).chain(by.as_deref()).chain(axes) {
             if self.text.len() > begin {
@@ -389,7 +389,7 @@ impl<'a> Rewriter<'a> {
             }
             None => {
                 let allowed = if is_arc { 0.6 * tolerance } else { 0.85 * tolerance };
-                for k in kept(&corrected, allowed) {
+                for k in simplified_indices(&corrected, allowed) {
                     self.point(&corrected[k]);
                 }
             }
@@ -431,7 +431,7 @@ impl<'a> Rewriter<'a> {
     /// Records the displacement of a move and its length outside the map; rejects a displacement above the limit.
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
-        if largest_mm > self.amendment.largest_mm {
+        if largest_mm > self.amendment.max_shift_mm {
             let found = format!("the map would move the tool by {:.1} µm", 1e3 * largest_mm);
             return Err((found, "check that it is the right map in the right unit, or raise --max-correction-um"));
         }
@@ -492,7 +492,7 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    fn copy_words(&mut self, block: &Block, wanted: impl Fn(&Word) -> bool) {
+    fn copy_words(&mut self, block: &Block, wanted: impl Fn(&GcodeWord) -> bool) {
         let begin = self.text.len();
         let words = block.words.iter().filter(|w| wanted(w)).map(|w| w.text);
         for piece in words.chain(block.comments.iter().copied()) {
@@ -512,7 +512,7 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
     let shift = amendment.shift;
     let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
     let centre = at + Vector::z() * along.centre_above_mm;
-    displaced(along.nominal, shift, &centre).ok_or_else(|| {
+    ball_displacement(along.nominal, shift, &centre).ok_or_else(|| {
         let found = format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
         let remedy = "normals cross high above a concave part: go down by G0 and begin the move at feed nearer to \
                       the part; otherwise check that the program is in the frame of the nominal surface, and that \
@@ -522,7 +522,7 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
 }
 
 /// Returns true for words that every move writes itself, and for line numbers, which would otherwise occur twice.
-fn is_of_the_move(word: &Word, act: &Act) -> bool {
+fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
         // In a line without an arc, R and P belong to another word.
@@ -533,21 +533,21 @@ fn is_of_the_move(word: &Word, act: &Act) -> bool {
 }
 
 /// Returns true if a word turns the move of its line into one in machine coordinates.
-fn is_machine(word: &Word) -> bool {
+fn is_machine(word: &GcodeWord) -> bool {
     word.letter == b'G' && [28.0, 30.0, 53.0].contains(&word.value)
 }
 
-fn is_turning(word: &Word) -> bool {
+fn is_turning(word: &GcodeWord) -> bool {
     matches!(word.letter, b'A' | b'B' | b'C')
 }
 
-fn takes_effect_after(word: &Word) -> bool {
+fn takes_effect_after(word: &GcodeWord) -> bool {
     word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
 }
 
 /// Returns the indices of the points to write, without the first, so that the lines between them stay within the
 /// tolerance of all points (Douglas and Peucker).
-fn kept(points: &[Point], tolerance: f64) -> Vec<usize> {
+fn simplified_indices(points: &[Point], tolerance: f64) -> Vec<usize> {
     let mut kept = Vec::new();
     let mut open = vec![(0, points.len() - 1)];
     while let Some((from, to)) = open.pop() {

@@ -42,7 +42,7 @@ struct Machine {
 
 /// Movement of one line.
 #[derive(Debug)]
-enum Way {
+enum Movement {
     /// Rapid move, not at feed: its end position, as far as it is known.
     Rapid([Option<f64>; 3]),
     /// Move in machine coordinates: its motion, whether it is incremental, and its words.
@@ -61,7 +61,7 @@ struct Round {
     angle: f64,
 }
 
-impl Way {
+impl Movement {
     fn at(&self, share: f64) -> Point {
         match self {
             Self::Straight(from, to) => from + (to - from) * share,
@@ -103,7 +103,7 @@ impl Round {
 
 impl Machine {
     /// Reads a line.
-    fn read(&mut self, block: &Block) -> Result<Option<Way>, String> {
+    fn read(&mut self, block: &Block) -> Result<Option<Movement>, String> {
         if self.over {
             return Ok(None);
         }
@@ -139,7 +139,7 @@ impl Machine {
             let alone = named.iter().all(Option::is_none);
             (0..3).filter(|&k| alone || named[k].is_some()).for_each(|k| self.at[k] = None);
             let by = self.motion.filter(|_| *code == 530);
-            return Ok(Some(Way::Machine(by, self.by_distance, format!("{code} {named:?} {scale}"))));
+            return Ok(Some(Movement::Machine(by, self.by_distance, format!("{code} {named:?} {scale}"))));
         }
         let offsets = [number(b'I'), number(b'J'), number(b'K')];
         let around = offsets.iter().any(Option::is_some) && matches!(self.motion, Some(2 | 3));
@@ -155,14 +155,14 @@ impl Machine {
         }
         let from = std::mem::replace(&mut self.at, to);
         match self.motion.ok_or("axes without a motion")? {
-            0 => Ok(Some(Way::Rapid([0, 1, 2].map(|k| to[k].filter(|_| named[k].is_some()))))),
+            0 => Ok(Some(Movement::Rapid([0, 1, 2].map(|k| to[k].filter(|_| named[k].is_some()))))),
             motion => {
                 let whole = |of: [Option<f64>; 3]| Some(Point::new(of[0]?, of[1]?, of[2]?));
                 let (from, to) = whole(from).zip(whole(to)).ok_or("a move at feed from an unknown place")?;
                 if motion == 1 {
-                    return Ok(Some(Way::Straight(from, to)));
+                    return Ok(Some(Movement::Straight(from, to)));
                 }
-                self.round((from, to), motion == 3, offsets, number(b'R'), scale).map(|round| Some(Way::Round(round)))
+                self.round((from, to), motion == 3, offsets, number(b'R'), scale).map(|round| Some(Movement::Round(round)))
             }
         }
     }
@@ -253,20 +253,20 @@ impl<'a> Check<'a> {
         self.same_state()?;
         match (wanted, &ways[..]) {
             (None, []) => Ok(()),
-            (Some(Way::Rapid(to)), [Way::Rapid(found)]) => {
+            (Some(Movement::Rapid(to)), [Movement::Rapid(found)]) => {
                 let same = |k: usize| match (to[k], found[k]) {
                     (Some(a), Some(b)) => (a - b).abs() <= DIGITS_MM,
                     (a, b) => a == b,
                 };
                 if (0..3).all(same) { Ok(()) } else { Err(format!("a rapid move to {found:?}, not to {to:?}")) }
             }
-            (Some(Way::Machine(by, distance, what)), [Way::Machine(found_by, found_distance, found)])
+            (Some(Movement::Machine(by, distance, what)), [Movement::Machine(found_by, found_distance, found)])
                 if by == *found_by && distance == *found_distance && what == *found =>
             {
                 Ok(())
             }
-            (Some(way @ (Way::Straight(..) | Way::Round(_))), [_, ..])
-                if ways.iter().all(|way| matches!(way, Way::Straight(..) | Way::Round(_))) =>
+            (Some(way @ (Movement::Straight(..) | Movement::Round(_))), [_, ..])
+                if ways.iter().all(|way| matches!(way, Movement::Straight(..) | Movement::Round(_))) =>
             {
                 self.along(&way, &ways)
             }
@@ -288,7 +288,7 @@ impl<'a> Check<'a> {
     }
 
     /// Checks that the corrected moves follow the base path displaced by the map, in order and without a detour.
-    fn along(&self, way: &Way, found: &[Way]) -> Result<(), String> {
+    fn along(&self, way: &Movement, found: &[Movement]) -> Result<(), String> {
         let allowed = self.amendment.tolerance_mm + DIGITS_MM;
         let at = |share: f64| {
             let base = way.at(share);
@@ -311,8 +311,8 @@ impl<'a> Check<'a> {
             let wanted = at(share)?;
             length += off(before, wanted);
             before = wanted;
-            let away = |way: &Way| match way {
-                Way::Straight(from, to) => beside(*from, *to, wanted),
+            let away = |way: &Movement| match way {
+                Movement::Straight(from, to) => distance_to_segment(*from, *to, wanted),
                 // An arc that stayed an arc is compared at the same share of its length.
                 round => off(round.at(share), wanted),
             };
@@ -320,12 +320,12 @@ impl<'a> Check<'a> {
                 k += 1;
             }
             // A straight move down to the part can begin where the rapid move ended.
-            let reaches = away(&found[k]).min(beside(first, begin, wanted));
+            let reaches = away(&found[k]).min(distance_to_segment(first, begin, wanted));
             if reaches > allowed {
                 return Err(format!("it is {reaches:.6} mm from the position by the map"));
             }
         }
-        let written: f64 = found.iter().map(Way::length).sum();
+        let written: f64 = found.iter().map(Movement::length).sum();
         // The chords between the samples are shorter than an arc.
         let longest = length.max(way.length()) + off(first, begin) + 4.0 * allowed;
         if written > longest * (1.0 + 1e-6) {
@@ -336,7 +336,7 @@ impl<'a> Check<'a> {
 }
 
 /// Returns the distance of a point from a straight segment between two points.
-fn beside(from: Point, to: Point, point: Point) -> f64 {
+fn distance_to_segment(from: Point, to: Point, point: Point) -> f64 {
     let (along, arm) = (to - from, point - from);
     let length2 = along.norm_squared();
     let share = if length2 > 0.0 { (arm.dot(&along) / length2).clamp(0.0, 1.0) } else { 0.0 };

@@ -4,8 +4,8 @@
 //! another tool length makes Z unknown, another zero makes all axes unknown.
 
 use super::arc::{Arc, Centre, Plane};
-use super::number::LARGEST_MM;
-use super::read::{Block, Refusal, Word};
+use super::number::MAX_COORDINATE_MM;
+use super::read::{Block, Refusal, GcodeWord};
 use regrind_core::geometry::Point;
 
 pub(super) const INCH_MM: f64 = 25.4;
@@ -66,7 +66,7 @@ pub(super) struct Control {
 
 /// Requests of the words of a line.
 #[derive(Default)]
-struct Asked {
+struct BlockRequests {
     motion: Option<u8>,
     dwell: bool,
     machine: bool,
@@ -94,7 +94,7 @@ impl Control {
     }
 
     /// Reads a line, updates the state and returns the action of the line.
-    pub(super) fn take(&mut self, block: &Block) -> Result<Act, Refusal> {
+    pub(super) fn execute_block(&mut self, block: &Block) -> Result<Act, Refusal> {
         let asked = self.states(block)?;
         (0..3).filter(|&k| asked.forgets[k]).for_each(|k| self.at[k] = None);
         let turned = self.turning(block, &asked)?;
@@ -140,9 +140,9 @@ impl Control {
     }
 
     /// Applies the modal words of a line; rejects words that move the tool in another way.
-    fn states(&mut self, block: &Block) -> Result<Asked, Refusal> {
-        let mut asked = Asked::default();
-        let is_move = |word: &&Word| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
+    fn states(&mut self, block: &Block) -> Result<BlockRequests, Refusal> {
+        let mut asked = BlockRequests::default();
+        let is_move = |word: &&GcodeWord| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
         asked.motion = block.words.iter().find(is_move).map(|word| word.value as u8);
         for word in &block.words {
             match word.letter {
@@ -160,7 +160,7 @@ impl Control {
         Ok(asked)
     }
 
-    fn g(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+    fn g(&mut self, word: &GcodeWord, asked: &mut BlockRequests) -> Result<(), Refusal> {
         match tenths(word).ok_or_else(|| (format!("{} is unknown", word.text), "correct the number"))? {
             code @ (0 | 10 | 20 | 30) => {
                 (self.motion, asked.motion) = (Some((code / 10) as u8), Some((code / 10) as u8));
@@ -215,7 +215,7 @@ impl Control {
         Ok(())
     }
 
-    fn choose_system(&mut self, code: i64, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+    fn choose_system(&mut self, code: i64, word: &GcodeWord, asked: &mut BlockRequests) -> Result<(), Refusal> {
         let same = self.system == Some(code);
         if !same && self.moved {
             let remedy = "a map belongs to one zero: divide the program";
@@ -226,7 +226,7 @@ impl Control {
         Ok(())
     }
 
-    fn m(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+    fn m(&mut self, word: &GcodeWord, asked: &mut BlockRequests) -> Result<(), Refusal> {
         match word.value {
             v if v == 2.0 || v == 30.0 => self.ended = true,
             // The tool moves to the place where the machine changes it.
@@ -247,7 +247,7 @@ impl Control {
     /// valid.
     ///
     /// Returns the word of the first rotary axis, and whether one of the axes can turn now.
-    fn turning<'w>(&mut self, block: &'w Block, asked: &Asked) -> Result<Option<(&'w Word<'w>, bool)>, Refusal> {
+    fn turning<'w>(&mut self, block: &'w Block, asked: &BlockRequests) -> Result<Option<(&'w GcodeWord<'w>, bool)>, Refusal> {
         let mut first = None;
         for word in &block.words {
             let Some(k) = TURNING.iter().position(|letter| *letter == word.letter) else { continue };
@@ -264,7 +264,7 @@ impl Control {
     }
 
     /// Processes a move that the program gives in machine coordinates: the positions of its axes are unknown after it.
-    fn machine(&mut self, asked: &Asked, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
+    fn machine(&mut self, asked: &BlockRequests, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
         if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
             return Err((
                 "G53 is used with an arc, without a move or in G91".into(),
@@ -293,8 +293,8 @@ impl Control {
             } else {
                 value
             };
-            if to.abs() > LARGEST_MM {
-                let found = format!("{} goes to {to:e} mm; the limit is {LARGEST_MM:e} mm", ['X', 'Y', 'Z'][k]);
+            if to.abs() > MAX_COORDINATE_MM {
+                let found = format!("{} goes to {to:e} mm; the limit is {MAX_COORDINATE_MM:e} mm", ['X', 'Y', 'Z'][k]);
                 return Err((found, "correct the number, or the unit (G20, G21)"));
             }
             target[k] = Some(to);
@@ -341,12 +341,12 @@ pub(super) fn all(of: [Option<f64>; 3]) -> Option<Point> {
 }
 
 /// Returns ten times the number of a word, if it has at most one decimal.
-pub(super) fn tenths(word: &Word) -> Option<i64> {
+pub(super) fn tenths(word: &GcodeWord) -> Option<i64> {
     let tenths = (word.value * 10.0).round();
     ((word.value * 10.0 - tenths).abs() <= 1e-6).then_some(tenths as i64)
 }
 
-fn axis_refused(word: &Word) -> Refusal {
+fn axis_refused(word: &GcodeWord) -> Refusal {
     let found = format!("{} moves an axis that turns the part or the tool", word.text);
     (
         found,
@@ -383,7 +383,7 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
 }
 
 /// Rejects words that no other word in their line uses.
-fn check_uses(block: &Block, asked: &Asked, moves: bool, is_arc: bool) -> Result<(), Refusal> {
+fn check_uses(block: &Block, asked: &BlockRequests, moves: bool, is_arc: bool) -> Result<(), Refusal> {
     for word in &block.words {
         let used = match word.letter {
             b'X' | b'Y' | b'Z' => (moves || asked.machine || asked.reference) && !asked.dwell,

@@ -8,7 +8,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use regrind_core::compensation::path::{ArcOptions, PathMode, Rotary};
+use regrind_core::compensation::path::{ArcOptions, PathMode, RotaryAxis};
 
 /// The dialect of LinuxCNC, which a cell has that says nothing.
 pub const LINUXCNC: &str = "linuxcnc";
@@ -506,7 +506,7 @@ impl Dialect {
     ///
     /// # Errors
     /// A way of tilting for which the dialect has no words.
-    pub fn turning(&self, rotary: &Rotary) -> Result<&Turning, DialectError> {
+    pub fn turning(&self, rotary: &RotaryAxis) -> Result<&Turning, DialectError> {
         let dialect = || self.dialect.name.clone();
         match rotary.pivot_mm {
             None => self.rotary.tool_centre.as_ref().ok_or_else(|| DialectError::ToolCentre { dialect: dialect() }),

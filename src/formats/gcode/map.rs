@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::GcodeError;
 use crate::FormatError;
-use regrind_core::geometry::grid_order::NO_POINT;
+use regrind_core::geometry::grid_recognition::NO_POINT;
 use regrind_core::geometry::{Grid, Point, recognise_grid};
 
 /// Largest map that is read, in bytes.
@@ -89,7 +89,7 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
             let (path, found, limit, unit) = (path.to_owned(), bytes, MOST_BYTES, "bytes");
             return Err(GcodeError::File(FormatError::TooLarge { path, found, limit, unit }));
         }
-        lines.take(&line).map_err(|what| {
+        lines.read_line(&line).map_err(|what| {
             let remedy = "give the error_map.csv or correction.csv of a run, or a file like it";
             GcodeError::Line { path: path.to_owned(), line: number, what, remedy }
         })?;
@@ -114,7 +114,7 @@ struct MapLines {
 
 impl MapLines {
     /// Reads one line; the error describes the fault.
-    fn take(&mut self, line: &[u8]) -> Result<(), String> {
+    fn read_line(&mut self, line: &[u8]) -> Result<(), String> {
         self.hash.update(line);
         let text = std::str::from_utf8(line).map_err(|_| "the line is not text")?.trim_start_matches('\u{feff}').trim();
         if let Some(comment) = text.strip_prefix('#') {

@@ -3,7 +3,7 @@
 /// Number of decimals that are written: the last one is a nanometre.
 pub(super) const PER_MM: f64 = 1e6;
 /// Largest coordinate that is written, in millimetres.
-pub(super) const LARGEST_MM: f64 = 1e9;
+pub(super) const MAX_COORDINATE_MM: f64 = 1e9;
 
 /// Rounds a length to the written decimals; returns millionths of a millimetre.
 #[inline]

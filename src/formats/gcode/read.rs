@@ -3,7 +3,7 @@
 
 /// Word of a line: a letter and its number, with the text as written.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Word<'a> {
+pub(super) struct GcodeWord<'a> {
     pub(super) letter: u8,
     pub(super) value: f64,
     pub(super) text: &'a str,
@@ -12,7 +12,7 @@ pub(super) struct Word<'a> {
 /// A line split into words and comments.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Block<'a> {
-    pub(super) words: Vec<Word<'a>>,
+    pub(super) words: Vec<GcodeWord<'a>>,
     /// Comments as written, with their marks.
     pub(super) comments: Vec<&'a str>,
     /// True for a line that is only a percent sign.
@@ -76,7 +76,7 @@ fn expression() -> Refusal {
 }
 
 /// Reads the word that begins at a byte, and returns it with its end.
-fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
+fn word(line: &str, at: usize) -> Result<(GcodeWord<'_>, usize), Refusal> {
     let bytes = line.as_bytes();
     let letter = bytes[at].to_ascii_uppercase();
     if letter == b'O' {
@@ -94,8 +94,8 @@ fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
     }
     let number = line.get(begin..end).unwrap_or_default();
     match number.parse::<f64>() {
-        Ok(value) if value.abs() <= super::number::LARGEST_MM => {
-            Ok((Word { letter, value, text: line.get(at..end).unwrap_or_default() }, end))
+        Ok(value) if value.abs() <= super::number::MAX_COORDINATE_MM => {
+            Ok((GcodeWord { letter, value, text: line.get(at..end).unwrap_or_default() }, end))
         }
         _ => Err((
             format!("{} is followed by {number:?}, which is not a number", char::from(letter)),

@@ -8,7 +8,7 @@ use super::dialect::{ArcWords, CentreWords, Dialect, Exactness, LineEnd, NAME, N
 use super::number::{push_decimals, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Arc, ArcSummary, Block, Move, Plane, Rotary, Summary, ToolPath, TurnAxis};
+use regrind_core::compensation::path::{Arc, ArcSummary, ProgramBlock, Move, Plane, RotaryAxis, PathSummary, ToolPath, RotationAxis};
 
 /// Bytes that are collected before they are written to the file.
 const CHUNK: usize = 1 << 16;
@@ -36,7 +36,7 @@ pub struct ProgramHeader {
     /// True if the wheel comes from -z.
     pub from_below: bool,
     /// Rotary axis that tilts the wheel, if there is one.
-    pub rotary: Option<Rotary>,
+    pub rotary: Option<RotaryAxis>,
     /// Tilt of the wheel, in words.
     pub lean: String,
     /// Description of the wheel, in words.
@@ -67,7 +67,7 @@ pub fn write_program(
     file: &Path,
     header: &ProgramHeader,
     dialect: &Dialect,
-    summary: &Summary,
+    summary: &PathSummary,
     path: &ToolPath,
 ) -> Result<(), GcodeError> {
     let post = dialect.post(&header.exactness)?;
@@ -84,11 +84,11 @@ fn write_tracks<T>(
     path: &Path,
     header: &ProgramHeader,
     post: &Post,
-    (summary, arcs): (&Summary, Option<&ArcSummary>),
+    (summary, arcs): (&PathSummary, Option<&ArcSummary>),
     tracks: &[T],
 ) -> Result<(), GcodeError>
 where
-    T: Iterator<Item: Into<Block>> + Clone + Sync,
+    T: Iterator<Item: Into<ProgramBlock>> + Clone + Sync,
 {
     let dialect = post.dialect;
     let frame = Frame::new(post, header)?;
@@ -114,7 +114,7 @@ where
     } else {
         for some in tracks.chunks(at_once) {
             let texts: Vec<Result<Lines, GcodeError>> =
-                some.par_iter().map(|track| Lines::of(dialect, rotary, track)).collect();
+                some.par_iter().map(|track| Lines::format_track(dialect, rotary, track)).collect();
             for text in texts {
                 let text = text.map_err(|error| error.after(lines.count))?;
                 draft.write(&text.text)?;
@@ -134,7 +134,7 @@ where
 /// Lines of the moves, and the modal state after them.
 struct Lines<'a> {
     dialect: &'a Dialect,
-    rotary: Option<&'a Rotary>,
+    rotary: Option<&'a RotaryAxis>,
     text: Vec<u8>,
     /// Last coordinates, in units of the last written digit; `i64::MAX` if none is in force.
     last: [i64; 3],
@@ -160,13 +160,13 @@ enum Motion {
 }
 
 /// Minimum length for which an inverse time is computed, in millimetres.
-const LEAST_MM: f64 = 1e-6;
+const MIN_LENGTH_MM: f64 = 1e-6;
 /// Value of a position or a feed that is not in force.
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
     /// Creates an empty state, after `count` moves and `numbered` numbered blocks.
-    fn new(dialect: &'a Dialect, rotary: Option<&'a Rotary>, count: u64, numbered: u64) -> Self {
+    fn new(dialect: &'a Dialect, rotary: Option<&'a RotaryAxis>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let numbers = &dialect.numbers;
         let [per_mm, per_deg, feed_per] = [numbers.decimals, numbers.angle_decimals, numbers.feed_decimals].map(power);
@@ -176,9 +176,9 @@ impl<'a> Lines<'a> {
     }
 
     /// Formats the lines of a whole track.
-    fn of<T: Iterator<Item: Into<Block>> + Clone>(
+    fn format_track<T: Iterator<Item: Into<ProgramBlock>> + Clone>(
         dialect: &'a Dialect,
-        rotary: Option<&'a Rotary>,
+        rotary: Option<&'a RotaryAxis>,
         track: &T,
     ) -> Result<Self, GcodeError> {
         let mut lines = Self::new(dialect, rotary, 0, 0);
@@ -193,11 +193,11 @@ impl<'a> Lines<'a> {
     }
 
     #[inline]
-    fn push(&mut self, block: &Block) -> Result<(), GcodeError> {
+    fn push(&mut self, block: &ProgramBlock) -> Result<(), GcodeError> {
         self.count += 1;
         match block {
-            Block::Straight(one) => self.straight(one),
-            Block::Arc(arc) => self.arc(arc),
+            ProgramBlock::Straight(one) => self.straight(one),
+            ProgramBlock::Arc(arc) => self.arc(arc),
         }
     }
 
@@ -241,7 +241,7 @@ impl<'a> Lines<'a> {
             return feed_mm_min;
         }
         self.feed = NOTHING;
-        feed_mm_min / centre_mm.max(LEAST_MM)
+        feed_mm_min / centre_mm.max(MIN_LENGTH_MM)
     }
 
     fn moves_slides(&self) -> bool {
@@ -411,7 +411,7 @@ impl<'a> Lines<'a> {
         let Some(rotary) = self.rotary.filter(|_| tilt_rad.is_finite()) else {
             return Err(GcodeError::NotFinite { axis: 'A', value_mm: tilt_rad, number: self.count });
         };
-        Ok((rotary.on_scale_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
+        Ok((rotary.scale_reading_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
     }
 
     /// Returns a feed in units of the last written digit.
@@ -507,7 +507,7 @@ impl<'a> Frame<'a> {
 
     /// Returns the lines before the moves, which state the total number of lines, and the number of numbered blocks
     /// among them.
-    fn head(&self, header: &ProgramHeader, summary: &Summary, arcs: Option<&ArcSummary>) -> (String, u64) {
+    fn head(&self, header: &ProgramHeader, summary: &PathSummary, arcs: Option<&ArcSummary>) -> (String, u64) {
         let lines = |count: u64| {
             let (mut text, mut numbered) = (Vec::new(), 0);
             let all = self.dialect.blocks.as_ref().is_some_and(|blocks| blocks.all);
@@ -560,7 +560,7 @@ impl<'a> Frame<'a> {
 }
 
 /// Returns the content of the header, one comment each.
-fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
+fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
     if h.simulation {
@@ -606,11 +606,11 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
 }
 
 /// Returns the header's text about the tilt of the wheel and about the resulting meaning of X, Y and Z.
-fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2] {
-    let about = if rotary.axis == TurnAxis::X { "x" } else { "y" };
+fn tilt_in_words(rotary: &RotaryAxis, h: &ProgramHeader, s: &PathSummary) -> [String; 2] {
+    let about = if rotary.axis == RotationAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
     let reached = s.head_rotation.map_or(String::new(), |turned| {
-        let [a, b] = [turned.min_tilt_rad, turned.max_tilt_rad].map(|peak| rotary.on_scale_rad(peak.value).to_degrees());
+        let [a, b] = [turned.min_tilt_rad, turned.max_tilt_rad].map(|peak| rotary.scale_reading_rad(peak.value).to_degrees());
         format!(", {:.4} to {:.4} degrees", a.min(b), a.max(b))
     });
     let of = match rotary.pivot_mm {
@@ -664,7 +664,7 @@ mod tests {
         write_with(dialect, tracks, points, None)
     }
 
-    fn write_with<B: Into<Block> + Clone + Send + Sync>(
+    fn write_with<B: Into<ProgramBlock> + Clone + Send + Sync>(
         dialect: &Dialect,
         tracks: &[std::vec::IntoIter<B>],
         points: u64,
@@ -693,7 +693,7 @@ mod tests {
                 arcs_within_mm: arcs.map(|_| 1e-4),
             },
         };
-        let summary = Summary {
+        let summary = PathSummary {
             moves: 5 * tracks.len() as u64,
             points,
             min_mm: [0.0; 3],
@@ -787,16 +787,16 @@ mod tests {
 
     /// A track with a quarter turn about the origin in the plane of z and x, with or without motion along y, a line,
     /// and the same turn backwards.
-    fn turning(y_mm: f64) -> Vec<std::vec::IntoIter<Block>> {
+    fn turning(y_mm: f64) -> Vec<std::vec::IntoIter<ProgramBlock>> {
         let arc = |clockwise: bool, to: Point| {
             let (plane, centre_mm) = (Plane::ZX, [0.0, 0.0]);
-            Block::Arc(Arc { plane, clockwise, to, centre_mm, feed_mm_min: 600.0, deviation_mm: 0.0 })
+            ProgramBlock::Arc(Arc { plane, clockwise, to, centre_mm, feed_mm_min: 600.0, deviation_mm: 0.0 })
         };
         let feed = |x: f64, y: f64, z: f64| Move::Feed { to: Point::new(x, y, z), feed_mm_min: 600.0 };
-        let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(Block::Straight);
+        let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(ProgramBlock::Straight);
         let (there, back) = (arc(false, Point::new(2.0, y_mm, 0.0)), arc(true, Point::new(0.0, y_mm, 2.0)));
-        let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(Block::Straight);
-        let blocks = straight.into_iter().chain([there]).chain(over).chain([back, Block::Straight(Move::RapidZ(5.0))]);
+        let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(ProgramBlock::Straight);
+        let blocks = straight.into_iter().chain([there]).chain(over).chain([back, ProgramBlock::Straight(Move::RapidZ(5.0))]);
         vec![blocks.collect::<Vec<_>>().into_iter()]
     }
 

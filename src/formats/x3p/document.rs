@@ -165,10 +165,10 @@ impl Main {
         let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
         let document = Document::parse_with_options(source.trim_start_matches('\u{feff}'), options)
             .map_err(|source| FormatError::Xml { path: path.to_owned(), entry: entry.to_owned(), source })?;
-        Self::of(&place, document.root_element())
+        Self::from_root(&place, document.root_element())
     }
 
-    fn of<'d>(place: &Place<'_>, root: Node<'d, 'd>) -> Result<(Self, Samples), FormatError> {
+    fn from_root<'d>(place: &Place<'_>, root: Node<'d, 'd>) -> Result<(Self, Samples), FormatError> {
         if !root.tag_name().name().starts_with("ISO5436") {
             return Err(place.unexpected(root, "the root ISO5436_2", root.tag_name().name()));
         }

@@ -215,11 +215,11 @@ impl LockFolder {
         if FileType::from_raw_mode(found.st_mode) != FileType::RegularFile {
             return Err("it is not a file".to_owned());
         }
-        let is_spoiled = found.st_nlink != 1 || found.st_size.cast_unsigned() > MOST_TOLD;
+        let is_spoiled = found.st_nlink != 1 || found.st_size.cast_unsigned() > MAX_HOLDER_BYTES;
         if is_spoiled && !is_trusted(found.st_uid) {
             let (names, bytes) = (found.st_nlink, found.st_size);
             return Err(format!(
-                "it has {names} names and {bytes} bytes; a lock has one name and at most {MOST_TOLD} bytes"
+                "it has {names} names and {bytes} bytes; a lock has one name and at most {MAX_HOLDER_BYTES} bytes"
             ));
         }
         let lock = File::from(file);
@@ -277,7 +277,7 @@ fn is_trusted(uid: u32) -> bool {
 }
 
 /// Maximum length of a lock file, in bytes.
-const MOST_TOLD: u64 = 4096;
+const MAX_HOLDER_BYTES: u64 = 4096;
 
 /// File to be locked.
 pub(crate) struct LockFile {

@@ -8,7 +8,7 @@ use opcua_types::{
 use regrind_cell::Alarm;
 use regrind_control::{CycleRow, Snapshot};
 
-use crate::told::{Now, Told};
+use crate::cell_status::{RunStatus, CellStatus};
 
 /// Severities of events, from 1 to 1000.
 const OF_INTEREST: u16 = 100;
@@ -70,12 +70,12 @@ pub(super) struct CellEvent {
 
 /// Returns the events between two published states. `on` is the last published state with an active run, so that a run
 /// that was interrupted and continues repeats no event.
-pub(super) fn happened([before, on]: [&Told; 2], now: &Told, own: u16, cell: &str) -> Vec<CellEvent> {
+pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)
     };
     let mut events = Vec::new();
-    if let Now::On { run, snapshot } = &now.now {
+    if let RunStatus::Active { run, snapshot } = &now.run_status {
         let earlier = on.snapshot().filter(|_| on.run() == Some(run));
         for row in new_rows(earlier, snapshot) {
             let [pv_um, rms_um] = row.judged_um();
@@ -88,7 +88,7 @@ pub(super) fn happened([before, on]: [&Told; 2], now: &Told, own: u16, cell: &st
             events.push(from(&ALARM, TO_BE_SEEN_TO, alarm.what.clone(), values));
         }
     }
-    if let Some(last) = now.last.as_ref().filter(|last| before.last.as_ref() != Some(last)) {
+    if let Some(last) = now.last_run.as_ref().filter(|last| before.last_run.as_ref() != Some(last)) {
         let values = vec![text(&last.run), text(&last.verdict), last.accepted.into()];
         events.push(from(&RUN_ENDED, OF_INTEREST, last.verdict.clone(), values));
     }
@@ -182,7 +182,7 @@ impl EventField for CellEvent {
 mod tests {
     use super::*;
 
-    fn on(run: &str, cycles: u32) -> Told {
+    fn on(run: &str, cycles: u32) -> CellStatus {
         let row = |cycle| CycleRow {
             cycle,
             pv_um: 3.0,
@@ -194,16 +194,16 @@ mod tests {
             level_um: 0.0,
         };
         let snapshot = Snapshot { cycles: (1..=cycles).map(row).collect(), ..Snapshot::default() };
-        Told { now: Now::On { run: run.into(), snapshot: Box::new(snapshot) }, last: None }
+        CellStatus { run_status: RunStatus::Active { run: run.into(), snapshot: Box::new(snapshot) }, last_run: None }
     }
 
-    fn cycles(before: &Told, now: &Told) -> Vec<Variant> {
+    fn cycles(before: &CellStatus, now: &CellStatus) -> Vec<Variant> {
         cycles_since([before, before], now)
     }
 
-    fn cycles_since(before: [&Told; 2], now: &Told) -> Vec<Variant> {
+    fn cycles_since(before: [&CellStatus; 2], now: &CellStatus) -> Vec<Variant> {
         let name = [QualifiedName::new(2, "Cycle")];
-        let events = happened(before, now, 2, "cell-1");
+        let events = events_between(before, now, 2, "cell-1");
         events.iter().map(|event| event.get_value(AttributeId::Value, &NumericRange::None, &name)).collect()
     }
 
@@ -212,12 +212,12 @@ mod tests {
         assert_eq!(cycles(&on("a", 1), &on("a", 3)), [Variant::UInt32(2), Variant::UInt32(3)]);
         assert!(cycles(&on("a", 3), &on("a", 3)).is_empty());
         assert_eq!(cycles(&on("a", 3), &on("b", 1)), [Variant::UInt32(1)]);
-        assert_eq!(cycles(&Told::default(), &on("b", 1)), [Variant::UInt32(1)]);
-        let gone = Told { now: Now::Gone { run: "a".into(), machines_within: false }, last: None };
+        assert_eq!(cycles(&CellStatus::default(), &on("b", 1)), [Variant::UInt32(1)]);
+        let gone = CellStatus { run_status: RunStatus::ProgramGone { run: "a".into(), machines_within: false }, last_run: None };
         assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
         // A cycle that was measured again has other results.
         let mut again = on("a", 1);
-        let Now::On { snapshot, .. } = &mut again.now else { unreachable!() };
+        let RunStatus::Active { snapshot, .. } = &mut again.run_status else { unreachable!() };
         snapshot.cycles[0].pv_um = 2.5;
         assert_eq!(cycles(&on("a", 1), &again), [Variant::UInt32(1)]);
     }

@@ -16,13 +16,13 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use self::events::happened;
+use self::events::events_between;
 use self::nodes::{CellNodes, CellNodesBuilder, Namespaces};
 use crate::error::LiveError;
-use crate::news::Notes;
+use crate::publisher_event::EventSender;
 use crate::settings::OpcUaSettings;
-use crate::told::{Now, Told};
-use crate::turn::Turn;
+use crate::cell_status::{RunStatus, CellStatus};
+use crate::publisher_lock::PublisherLock;
 
 /// Time between two attempts to bind the port.
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);
@@ -43,8 +43,8 @@ pub struct UaServer {
     listen: SocketAddr,
     cell: String,
     keeps: std::path::PathBuf,
-    told: watch::Receiver<Told>,
-    notes: Notes,
+    status: watch::Receiver<CellStatus>,
+    notes: EventSender,
 }
 
 impl UaServer {
@@ -55,15 +55,15 @@ impl UaServer {
     pub fn new(
         settings: &OpcUaSettings,
         cell: &str,
-        turn: &Turn,
-        told: watch::Receiver<Told>,
-        notes: Notes,
+        turn: &PublisherLock,
+        told: watch::Receiver<CellStatus>,
+        notes: EventSender,
     ) -> Result<Self, LiveError> {
         let listen = settings.listen;
         if !listen.ip().is_loopback() {
             return Err(LiveError::ForOthers { listen });
         }
-        Ok(Self { listen, cell: cell.to_owned(), keeps: turn.folder().join("opcua"), told, notes })
+        Ok(Self { listen, cell: cell.to_owned(), keeps: turn.folder().join("opcua"), status: told, notes })
     }
 
     /// Serves the state of the cell until its source closes.
@@ -79,10 +79,10 @@ impl UaServer {
         let shown = shown.ok_or_else(|| server("the nodes of the cell are missing".into()))?;
         let mut serving = JoinSet::new();
         serving.spawn(serves.run_with(listener));
-        self.notes.tells(&format!("opc.tcp://{address}/"));
+        self.notes.connected(&format!("opc.tcp://{address}/"));
         let ended = tokio::select! {
             Some(ended) = serving.join_next() => Some(ended),
-            () = show(&mut self.told, &handle, &shown) => None,
+            () = show(&mut self.status, &handle, &shown) => None,
         };
         if let Some(ended) = ended {
             let why = ended.unwrap_or_else(|error| Err(error.to_string()));
@@ -99,11 +99,11 @@ impl UaServer {
         loop {
             match TcpListener::bind(self.listen).await {
                 Ok(listener) => return Some(listener),
-                Err(error) => self.notes.waits(&format!("opc.tcp://{}/", self.listen), error.to_string()),
+                Err(error) => self.notes.retrying(&format!("opc.tcp://{}/", self.listen), error.to_string()),
             }
             tokio::select! {
                 () = sleep(BETWEEN_TRIES) => {}
-                () = async { while self.told.changed().await.is_ok() {} } => return None,
+                () = async { while self.status.changed().await.is_ok() {} } => return None,
             }
         }
     }
@@ -143,20 +143,20 @@ impl UaServer {
 }
 
 /// Writes each new state to the nodes, until the source closes.
-async fn show(told: &mut watch::Receiver<Told>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
+async fn show(told: &mut watch::Receiver<CellStatus>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
-    let mut before: Option<Told> = None;
-    let mut on = Told::default();
+    let mut before: Option<CellStatus> = None;
+    let mut on = CellStatus::default();
     loop {
         let now = told.borrow_and_update().clone();
         nodes::set(shown, handle.subscriptions(), before.as_ref(), &now);
         if let Some(before) = &before {
-            let events = happened([before, &on], &now, own, shown.inner().cell());
+            let events = events_between([before, &on], &now, own, shown.inner().cell());
             let emitters = [shown.inner().cell_node(), opcua_types::ObjectId::Server.into()];
             let all = events.iter().flat_map(|event| emitters.iter().map(move |from| (event as _, from)));
             handle.subscriptions().notify_events(all);
         }
-        if matches!(now.now, Now::On { .. }) {
+        if matches!(now.run_status, RunStatus::Active { .. }) {
             on.clone_from(&now);
         }
         before = Some(now);

@@ -29,9 +29,9 @@ use regrind_cell::StateName;
 
 use super::events::{ALL, KINDS};
 use crate::figures::{FIGURES, Figure, FigureKind, FigureValue};
-use crate::news::Notes;
+use crate::publisher_event::EventSender;
 use crate::packml::state_number;
-use crate::told::{Now, Told};
+use crate::cell_status::{RunStatus, CellStatus};
 
 const PACKML: &str = "http://opcfoundation.org/UA/PackML/";
 const OWN: &str = "urn:regrind:live";
@@ -62,7 +62,7 @@ pub(super) struct Namespaces {
 /// Builder of the nodes of a cell.
 pub(super) struct CellNodesBuilder {
     pub(super) cell: String,
-    pub(super) notes: Notes,
+    pub(super) notes: EventSender,
 }
 
 /// Nodes of a cell; clients cannot write them.
@@ -70,7 +70,7 @@ pub(super) struct CellNodes {
     pub(super) namespaces: Namespaces,
     metadata: Vec<NamespaceMetadata>,
     cell: String,
-    notes: Notes,
+    notes: EventSender,
 }
 
 impl CellNodes {
@@ -347,16 +347,16 @@ fn unit_of(unit: &str) -> EUInformation {
 pub(super) fn set(
     shown: &InMemoryNodeManager<CellNodes>,
     subscriptions: &SubscriptionCache,
-    before: Option<&Told>,
-    now: &Told,
+    before: Option<&CellStatus>,
+    now: &CellStatus,
 ) {
     let then = DateTime::now();
     let namespaces = shown.inner().namespaces;
     let known = |value: Option<Variant>| value.map_or_else(|| unknown(then), |value| good(value, then));
     let mut values = Vec::new();
     for figure in FIGURES {
-        let value = figure.of(now);
-        if before.is_none_or(|before| figure.of(before) != value) {
+        let value = figure.value(now);
+        if before.is_none_or(|before| figure.value(before) != value) {
             values.push((NodeId::new(namespaces.own, figure.name), known(value.map(variant))));
         }
     }
@@ -394,11 +394,11 @@ fn unknown(then: DateTime) -> DataValue {
 }
 
 /// Returns the state of the cell; `None` if it is unknown.
-fn state(told: &Told) -> Option<StateName> {
-    match &told.now {
-        Now::NoRun => Some(StateName::Idle),
-        Now::Silent { .. } | Now::Gone { .. } => None,
-        Now::On { snapshot, .. } => Some(snapshot.state),
+fn state(told: &CellStatus) -> Option<StateName> {
+    match &told.run_status {
+        RunStatus::NoRun => Some(StateName::Idle),
+        RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
+        RunStatus::Active { snapshot, .. } => Some(snapshot.state),
     }
 }
 

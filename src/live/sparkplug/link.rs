@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use regrind_trust::{password, proof};
+use regrind_trust::{read_password, tls_config};
 use rumqttc::{LastWill, MqttOptions, QoS, TlsConfiguration, Transport};
 
 use crate::error::LiveError;
@@ -16,15 +16,15 @@ const KEEP_ALIVE: Duration = Duration::from_secs(10);
 const LONGEST_MESSAGE: usize = 1 << 20;
 
 /// Connection options of a broker, without the last will.
-pub(super) struct Way {
+pub(super) struct BrokerOptions {
     options: MqttOptions,
     pub(super) place: String,
 }
 
-impl Way {
-    pub(super) fn of(settings: &SparkplugSettings, client: &str) -> Result<Self, LiveError> {
+impl BrokerOptions {
+    pub(super) fn new(settings: &SparkplugSettings, client: &str) -> Result<Self, LiveError> {
         let SparkplugSettings { broker, port, user, password_file, certificates, .. } = settings;
-        let proof = proof(broker, certificates.as_deref(), "[sparkplug]")?;
+        let proof = tls_config(broker, certificates.as_deref(), "[sparkplug]")?;
         let port = port.unwrap_or(if proof.is_some() { 8883 } else { 1883 });
         let mut options = MqttOptions::new(client, broker, port);
         options
@@ -35,7 +35,7 @@ impl Way {
             options.set_transport(Transport::Tls(TlsConfiguration::Rustls(Arc::new(proof))));
         }
         if let Some(user) = user {
-            options.set_credentials(user, password_file.as_deref().map(password).transpose()?.unwrap_or_default());
+            options.set_credentials(user, password_file.as_deref().map(read_password).transpose()?.unwrap_or_default());
         }
         Ok(Self { options, place: format!("{broker}:{port}") })
     }

@@ -35,7 +35,7 @@ pub(super) fn death(connection: u8) -> Vec<u8> {
 }
 
 /// Reads the requests of a command: true if it requests a rebirth; and all other requests, in words.
-pub(super) fn asked(payload: &[u8]) -> (bool, Vec<String>) {
+pub(super) fn read_requests(payload: &[u8]) -> (bool, Vec<String>) {
     let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
         return (false, vec!["what is no command of Sparkplug B".into()]);
     };

@@ -20,14 +20,14 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use self::link::Way;
+use self::link::BrokerOptions;
 use self::message::Values;
 use crate::error::LiveError;
 use crate::figures::FIGURES;
-use crate::news::Notes;
+use crate::publisher_event::EventSender;
 use crate::settings::SparkplugSettings;
-use crate::told::Told;
-use crate::turn::{Births, Turn};
+use crate::cell_status::CellStatus;
+use crate::publisher_lock::{BdSeqCounter, PublisherLock};
 
 /// Limits of the time between two attempts to connect to the broker.
 const SHORTEST_WAIT: Duration = Duration::from_millis(500);
@@ -43,11 +43,11 @@ const WAITING: usize = 16;
 
 /// Edge node that publishes the state of a cell to a broker.
 pub struct Node {
-    way: Way,
-    births: Births,
+    broker: BrokerOptions,
+    bd_seq: BdSeqCounter,
     topics: Topics,
-    told: watch::Receiver<Told>,
-    notes: Notes,
+    status: watch::Receiver<CellStatus>,
+    notes: EventSender,
 }
 
 struct Topics {
@@ -59,7 +59,7 @@ struct Topics {
 }
 
 impl Topics {
-    fn of(group: &str, node: &str) -> Self {
+    fn new(group: &str, node: &str) -> Self {
         let topic = |message| NodeTopic::new(group, message, node).topic;
         Self {
             birth: topic(NodeMessage::NBirth),
@@ -72,7 +72,7 @@ impl Topics {
 }
 
 /// Reason for the end of a connection.
-enum Over {
+enum SessionEnd {
     /// The source of the state has closed.
     Ended,
     /// The broker is gone or was never reached; `stood` is true if the connection was established before.
@@ -88,15 +88,15 @@ impl Node {
     pub fn new(
         settings: &SparkplugSettings,
         cell: &str,
-        turn: &Turn,
-        told: watch::Receiver<Told>,
-        notes: Notes,
+        turn: &PublisherLock,
+        told: watch::Receiver<CellStatus>,
+        notes: EventSender,
     ) -> Result<Self, LiveError> {
         for (of, name) in [("the group", &*settings.group), ("the cell", cell)] {
             validate_name(name).map_err(|_| LiveError::Topic { of, name: name.to_owned() })?;
         }
-        let way = Way::of(settings, &format!("regrind-{}-{cell}", settings.group))?;
-        Ok(Self { way, births: Births::of(turn)?, topics: Topics::of(&settings.group, cell), told, notes })
+        let way = BrokerOptions::new(settings, &format!("regrind-{}-{cell}", settings.group))?;
+        Ok(Self { broker: way, bd_seq: BdSeqCounter::open(turn)?, topics: Topics::new(&settings.group, cell), status: told, notes })
     }
 
     /// Publishes the state of the cell until its source closes, whether or not the broker can be reached.
@@ -105,13 +105,13 @@ impl Node {
     /// The number of the connection cannot be written.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let mut wait = SHORTEST_WAIT;
-        let mut connection = self.births.next()?;
+        let mut connection = self.bd_seq.next()?;
         loop {
             let began = Instant::now();
-            let Over::Lost { why, stood } = self.session(connection).await else { return Ok(()) };
-            self.notes.waits(&self.way.place, why);
+            let SessionEnd::Lost { why, stood } = self.session(connection).await else { return Ok(()) };
+            self.notes.retrying(&self.broker.place, why);
             if stood {
-                connection = self.births.next()?;
+                connection = self.bd_seq.next()?;
             }
             // After a connection that lasted, the next attempt comes soon. After one that ended at once, the wait keeps
             // growing.
@@ -120,7 +120,7 @@ impl Node {
             while Instant::now() < until {
                 tokio::select! {
                     () = sleep_until(until) => {}
-                    changed = self.told.changed() => if changed.is_err() { return Ok(()) },
+                    changed = self.status.changed() => if changed.is_err() { return Ok(()) },
                 }
             }
             wait = (2 * wait).min(LONGEST_WAIT);
@@ -128,8 +128,8 @@ impl Node {
     }
 
     /// Runs one connection, from its beginning to its end.
-    async fn session(&mut self, connection: u8) -> Over {
-        let options = self.way.with_death(&self.topics.death, message::death(connection));
+    async fn session(&mut self, connection: u8) -> SessionEnd {
+        let options = self.broker.with_death(&self.topics.death, message::death(connection));
         let (client, mut broker) = AsyncClient::new(options, WAITING);
         broker.network_options.set_tcp_nodelay(true);
         // Polls in a task of its own: cancelling a poll in the middle of a message would end the connection.
@@ -149,9 +149,9 @@ impl Node {
         loop {
             let due = session.due;
             let over = tokio::select! {
-                event = events.recv() => session.takes(event),
-                changed = session.node.told.changed() => match changed {
-                    Ok(()) => session.tell(),
+                event = events.recv() => session.handle_event(event),
+                changed = session.node.status.changed() => match changed {
+                    Ok(()) => session.publish_changes(),
                     Err(_) => return session.farewell(&mut events).await,
                 },
                 () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => session.catch_up(),
@@ -192,10 +192,10 @@ struct Session<'a> {
 
 impl Session<'_> {
     /// Handles an event of the broker.
-    fn takes(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), Over> {
+    fn handle_event(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), SessionEnd> {
         self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
         let stood = self.stood;
-        let lost = |why: String| Err(Over::Lost { why, stood });
+        let lost = |why: String| Err(SessionEnd::Lost { why, stood });
         match event {
             None => lost("the connection has gone".into()),
             Some(Err(error)) => lost(in_words(&error)),
@@ -209,15 +209,15 @@ impl Session<'_> {
                 let refused = ack.return_codes.contains(&SubscribeReasonCode::Failure);
                 if refused {
                     let why = "it lets nobody ask for a birth: the node may not subscribe to its commands".to_owned();
-                    self.node.notes.waits(&self.node.way.place, why);
+                    self.node.notes.retrying(&self.node.broker.place, why);
                 } else {
-                    self.node.notes.tells(&self.node.way.place);
+                    self.node.notes.connected(&self.node.broker.place);
                 }
                 self.birth();
                 Ok(())
             }
             Some(Ok(Event::Incoming(Packet::Publish(publish)))) => {
-                self.hear(&publish);
+                self.handle_command(&publish);
                 Ok(())
             }
             Some(Ok(_)) => Ok(()),
@@ -226,7 +226,7 @@ impl Session<'_> {
 
     /// Publishes a birth with all values.
     fn birth(&mut self) {
-        let values = current(&mut self.node.told);
+        let values = current(&mut self.node.status);
         let birth = message::birth(FIGURES, &values, self.connection);
         if self.client.try_publish(&self.node.topics.birth, QoS::AtMostOnce, false, birth).is_err() {
             self.due = Some(Instant::now() + OFFERED_AGAIN);
@@ -237,9 +237,9 @@ impl Session<'_> {
     }
 
     /// Publishes the values that have changed.
-    fn tell(&mut self) -> Result<(), Over> {
+    fn publish_changes(&mut self) -> Result<(), SessionEnd> {
         let Some(told) = &self.values else { return Ok(()) };
-        let values = current(&mut self.node.told);
+        let values = current(&mut self.node.status);
         let next = self.sequence.wrapping_add(1);
         let Some(changes) = message::changes(FIGURES, &values, told, next) else { return Ok(()) };
         match self.client.try_publish(&self.node.topics.data, QoS::AtMostOnce, false, changes) {
@@ -251,19 +251,19 @@ impl Session<'_> {
     }
 
     /// Does the deferred work.
-    fn catch_up(&mut self) -> Result<(), Over> {
+    fn catch_up(&mut self) -> Result<(), SessionEnd> {
         self.due = None;
         match self.values {
             None => self.birth(),
-            Some(_) => self.tell()?,
+            Some(_) => self.publish_changes()?,
         }
         Ok(())
     }
 
     /// Handles a command of a host. A host may request a birth, and nothing else.
-    fn hear(&mut self, publish: &Publish) {
-        let by = format!("somebody at the broker {}", self.node.way.place);
-        let (wants_birth, others) = message::asked(&publish.payload);
+    fn handle_command(&mut self, publish: &Publish) {
+        let by = format!("somebody at the broker {}", self.node.broker.place);
+        let (wants_birth, others) = message::read_requests(&publish.payload);
         if publish.topic != self.node.topics.command {
             let others = if wants_birth { vec!["a birth of a device".into()] } else { others };
             return self.node.notes.refused(by, &format!("DCMD: {}", others.join(", ")));
@@ -280,7 +280,7 @@ impl Session<'_> {
     }
 
     /// Publishes the death and disconnects.
-    async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> Over {
+    async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> SessionEnd {
         let said = async {
             let death = message::death(self.connection);
             self.client.publish(&self.node.topics.death, QoS::AtLeastOnce, false, death).await.ok()?;
@@ -291,13 +291,13 @@ impl Session<'_> {
         };
         // If the death cannot be sent in time, the broker publishes it.
         let _ = timeout(FAREWELL, said).await;
-        Over::Ended
+        SessionEnd::Ended
     }
 }
 
-fn current(told: &mut watch::Receiver<Told>) -> Values {
+fn current(told: &mut watch::Receiver<CellStatus>) -> Values {
     let told = told.borrow_and_update();
-    FIGURES.iter().map(|figure| figure.of(&told)).collect()
+    FIGURES.iter().map(|figure| figure.value(&told)).collect()
 }
 
 /// Returns the message of an error of the client, with its causes.

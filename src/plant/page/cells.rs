@@ -11,10 +11,10 @@ use super::words::{ago, encoded, range, shown};
 /// Time without a report, in s, after which the state of a cell is unknown. A cell reports every second.
 const SILENCE_S: f64 = 60.0;
 /// Maximum number of cells on the page.
-const MOST: i64 = 2000;
+const MAX_CELLS: i64 = 2000;
 
 /// State of a cell, as the plant has it.
-pub(super) struct CellNow {
+pub(super) struct CellSummary {
     name: String,
     /// Seconds since the last report; `None` if the cell has never reported.
     heard_s: Option<f64>,
@@ -33,7 +33,7 @@ pub(super) struct CellNow {
 
 /// State of a cell as the page shows it, readable from two metres.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Look {
+enum DisplayState {
     Runs,
     Held,
     Alarm,
@@ -42,7 +42,7 @@ enum Look {
     Silent,
 }
 
-impl Look {
+impl DisplayState {
     const ALL: [Self; 5] = [Self::Alarm, Self::Silent, Self::Held, Self::Runs, Self::Still];
 
     fn class(self) -> &'static str {
@@ -78,19 +78,19 @@ impl Look {
 }
 
 /// Reads the states of the cells, those that need attention first.
-pub(super) async fn read(link: &Link) -> Result<Vec<CellNow>, PlantError> {
+pub(super) async fn read(link: &Link) -> Result<Vec<CellSummary>, PlantError> {
     let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
             coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
             left_most_s, alarms, coalesce(next, '')
         FROM cell_now ORDER BY cell LIMIT $1";
-    let mut cells: Vec<CellNow> =
-        link.ask(text, &[&MOST as &(dyn ToSql + Sync)]).await?.iter().map(CellNow::of).collect();
-    cells.sort_by_key(|cell| Look::ALL.iter().position(|look| *look == cell.look()));
+    let mut cells: Vec<CellSummary> =
+        link.query(text, &[&MAX_CELLS as &(dyn ToSql + Sync)]).await?.iter().map(CellSummary::from_row).collect();
+    cells.sort_by_key(|cell| DisplayState::ALL.iter().position(|look| *look == cell.display_state()));
     Ok(cells)
 }
 
-impl CellNow {
-    fn of(row: &Row) -> Self {
+impl CellSummary {
+    fn from_row(row: &Row) -> Self {
         let pair = |k: usize| Some([row.get::<_, Option<i32>>(k)?, row.get::<_, Option<i32>>(k + 1)?]);
         let left = |k: usize| Some([row.get::<_, Option<f64>>(k)?, row.get::<_, Option<f64>>(k + 1)?]);
         Self {
@@ -114,14 +114,14 @@ impl CellNow {
         self.heard_s.is_none_or(|seconds| seconds > SILENCE_S)
     }
 
-    fn look(&self) -> Look {
+    fn display_state(&self) -> DisplayState {
         match self.state.as_str() {
-            _ if self.is_silent() => Look::Silent,
-            "Aborting" | "Aborted" => Look::Alarm,
-            _ if self.alarms > 0 => Look::Alarm,
-            "Execute" | "Starting" | "Unholding" | "Unsuspending" | "Completing" => Look::Runs,
-            "Held" | "Holding" | "Suspending" | "Suspended" => Look::Held,
-            _ => Look::Still,
+            _ if self.is_silent() => DisplayState::Silent,
+            "Aborting" | "Aborted" => DisplayState::Alarm,
+            _ if self.alarms > 0 => DisplayState::Alarm,
+            "Execute" | "Starting" | "Unholding" | "Unsuspending" | "Completing" => DisplayState::Runs,
+            "Held" | "Holding" | "Suspending" | "Suspended" => DisplayState::Held,
+            _ => DisplayState::Still,
         }
     }
 
@@ -135,20 +135,20 @@ impl CellNow {
 }
 
 /// Returns the number of cells in each state, in words.
-pub(super) fn tally(cells: &[CellNow]) -> String {
-    let of = |look: Look| (cells.iter().filter(|cell| cell.look() == look).count(), look);
-    let told = Look::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
+pub(super) fn tally(cells: &[CellSummary]) -> String {
+    let of = |look: DisplayState| (cells.iter().filter(|cell| cell.display_state() == look).count(), look);
+    let told = DisplayState::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
     let told: Vec<String> = told.map(|(count, look)| format!("{count} {}", look.words())).collect();
     if told.is_empty() { "no cell is enrolled yet: regrind plant enrol".to_owned() } else { told.join(" · ") }
 }
 
 /// Draws a card for each cell.
-pub(super) fn cards(cells: &[CellNow]) -> Markup {
+pub(super) fn cards(cells: &[CellSummary]) -> Markup {
     html! { div .cells { @for cell in cells { (card(cell)) } } }
 }
 
-fn card(cell: &CellNow) -> Markup {
-    let look = cell.look();
+fn card(cell: &CellSummary) -> Markup {
+    let look = cell.display_state();
     html! {
         article .cell .(look.class()) data-cell=(shown(&cell.name)) {
             h3 {
@@ -156,7 +156,7 @@ fn card(cell: &CellNow) -> Markup {
                 span .name { (shown(&cell.name)) }
                 @if cell.simulation { span .simulation { "SIMULATION" } }
             }
-            @if look == Look::Silent {
+            @if look == DisplayState::Silent {
                 p .state { strong { (cell.heard()) } }
                 p { "What it does now is not known." @if !cell.words.is_empty() { " Then it said: " (shown(&cell.words)) } }
                 (of_part(cell))
@@ -168,14 +168,14 @@ fn card(cell: &CellNow) -> Markup {
                     p .left { (done) " of " (total) @if let Some(left) = cell.left_s { ", " strong { (range(left)) } " left" } }
                 }
                 @if cell.alarms > 0 { p .alarms { strong { (cell.alarms) @if cell.alarms == 1 { " alarm" } @else { " alarms" } } } }
-                @if !cell.next.is_empty() && matches!(look, Look::Held | Look::Alarm) { p { "Next: " (shown(&cell.next)) } }
+                @if !cell.next.is_empty() && matches!(look, DisplayState::Held | DisplayState::Alarm) { p { "Next: " (shown(&cell.next)) } }
                 p .quiet { (cell.heard()) }
             }
         }
     }
 }
 
-fn of_part(cell: &CellNow) -> Markup {
+fn of_part(cell: &CellSummary) -> Markup {
     let Some(run) = &cell.run else { return Markup::default() };
     html! {
         p {
@@ -192,8 +192,8 @@ fn of_part(cell: &CellNow) -> Markup {
 mod tests {
     use super::*;
 
-    fn cell(state: &str, heard_s: Option<f64>, alarms: i32) -> CellNow {
-        CellNow {
+    fn cell(state: &str, heard_s: Option<f64>, alarms: i32) -> CellSummary {
+        CellSummary {
             name: "<script>".into(),
             heard_s,
             run: Some("r&s".into()),
@@ -214,18 +214,18 @@ mod tests {
     fn a_cell_that_is_silent_is_never_shown_at_work() {
         for heard in [None, Some(61.0), Some(1e9), Some(f64::NAN)] {
             let silent = cell("Execute", heard.filter(|heard| !heard.is_nan()), 0);
-            assert_eq!(silent.look(), Look::Silent);
+            assert_eq!(silent.display_state(), DisplayState::Silent);
             let card = card(&silent).into_string();
             assert!(card.contains("is not known") && !card.contains("left") && !card.contains("runs"), "{card}");
         }
         let looks = [
-            ("Execute", 0, Look::Runs),
-            ("Execute", 1, Look::Alarm),
-            ("Held", 0, Look::Held),
-            ("Idle", 0, Look::Still),
+            ("Execute", 0, DisplayState::Runs),
+            ("Execute", 1, DisplayState::Alarm),
+            ("Held", 0, DisplayState::Held),
+            ("Idle", 0, DisplayState::Still),
         ];
         for (state, alarms, look) in looks {
-            assert_eq!(cell(state, Some(1.0), alarms).look(), look);
+            assert_eq!(cell(state, Some(1.0), alarms).display_state(), look);
         }
     }
 

@@ -11,7 +11,7 @@ use super::super::ToSql;
 use super::super::error::PlantError;
 use super::super::link::Link;
 use super::rank::{ENOUGH, holm, rank_sum};
-use super::selection::{Asked, Selection, mark};
+use super::selection::{SelectionQuery, Selection, mark};
 use super::words::{encoded, interval, share, shown, um};
 use super::{Made, Shared, Unmade, page};
 
@@ -36,16 +36,16 @@ struct Cell {
 pub(super) async fn cells(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<SelectionQuery>,
     RawQuery(query): RawQuery,
 ) -> Response {
     let after = query.as_deref().unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("after="));
     page(&session, made(&plant, &asked, after.and_then(|after| after.parse().ok()).unwrap_or(0))).await
 }
 
-async fn made(plant: &Shared, asked: &Asked, after: usize) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Made, Unmade> {
     let link = plant.lease().await?;
-    let selection = Selection::of(&link, asked).await?;
+    let selection = Selection::from_query(&link, asked).await?;
     let form = selection.form(&link, "/cells", &["recipe", "grinder", "cmm", "wheel", "probe"]).await?;
     let mut cells = read(&link, &selection, after).await?;
     let more = cells.len() > CELLS;
@@ -89,7 +89,7 @@ async fn read(link: &Link, selection: &Selection, after: usize) -> Result<Vec<Ce
     let mut given: Vec<&(dyn ToSql + Sync)> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
     given.extend([&most as &(dyn ToSql + Sync), &after]);
     let mut cells: Vec<Cell> = Vec::new();
-    for row in link.ask(&text, &given).await? {
+    for row in link.query(&text, &given).await? {
         let name: String = row.get(0);
         if cells.last().is_none_or(|last| last.name != name) {
             cells.push(Cell { name, ..Cell::default() });
@@ -148,14 +148,14 @@ fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Mark
                     td .box { (drawn(&cell.pv_um, scale)) }
                     td .n { (share(cell.accepted, cell.ended)) } td .n { (share(cell.at_once, cell.ended)) } td .n .quiet { (interval(cell.at_once, cell.ended)) }
                     td .n { @if cell.cycles.is_empty() { "–" } @else { (format!("{:.2}", mean(&cell.cycles))) } }
-                    td { (told(*chance)) }
+                    td { (significance(*chance)) }
                 }
             }
         }
     }
 }
 
-fn told(chance: Option<f64>) -> Markup {
+fn significance(chance: Option<f64>) -> Markup {
     html! {
         @match chance {
             None => { span .quiet { "too few to tell" } }

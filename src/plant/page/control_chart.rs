@@ -47,7 +47,7 @@ pub(super) struct Limits {
 
 impl Limits {
     /// Computes the limits; `None` for fewer than two values.
-    pub(super) fn of(values: &[f64]) -> Option<Self> {
+    pub(super) fn from_values(values: &[f64]) -> Option<Self> {
         let ranges = ranges(values);
         if ranges.is_empty() {
             return None;
@@ -93,7 +93,7 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
     // A tolerance far above all values would flatten the chart, so it is not drawn.
     let tolerance = values.iter().filter_map(|value| value.limit_um).fold(0.0, f64::max);
     let shows = tolerance > 0.0 && tolerance < 4.0 * most;
-    let scale = Scale { most: if shows { most.max(tolerance) } else { most }, count: values.len(), height: 280.0 };
+    let scale = Scale { max: if shows { most.max(tolerance) } else { most }, count: values.len(), height: 280.0 };
     let steps = if shows { tolerance_line(values, &scale) } else { Vec::new() };
     // The label is next to the end of the line; the line itself is stepped.
     let last = values.last().and_then(|value| value.limit_um).filter(|_| shows);
@@ -110,7 +110,7 @@ pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &
         Across { class: "control", name: "upper limit", at: limits.range_upper },
     ];
     let most = all.iter().fold(limits.range_upper, |most, value| most.max(*value));
-    let scale = Scale { most, count: values.len(), height: 150.0 };
+    let scale = Scale { max: most, count: values.len(), height: 150.0 };
     let is_out = |value| value > limits.range_upper;
     drawn(&format!("Moving range of {name}, µm"), class, &values[1..], &all, &lines, &scale, is_out, &[])
 }
@@ -173,9 +173,9 @@ fn drawn(
                     @let (x, y) = at(k);
                     a href=(format!("/runs/{}", value.run)) {
                         @if is_out(all[k]) {
-                            path .out d=(format!("M{x:.1} {:.1} l7 12 h-14 Z", y - 8.0)) { (told(value, all[k], true)) }
+                            path .out d=(format!("M{x:.1} {:.1} l7 12 h-14 Z", y - 8.0)) { (tooltip(value, all[k], true)) }
                         } @else {
-                            circle cx=(format!("{x:.1}")) cy=(format!("{y:.1}")) r="3" { (told(value, all[k], false)) }
+                            circle cx=(format!("{x:.1}")) cy=(format!("{y:.1}")) r="3" { (tooltip(value, all[k], false)) }
                         }
                     }
                 }
@@ -185,7 +185,7 @@ fn drawn(
 }
 
 /// Returns the tooltip of a point.
-fn told(value: &Value, um: f64, is_out: bool) -> Markup {
+fn tooltip(value: &Value, um: f64, is_out: bool) -> Markup {
     let out = if is_out { ", OUT OF LIMITS" } else { "" };
     html! { title { (shown(&value.serial)) ", " (shown(&value.cell)) ", " (value.when) ": " (format!("{um:.3}")) " µm" (out) } }
 }
@@ -202,7 +202,7 @@ fn apart(mut at: Vec<f64>) -> Vec<f64> {
 
 /// Scale of a chart: parts in their order on the x axis, µm from 0 upwards on the y axis.
 struct Scale {
-    most: f64,
+    max: f64,
     count: usize,
     height: f64,
 }
@@ -214,17 +214,17 @@ impl Scale {
     }
 
     fn y(&self, value: f64) -> f64 {
-        let share = if self.most > 0.0 { value / (1.05 * self.most) } else { 0.0 };
+        let share = if self.max > 0.0 { value / (1.05 * self.max) } else { 0.0 };
         self.height - BOTTOM - share * (self.height - TOP - BOTTOM - 8.0)
     }
 
     /// Returns the ticks: about four round values.
     fn ticks(&self) -> Vec<f64> {
-        let step = round_step(self.most / 4.0);
+        let step = round_step(self.max / 4.0);
         // Rounds, so that a tick is 0.6 and not 0.6000000000000001.
         let per_step = 10f64.powf(-step.log10().floor());
         let round = |tick: f64| (tick * per_step).round() / per_step;
-        (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.most).map(round).collect()
+        (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.max).map(round).collect()
     }
 
     /// Returns the indices of the values whose day is written on the axis.
@@ -254,7 +254,7 @@ mod tests {
     fn the_limits_are_those_of_a_worked_example() {
         // NIST/SEMATECH e-Handbook 6.3.2.2: ten batches, mean 50.81, mean range 1.8778, limits 45.82 and 55.80.
         let flow = [49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1];
-        let limits = Limits::of(&flow).unwrap();
+        let limits = Limits::from_values(&flow).unwrap();
         let near = |value: f64, known: f64| (value - known).abs() < 2e-3;
         assert!(near(limits.mean, 50.81) && near(limits.mean_range, 1.8778), "{limits:?}");
         assert!(near(limits.upper, 55.8041) && near(limits.lower.unwrap(), 45.8159), "{limits:?}");
@@ -264,10 +264,10 @@ mod tests {
 
     #[test]
     fn no_limit_lies_where_no_figure_can() {
-        let limits = Limits::of(&[1.0, 4.0, 1.0]).unwrap();
+        let limits = Limits::from_values(&[1.0, 4.0, 1.0]).unwrap();
         assert_eq!(limits.lower, None);
         assert!(!limits.is_out(0.0));
-        assert_eq!((Limits::of(&[1.0]), Limits::of(&[])), (None, None));
+        assert_eq!((Limits::from_values(&[1.0]), Limits::from_values(&[])), (None, None));
     }
 
     #[test]
@@ -284,7 +284,7 @@ mod tests {
         let mut values: Vec<Value> = (0..30).map(|k| value(3.0 + 0.1 * f64::from(k % 3))).collect();
         values.push(value(9.0));
         let all: Vec<f64> = values.iter().map(|value| value.um).collect();
-        let limits = Limits::of(&all).unwrap();
+        let limits = Limits::from_values(&all).unwrap();
         let svg = individuals("PV", "pv", &values, &limits).into_string();
         assert_eq!((svg.matches("class=\"out\"").count(), svg.matches("<circle").count()), (1, 30), "{svg}");
         assert!(!svg.contains("<b>") && svg.contains("&lt;b&gt;") && !svg.contains("NaN"), "{svg}");

@@ -11,12 +11,12 @@ use regrind_report::{DfqPart, dfq_of_parts};
 use super::super::{Row, ToSql};
 use super::control_chart::Value;
 use super::run::file;
-use super::selection::{Asked, Selection};
+use super::selection::{SelectionQuery, Selection};
 use super::trend::parts;
 use super::{PlantPage, Shared, Unmade, unmade, within};
 
 /// Maximum number of parts in a file.
-const MOST: i64 = 20_000;
+const MAX_PARTS: i64 = 20_000;
 
 /// Columns of the file, in order: those of the view `part_run`.
 const COLUMNS: [&str; 26] = [
@@ -65,7 +65,7 @@ const NUMBERS: [&str; 11] = [
 pub(super) async fn csv(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<SelectionQuery>,
 ) -> Response {
     match within(csv_of(&plant, &asked)).await {
         Ok(text) => file("parts.csv", "text/csv; charset=utf-8", text),
@@ -73,18 +73,18 @@ pub(super) async fn csv(
     }
 }
 
-async fn csv_of(plant: &PlantPage, asked: &Asked) -> Result<String, Unmade> {
+async fn csv_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Unmade> {
     let link = plant.lease().await?;
-    let selection = Selection::of(&link, asked).await?;
+    let selection = Selection::from_query(&link, asked).await?;
     let (condition, values) = selection.condition();
     let column = |name: &&str| match *name {
         time @ ("began" | "ended") => format!("to_char({time}, 'YYYY-MM-DD\"T\"HH24:MI:SS\"Z\"')"),
         other => format!("{other}::text"),
     };
     let columns = COLUMNS.iter().map(column).collect::<Vec<_>>().join(", ");
-    let text = format!("SELECT {columns} FROM part_run WHERE {condition} ORDER BY began DESC LIMIT {MOST}");
+    let text = format!("SELECT {columns} FROM part_run WHERE {condition} ORDER BY began DESC LIMIT {MAX_PARTS}");
     let values: Vec<_> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
-    let rows = link.ask(&text, &values).await?;
+    let rows = link.query(&text, &values).await?;
     let mut file = format!("{}\r\n", COLUMNS.join(","));
     for row in &rows {
         line(&mut file, row);
@@ -114,7 +114,7 @@ fn quoted(text: &str) -> String {
 pub(super) async fn dfq(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<SelectionQuery>,
 ) -> Response {
     match within(dfq_of(&plant, &asked)).await {
         Ok(text) => file("parts.dfq", "text/plain; charset=utf-8", text),
@@ -122,10 +122,10 @@ pub(super) async fn dfq(
     }
 }
 
-async fn dfq_of(plant: &PlantPage, asked: &Asked) -> Result<String, Unmade> {
+async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Unmade> {
     let link = plant.lease().await?;
-    let selection = Selection::of(&link, asked).await?;
-    let parts = parts(&link, &selection, MOST).await?;
+    let selection = Selection::from_query(&link, asked).await?;
+    let parts = parts(&link, &selection, MAX_PARTS).await?;
     if parts.is_empty() {
         return Err(Unmade::NotHere(
             "nothing was measured of such parts; choose others on the page of the trend".into(),

@@ -27,19 +27,19 @@ const AGAIN_S: u32 = 10;
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Asked {
+pub(super) struct HomeQuery {
     parts: String,
 }
 
 pub(super) async fn home(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<HomeQuery>,
 ) -> Response {
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &HomeQuery) -> Result<Made, Unmade> {
     let link = plant.lease().await?;
     let cells = cells::read(&link).await?;
     let simulated = is_simulated(&link, &asked.parts).await?;
@@ -51,7 +51,7 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
             p .tally { (cells::tally(&cells)) }
             (cells::cards(&cells))
             h2 { "Parts in " (DAYS) " days " (mark(simulated)) }
-            (counted.told(simulated))
+            (counted.render(simulated))
             h2 #queue { "Queue" }
             (queue)
             h2 #incidents { "What should not have been" }
@@ -81,7 +81,7 @@ impl Counted {
             GROUP BY GROUPING SETS ((day), (recipe), (cell)) ORDER BY 7, 1, 2, 3";
         let mut counted = Self::default();
         let mut by_day = Vec::new();
-        for row in link.ask(text, &[&first.to_string(), &simulated]).await? {
+        for row in link.query(text, &[&first.to_string(), &simulated]).await? {
             let count = Count { ended: row.get(3), accepted: row.get(4), at_once: row.get(5) };
             let name = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_else(|| "not told".into());
             match row.get::<_, i32>(6) {
@@ -104,7 +104,7 @@ impl Counted {
         Ok(counted)
     }
 
-    fn told(&self, simulated: bool) -> Markup {
+    fn render(&self, simulated: bool) -> Markup {
         let other = if simulated { "real" } else { "simulated" };
         html! {
             div .counted {
@@ -143,7 +143,7 @@ async fn queue(link: &Link) -> Result<Markup, PlantError> {
     let text = "SELECT serial, recipe, version, coalesce(for_cell, 'any'), coalesce(to_char(due, 'YYYY-MM-DD'), ''), state, coalesce(cell, ''),
             coalesce(to_char(leased_until, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, ''), due < (now() AT TIME ZONE 'UTC')::date
         FROM work_now ORDER BY due NULLS LAST, id LIMIT $1";
-    let rows = link.ask(text, &[&QUEUED]).await?;
+    let rows = link.query(text, &[&QUEUED]).await?;
     let line = |row: &Row| {
         let [serial, recipe, for_cell, due, state, cell, until, run] =
             [0, 1, 3, 4, 5, 6, 7, 8].map(|k| row.get::<_, &str>(k));
@@ -176,7 +176,7 @@ async fn queue(link: &Link) -> Result<Markup, PlantError> {
 async fn incidents(link: &Link) -> Result<Markup, PlantError> {
     let text = "SELECT to_char(at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(cell, by), coalesce(run, ''), what, words FROM incident_told
         ORDER BY at DESC LIMIT $1";
-    let rows = link.ask(text, &[&INCIDENTS]).await?;
+    let rows = link.query(text, &[&INCIDENTS]).await?;
     Ok(html! {
         @if rows.is_empty() { p .quiet { "Nothing: no broken chain, no refusal." } } @else {
             div .wide { table {

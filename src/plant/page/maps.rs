@@ -18,15 +18,15 @@ use super::words::{shown, um};
 use super::{Made, Shared, Unmade, page};
 
 /// Maximum number of maps on the page.
-const MOST: usize = 4;
+const MAX_MAPS: usize = 4;
 /// Maximum size of a map, in pixels of the page.
-const LARGEST: [f64; 2] = [400.0, 400.0];
+const MAX_SIZE_PX: [f64; 2] = [400.0, 400.0];
 /// Maximum length of a title, in characters. A longer title would be wider than the picture.
 const TITLE: usize = 52;
 
 /// Requested map: a run and a cycle; without a cycle, the last cycle of the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Asked {
+struct MapRequest {
     run: i32,
     cycle: Option<i32>,
 }
@@ -50,22 +50,22 @@ pub(super) async fn maps(
     Extension(session): Extension<Session>,
     RawQuery(query): RawQuery,
 ) -> Response {
-    let asked = asked(query.as_deref().unwrap_or_default());
+    let asked = parse_requests(query.as_deref().unwrap_or_default());
     page(&session, made(&plant, &asked)).await
 }
 
 /// Parses a query such as `run=17&run=18:2`: ids of runs, each with an optional cycle after a colon.
-fn asked(query: &str) -> Vec<Asked> {
+fn parse_requests(query: &str) -> Vec<MapRequest> {
     let named = query.split('&').filter_map(|pair| pair.strip_prefix("run="));
     let one = |text: &str| {
         let text = text.replace("%3A", ":").replace("%3a", ":");
         let (run, cycle) = text.split_once(':').map_or((text.as_str(), None), |(run, cycle)| (run, Some(cycle)));
-        Some(Asked { run: run.parse().ok()?, cycle: cycle.map(str::parse).transpose().ok()? })
+        Some(MapRequest { run: run.parse().ok()?, cycle: cycle.map(str::parse).transpose().ok()? })
     };
-    named.filter_map(one).take(MOST).collect()
+    named.filter_map(one).take(MAX_MAPS).collect()
 }
 
-async fn made(plant: &Shared, asked: &[Asked]) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<Made, Unmade> {
     if asked.is_empty() {
         return Err(Unmade::Nonsense(
             "name the runs, as in /maps?run=17&run=18, or tick them in the list of parts".into(),
@@ -88,10 +88,10 @@ async fn made(plant: &Shared, asked: &[Asked]) -> Result<Made, Unmade> {
     Ok(Made { title: "Maps".into(), again_s: None, main })
 }
 
-async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> {
+async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, Unmade> {
     let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
         WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
-    let rows = link.ask(text, &[&asked.run, &asked.cycle]).await?;
+    let rows = link.query(text, &[&asked.run, &asked.cycle]).await?;
     let Some(row) = rows.first() else { return without(link, asked).await };
     let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
     let name = words(7);
@@ -109,9 +109,9 @@ async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> 
 }
 
 /// Returns the entry of a run that has no map, for display next to runs that have one.
-async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
+async fn without(link: &Link, asked: MapRequest) -> Result<Map, Unmade> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
-    let rows = link.ask(text, &[&asked.run]).await?;
+    let rows = link.query(text, &[&asked.run]).await?;
     let missing = || Unmade::NotHere(format!("the plant has no run {} that made a part", asked.run));
     let row = rows.first().ok_or_else(missing)?;
     let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
@@ -130,7 +130,7 @@ async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
 
 /// Reads a map from the files of a run; in words, why there is none.
 async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, Unmade> {
-    let rows = link.ask("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
+    let rows = link.query("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
     let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
     let sha256: Vec<u8> = row.get(0);
     let Some(content) = content(link, plant.artefacts.as_ref(), &sha256).await? else {
@@ -177,7 +177,7 @@ fn drawn(map: &Map, limit_um: f64) -> Markup {
     let title: String = title.chars().take(TITLE).collect();
     let svg = map.samples.as_ref().map_err(Clone::clone).and_then(|samples| {
         let heat = HeatMap::new(&title, "deviation", "\u{b5}m", samples)
-            .and_then(|heat| heat.of_nodes().at_most(LARGEST).with_limit(limit_um));
+            .and_then(|heat| heat.of_nodes().with_max_size(MAX_SIZE_PX).with_limit(limit_um));
         heat.and_then(|heat| heat.to_svg()).map_err(|error| error.to_string())
     });
     match svg {
@@ -196,10 +196,10 @@ mod tests {
 
     #[test]
     fn runs_are_named_by_numbers_alone() {
-        let of = |run, cycle| Asked { run, cycle };
-        assert_eq!(asked("run=17&run=18:2&run=9%3A1&x=3"), [of(17, None), of(18, Some(2)), of(9, Some(1))]);
-        assert_eq!(asked("run=1;DROP&run=&run=%3A&run=1:x"), []);
-        assert_eq!(asked(&"run=1&".repeat(9)).len(), MOST);
+        let of = |run, cycle| MapRequest { run, cycle };
+        assert_eq!(parse_requests("run=17&run=18:2&run=9%3A1&x=3"), [of(17, None), of(18, Some(2)), of(9, Some(1))]);
+        assert_eq!(parse_requests("run=1;DROP&run=&run=%3A&run=1:x"), []);
+        assert_eq!(parse_requests(&"run=1&".repeat(9)).len(), MAX_MAPS);
     }
 
     #[test]

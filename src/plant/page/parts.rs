@@ -14,13 +14,13 @@ use super::words::{encoded, shown, um};
 use super::{Made, Shared, Unmade, page};
 
 /// Maximum number of parts on a page.
-const MOST: usize = 100;
+const MAX_ROWS: usize = 100;
 /// Upper bound of all texts with a given beginning: the last character of Unicode.
 const LAST: char = char::MAX;
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Asked {
+pub(super) struct PartsQuery {
     serial: String,
     /// Id of the run after which this page begins.
     after: Option<i32>,
@@ -29,16 +29,16 @@ pub(super) struct Asked {
 pub(super) async fn parts(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<PartsQuery>,
 ) -> Response {
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &PartsQuery) -> Result<Made, Unmade> {
     let serial = asked.serial.trim().replace('\0', "");
     let link = plant.lease().await?;
     let rows = read(&link, &serial, asked.after).await?;
-    let next = (rows.len() > MOST).then(|| rows[MOST - 1].get::<_, i32>(0));
+    let next = (rows.len() > MAX_ROWS).then(|| rows[MAX_ROWS - 1].get::<_, i32>(0));
     let main = html! {
         main .list .plant {
             h1 { "Parts" }
@@ -47,7 +47,7 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
             }
             @if rows.is_empty() { p { "No part's serial number begins so. Capital and small letters are told apart." } } @else {
                 form method="get" action="/maps" {
-                    div .wide { (table(&rows[..rows.len().min(MOST)])) }
+                    div .wide { (table(&rows[..rows.len().min(MAX_ROWS)])) }
                     p { "Tick two to four: " button { "Maps side by side" } }
                 }
             }
@@ -63,7 +63,7 @@ const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 
 /// Reads one row more than a page shows, in the order of an index. The database sorts nothing, however many serial
 /// numbers match.
 async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
-    let most = MOST as i64 + 1;
+    let most = MAX_ROWS as i64 + 1;
     let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);
     let last = format!("{serial}{LAST}");
     let mut text = format!("SELECT {COLUMNS} FROM part_run WHERE true");
@@ -87,7 +87,7 @@ async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>,
         true => " ORDER BY began DESC, id DESC LIMIT $1",
         false => " ORDER BY serial USING ~<~, began DESC, id DESC LIMIT $1",
     };
-    link.ask(&text, &values).await
+    link.query(&text, &values).await
 }
 
 fn table(rows: &[Row]) -> Markup {

@@ -40,7 +40,7 @@ impl Run {
 
     async fn read(link: &Link, id: i32) -> Result<Self, Unmade> {
         let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
-        let mut rows = link.ask(&text, &[&id]).await?;
+        let mut rows = link.query(&text, &[&id]).await?;
         let row = rows.pop().ok_or_else(|| Unmade::NotHere(format!("the plant has no run {id} that made a part")))?;
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
@@ -75,7 +75,7 @@ pub(super) async fn by_name(
     let found = async {
         let link = plant.lease().await?;
         let [cell, name] = [cell, name].map(|text| text.replace('\0', ""));
-        let rows = link.ask("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
+        let rows = link.query("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
         let missing = || Unmade::NotHere(format!("the plant has nothing of the run {name} of {cell} yet"));
         rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
     };
@@ -112,7 +112,7 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
             h1 { (shown(&title)) " " (mark(run.is_simulated())) }
             (about(&run))
             h2 { "The copy of the plant" }
-            (told(proof.as_deref()))
+            (proof_text(proof.as_deref()))
             @if let Some(proof) = proof.as_ref().filter(|proof| proof.found.is_ok()) { (made_of_it(&run, proof)) }
             h2 { "Cycles" }
             (cycles)
@@ -151,7 +151,7 @@ fn about(run: &Run) -> Markup {
 }
 
 /// Describes the proof in words.
-fn told(proof: Option<&Proof>) -> Markup {
+fn proof_text(proof: Option<&Proof>) -> Markup {
     let Some(proof) = proof else {
         return html! { p role="status" { "It is being brought together and proven; this page shows what comes of it by itself." } };
     };
@@ -191,7 +191,7 @@ fn made_of_it(run: &Run, proof: &Proof) -> Markup {
 async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
     let text = "SELECT cycle, pv_um, pv_u_um, rms_um, rms_u_um, verdict, reason, expected_pv_um, pv_limit_um, rms_limit_um FROM cycle_figure
         WHERE run_id = $1 ORDER BY cycle LIMIT 1000";
-    let rows = link.ask(text, &[&id]).await?;
+    let rows = link.query(text, &[&id]).await?;
     let limits = rows.last().map(|row| [row.get::<_, Option<f64>>(8), row.get(9)]);
     Ok(html! {
         @if rows.is_empty() { p .quiet { "No cycle was told of yet." } } @else {
@@ -219,7 +219,7 @@ async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
 /// Returns the cycles that have an error map.
 async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
     let rows = link
-        .ask("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
+        .query("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
         .await?;
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }

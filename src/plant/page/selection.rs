@@ -28,7 +28,7 @@ const NAMES: i64 = 5000;
 /// What an address says; what it does not say is chosen.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Asked {
+pub(super) struct SelectionQuery {
     recipe: Option<String>,
     cell: String,
     grinder: String,
@@ -59,13 +59,13 @@ pub(super) struct Selection {
 impl Selection {
     /// Builds the selection from an address. Defaults: real parts if there are any, the recipe of the newest part, and
     /// the last days.
-    pub(super) async fn of(link: &Link, asked: &Asked) -> Result<Self, Unmade> {
+    pub(super) async fn from_query(link: &Link, asked: &SelectionQuery) -> Result<Self, Unmade> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
             Some(recipe) => recipe.clone(),
             None => newest_recipe(link, simulated).await?,
         };
-        let Asked { cell, grinder, cmm, wheel, probe, since, until, at, .. } = asked.clone();
+        let SelectionQuery { cell, grinder, cmm, wheel, probe, since, until, at, .. } = asked.clone();
         let today = today();
         let until = day(&until)?.unwrap_or(today);
         let before = until.checked_sub(DAYS.days()).unwrap_or(Date::MIN);
@@ -113,7 +113,7 @@ impl Selection {
 
     /// Renders the form that sets the selection.
     pub(super) async fn form(&self, link: &Link, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
-        let rows = link.ask("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
+        let rows = link.query("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
         let chosen = |(kind, word): &(&str, &str), name: &String| {
             let mut known: Vec<&str> = names.iter().filter(|(of, _)| of == kind).map(|(_, name)| *name).collect();
@@ -159,7 +159,7 @@ pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, Plant
         "real" => Ok(false),
         "simulated" => Ok(true),
         _ => {
-            let rows = link.ask("SELECT NOT EXISTS (SELECT FROM part_run WHERE NOT simulation)", &[]).await?;
+            let rows = link.query("SELECT NOT EXISTS (SELECT FROM part_run WHERE NOT simulation)", &[]).await?;
             Ok(rows.first().is_some_and(|row| row.get(0)))
         }
     }
@@ -168,7 +168,7 @@ pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, Plant
 async fn newest_recipe(link: &Link, simulated: bool) -> Result<String, PlantError> {
     let world = if simulated { "simulation" } else { "NOT simulation" };
     let text = format!("SELECT recipe FROM part_run WHERE {world} AND recipe IS NOT NULL ORDER BY began DESC LIMIT 1");
-    let rows = link.ask(&text, &[]).await?;
+    let rows = link.query(&text, &[]).await?;
     Ok(rows.first().map_or_else(String::new, |row| row.get(0)))
 }
 

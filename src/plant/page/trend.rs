@@ -9,12 +9,12 @@ use regrind_page::Session;
 use super::super::error::PlantError;
 use super::super::link::Link;
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
-use super::selection::{ALL_KINDS, Asked, Selection, mark};
+use super::selection::{ALL_KINDS, SelectionQuery, Selection, mark};
 use super::words::{shown, um};
 use super::{Made, Shared, Unmade, page};
 
 /// Maximum number of parts in a chart, and of parts in the list of those out of limits.
-const MOST: i64 = 250;
+const MAX_PARTS: i64 = 250;
 const LISTED: usize = 20;
 
 /// Part with its two figures.
@@ -26,21 +26,21 @@ pub(super) struct Part {
 pub(super) async fn trend(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Query(asked): Query<Asked>,
+    Query(asked): Query<SelectionQuery>,
 ) -> Response {
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<Made, Unmade> {
     let link = plant.lease().await?;
-    let selection = Selection::of(&link, asked).await?;
+    let selection = Selection::from_query(&link, asked).await?;
     let form = selection.form(&link, "/trend", &ALL_KINDS).await?;
-    let parts = parts(&link, &selection, MOST).await?;
+    let parts = parts(&link, &selection, MAX_PARTS).await?;
     let main = html! {
         main .list .plant {
             h1 { "Trend " (mark(selection.simulated)) }
             (form)
-            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MOST { ", the newest" } "." }
+            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MAX_PARTS { ", the newest" } "." }
             @if selection.recipe().is_empty() {
                 p .no { "Parts of several recipes are in one chart: limits of such a chart tell nothing. Choose a recipe." }
             }
@@ -65,7 +65,7 @@ pub(super) async fn parts(link: &Link, selection: &Selection, most: i64) -> Resu
             FROM {view} WHERE {first}pv_um IS NOT NULL AND {condition} ORDER BY began DESC LIMIT {most}"
     );
     let values: Vec<_> = values.iter().map(|value| value as &(dyn super::super::ToSql + Sync)).collect();
-    let rows = link.ask(&text, &values).await?;
+    let rows = link.query(&text, &values).await?;
     let part = |row: &super::super::Row| {
         let value = |um: f64, k: usize| Value {
             run: row.get(0),
@@ -101,7 +101,7 @@ fn charts(parts: &[Part]) -> Markup {
 
 fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
-    let Some(limits) = Limits::of(&all) else { return Markup::default() };
+    let Some(limits) = Limits::from_values(&all) else { return Markup::default() };
     let out: Vec<&Value> = values.iter().rev().filter(|value| limits.is_out(value.um)).collect();
     let over = values.iter().filter(|value| value.limit_um.is_some_and(|limit| value.um > limit)).count();
     html! {

@@ -209,7 +209,7 @@ fn who(role: Role) -> &'static str {
 fn alarms() -> String {
     let mut text = String::new();
     for (k, id) in AlarmId::ALL.iter().enumerate() {
-        let alarm = id.in_general();
+        let alarm = id.generic_alarm();
         let name = serde_json::to_value(id).unwrap();
         let _ = writeln!(text, "{}### {}\n", if k == 0 { "" } else { "\n" }, alarm.what.trim_end_matches('.'));
         let _ = writeln!(text, "{}\n", alarm.consequence);

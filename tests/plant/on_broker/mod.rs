@@ -15,13 +15,13 @@ use crate::peers::Peer;
 use crate::program::{Running, regrind, run, small_recipe};
 
 /// Cell that publishes to a broker, and a host that listens there.
-struct Told {
+struct PublishingCell {
     home: TempDir,
     broker: Broker,
     host: Peer,
 }
 
-impl Told {
+impl PublishingCell {
     fn new() -> Self {
         let home = TempDir::new().unwrap();
         let broker = Broker::start();
@@ -32,7 +32,7 @@ impl Told {
         Self { home, broker, host }
     }
 
-    fn tell(&self) -> Running {
+    fn publish(&self) -> Running {
         Running::new(regrind(&["tell", "--plant", "plant.toml", "--json"], self.home.path()))
     }
 }
@@ -80,8 +80,8 @@ fn no_fault(host: &mut Peer) {
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
 fn a_host_sees_what_the_cell_tells_and_its_commands_are_refused_and_recorded() {
-    let mut told = Told::new();
-    let mut teller = told.tell();
+    let mut told = PublishingCell::new();
+    let mut teller = told.publish();
     let birth = heard(&mut told.host, 0, "NBIRTH");
     let metrics = &birth["metrics"];
     assert_eq!(
@@ -160,8 +160,8 @@ fn a_host_sees_what_the_cell_tells_and_its_commands_are_refused_and_recorded() {
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
 fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
-    let mut told = Told::new();
-    let mut teller = told.tell();
+    let mut told = PublishingCell::new();
+    let mut teller = told.publish();
     heard(&mut told.host, 0, "NBIRTH");
 
     let from = told.host.place();
@@ -178,11 +178,11 @@ fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
     teller.signal("KILL");
     assert_eq!(heard(&mut told.host, from, "NDEATH")["metrics"]["bdSeq"], 1, "the broker tells it");
     let from = told.host.place();
-    let mut teller = told.tell();
+    let mut teller = told.publish();
     assert_eq!(heard(&mut told.host, from, "NBIRTH")["metrics"]["bdSeq"], 2);
 
     // Two publishers of the same cell take turns instead of interfering.
-    let mut second = told.tell();
+    let mut second = told.publish();
     let from = told.host.place();
     teller.signal("TERM");
     assert_eq!(teller.end().0, 0);
@@ -196,7 +196,7 @@ fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
 fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
-    let mut told = Told::new();
+    let mut told = PublishingCell::new();
     let recipe = small_recipe(told.home.path(), 1000.0).display().to_string();
     let (code, out, errors) = run(&["run", &recipe, "--cell", "sim", "--plant", "plant.toml"], told.home.path());
     assert_eq!(code, 0, "{out}{errors}");
@@ -206,7 +206,7 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
     assert_eq!(values["Last Run/Accepted"], true);
     heard(&mut told.host, 0, "NDEATH");
 
-    let mut teller = told.tell();
+    let mut teller = told.publish();
     let (running, folder, _) = held_run(told.home.path(), 200.0);
     until_value(&mut told.host, "Status/StateCurrent", &json!(11));
     running.signal("KILL");
@@ -225,7 +225,7 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
     teller.signal("TERM");
     assert_eq!(teller.end().0, 0);
     let from = told.host.place();
-    let mut teller = told.tell();
+    let mut teller = told.publish();
     let born = heard(&mut told.host, from, "NBIRTH");
     assert!(born["nulls"].as_array().unwrap().contains(&json!("Status/StateCurrent")), "{born}");
     assert_eq!(born["metrics"]["Run"], json!(folder.file_name().unwrap().to_str().unwrap()));
@@ -237,8 +237,8 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
 fn a_run_that_answers_no_more_is_not_told_as_it_was() {
-    let mut told = Told::new();
-    let mut teller = told.tell();
+    let mut told = PublishingCell::new();
+    let mut teller = told.publish();
     let (running, folder, _) = held_run(told.home.path(), 200.0);
     until_value(&mut told.host, "Status/StateCurrent", &json!(11));
     running.signal("STOP");

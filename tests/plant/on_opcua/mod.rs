@@ -21,7 +21,7 @@ fn home() -> TempDir {
 }
 
 /// Starts publishing; returns the address.
-fn tell(home: &Path) -> (Running, String) {
+fn start_publishing(home: &Path) -> (Running, String) {
     let mut teller = Running::new(regrind(&["tell", "--plant", "plant.toml", "--json"], home));
     let line = teller.line("address", |line| line.contains("\"tells\""));
     let said: Value = serde_json::from_str(&line).unwrap();
@@ -71,7 +71,7 @@ fn events(client: &mut Peer, what: &str, is_it: impl Fn(&Value) -> bool) -> Vec<
 #[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
 fn a_client_sees_the_model_of_packml_values_and_results_and_its_writes_are_refused_and_recorded() {
     let home = home();
-    let (mut teller, url) = tell(home.path());
+    let (mut teller, url) = start_publishing(home.path());
     let mut client = client(home.path(), &url);
 
     let browsed = asked(&mut client, &json!({ "browse": true }), "browse");
@@ -214,7 +214,7 @@ fn read_pv(summary: &regrind::report::RunSummary) -> Value {
 #[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
 fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
     let home = home();
-    let (teller, url) = tell(home.path());
+    let (teller, url) = start_publishing(home.path());
     let mut first = client(home.path(), &url);
     teller.signal("KILL");
     answer(&mut first, 0, "lost");
@@ -224,7 +224,7 @@ fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
     let text = fs::read_to_string(home.path().join("plant.toml")).unwrap().replace("127.0.0.1:0", address);
     fs::write(home.path().join("plant.toml"), text).unwrap();
     let (running, folder, held) = held_run(home.path(), 200.0);
-    let (mut teller, again) = tell(home.path());
+    let (mut teller, again) = start_publishing(home.path());
     assert_eq!(again, url);
     let mut second = client(home.path(), &url);
     asked(&mut second, &json!({ "subscribe": LOOKED_AT, "events": Value::Null }), "subscribed");

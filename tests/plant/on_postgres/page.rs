@@ -21,14 +21,14 @@ const HOSTILE: &str =
 const FLOW: [f64; 10] = [49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1];
 
 /// Page of a plant, and its visitor.
-struct Shown {
+struct ServedPage {
     _page: Running,
     url: String,
     visitor: Visitor,
 }
 
-impl Shown {
-    fn of(plant: &Plant) -> Self {
+impl ServedPage {
+    fn serve(plant: &Plant) -> Self {
         if !plant.path("page.toml").is_file() {
             plant.somebody("page", "reader");
         }
@@ -135,7 +135,7 @@ fn plant_runs(plant: &Plant, runs: &[Planted]) -> i32 {
     first.parse().unwrap()
 }
 
-fn tell(plant: &Plant, cell: i32, ago: &str, run: Option<&str>, snapshot: &Value) {
+fn store_state(plant: &Plant, cell: i32, ago: &str, run: Option<&str>, snapshot: &Value) {
     let run = run.map_or("NULL".into(), quoted);
     let snapshot = quoted(&snapshot.to_string());
     plant.sql(&format!(
@@ -154,11 +154,11 @@ fn grinding(serial: &str) -> Value {
 fn what_one_cell_tells_amiss_leaves_the_others_alone() {
     let plant = Plant::new();
     let [one, two] = ["cell-1", "cell-2"].map(|name| cell(&plant, name));
-    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
     let odd = serde_json::json!({ "state": "Execute", "words": "odd", "simulation": "perhaps", "cycle": 3_000_000_000_u64, "max_cycles": -1,
         "progress": { "done": 1e300, "total": "many", "left_s": [true, {}] }, "alarms": {} });
-    tell(&plant, two, "1 second", Some("run"), &odd);
-    let said = words(&Shown::of(&plant).text("/"));
+    store_state(&plant, two, "1 second", Some("run"), &odd);
+    let said = words(&ServedPage::serve(&plant).text("/"));
     assert!(said.contains("cell-1 grinding SN-0042 Mirror, cycle 2 of at most 6 30 of 100, 2 – 4 min left"), "{said}");
     assert!(said.contains("cell-2 odd run heard"), "{said}");
 }
@@ -168,8 +168,8 @@ fn what_one_cell_tells_amiss_leaves_the_others_alone() {
 fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
     let plant = Plant::new();
     let [one, two, three] = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
-    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
-    tell(&plant, two, "3 hours", Some("run"), &grinding("SN-0043"));
+    store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    store_state(&plant, two, "3 hours", Some("run"), &grinding("SN-0043"));
     let of = |result, cycles| Planted { cell: one, result, cycles, ..Planted::default() };
     let mut runs: Vec<Planted> = (0..5).map(|_| of("accepted", 1)).collect();
     runs.extend((0..2).map(|_| of("accepted", 3)));
@@ -184,7 +184,7 @@ fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
     plant.sql("INSERT INTO work (serial, recipe, due) SELECT 'SN-0099', sha256, current_date - 3 FROM recipe");
     plant.sql("INSERT INTO incident (cell, run, what, words) VALUES (2, 'run-7', 'a broken chain', 'record 12 does not follow')");
 
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let html = shown.text("/");
     let said = words(&html);
     assert!(said.contains("2 not heard of · 1 at work"), "{said}");
@@ -234,7 +234,7 @@ fn trends_have_the_limits_of_the_handbook_and_other_programs_read_them() {
     runs.push(Planted { cell: one, pv_um: 900.0, real: false, ..Planted::default() });
     runs.push(Planted { cell: one, pv_um: 900.0, hours: 24 * 100, ..Planted::default() });
     let first = plant_runs(&plant, &runs);
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let html = shown.text("/trend");
     let said = words(&html);
     assert!(said.contains("recipe mirror, begun") && said.contains(": 10 parts."), "{said}");
@@ -303,7 +303,7 @@ fn cells_that_differ_are_told_and_parts_are_found() {
     };
     let runs: Vec<Planted> = (0..120).map(run).collect();
     plant_runs(&plant, &runs);
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let said = words(&shown.text("/cells"));
     for cell in ["cell-1 40 3.4", "cell-2 40 3.4", "cell-3 40 4.2"] {
         assert!(said.contains(cell), "{cell}: {said}");
@@ -343,7 +343,7 @@ fn what_a_cell_is_called_or_says_is_words_on_every_page() {
     for key in ["words", "part", "next"] {
         told[key] = HOSTILE.into();
     }
-    tell(&plant, one, "1 second", Some(HOSTILE), &told);
+    store_state(&plant, one, "1 second", Some(HOSTILE), &told);
     let run = |hours| Planted { cell: one, serial: HOSTILE, recipe: HOSTILE, hours, ..Planted::default() };
     let first = plant_runs(&plant, &[run(2), run(3), run(4)]);
     let text = quoted(HOSTILE);
@@ -358,7 +358,7 @@ fn what_a_cell_is_called_or_says_is_words_on_every_page() {
         quoted(&HOSTILE[..80])
     ));
     plant.sql(&format!("INSERT INTO work (serial, recipe) SELECT {text}, sha256 FROM recipe"));
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let encoded: String = HOSTILE.bytes().map(|byte| format!("%{byte:02x}")).collect();
     let pages = [
         "/".to_owned(),
@@ -406,7 +406,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
     // An attacker with all rights has changed a record.
     plant.sql("UPDATE record SET text = replace(text, 'Ada', 'Eve') WHERE seq = 1");
     {
-        let shown = Shown::of(&plant);
+        let shown = ServedPage::serve(&plant);
         let said = words(&until_proven(&shown, "/runs/1"));
         assert!(said.contains("NOT PROVEN") && said.contains("record 1") && !said.contains("regrind-page-"), "{said}");
         for made in ["report", "qif", "dfq"] {
@@ -414,7 +414,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
         }
     }
     plant.sql("UPDATE record SET text = replace(text, 'Eve', 'Ada') WHERE seq = 1");
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let answer = shown.visitor.get(&format!("/run?cell=cell-1&name={name}"));
     assert_eq!((answer.status, answer.header("location")), (303, vec!["/runs/1"]));
     let said = words(&until_proven(&shown, "/runs/1"));
@@ -444,7 +444,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
 }
 
 /// Returns the page of a run after it shows the result of its verification.
-fn until_proven(shown: &Shown, path: &str) -> String {
+fn until_proven(shown: &ServedPage, path: &str) -> String {
     let began = Instant::now();
     loop {
         let html = shown.text(path);
@@ -462,7 +462,7 @@ fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
     let mut plant = Plant::new();
     let one = cell(&plant, "cell-1");
     plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     for _ in 0..2 {
         assert!(shown.text("/").contains("cell-1"));
         plant.postgres.kill();
@@ -481,7 +481,7 @@ fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
     assert!(shown.text("/").contains("cell-1"));
     // A page that started without the database waits for it.
     plant.postgres.kill();
-    let late = Shown::of(&plant);
+    let late = ServedPage::serve(&plant);
     assert_eq!(late.visitor.get("/").status, 503);
     plant.postgres.go_on();
     assert!(late.text("/").contains("cell-1"));
@@ -493,7 +493,7 @@ fn the_page_is_for_who_has_its_key_and_changes_nothing() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
     plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let stranger = Visitor::stranger(&shown.url);
     for path in [
         "/",
@@ -545,7 +545,7 @@ fn the_page_is_for_who_has_its_key_and_changes_nothing() {
 fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
-    tell(&plant, one, "1 second", None, &grinding("SN-1"));
+    store_state(&plant, one, "1 second", None, &grinding("SN-1"));
     let runs: Vec<Planted> = (2..30).map(|hours| Planted { cell: one, hours, ..Planted::default() }).collect();
     plant_runs(&plant, &runs);
     plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 1, 'a', '{}'), 'mirror', 1, 'a')");
@@ -598,11 +598,11 @@ fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
 fn in_a_browser_every_page_fits_a_telephone_and_fetches_nothing_from_elsewhere() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
-    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
     let runs: Vec<Planted> =
         (2..60).map(|hours| Planted { cell: one, hours, cycles: 2, ..Planted::default() }).collect();
     let first = plant_runs(&plant, &runs);
-    let shown = Shown::of(&plant);
+    let shown = ServedPage::serve(&plant);
     let mut browser = Browser::start(plant.home.path());
     let tab = browser.open(&shown.url, [390, 844]);
     tab.until(&mut browser, "document.querySelector('.cell .left')");

@@ -1,11 +1,11 @@
 //! Columns of the fit: effects on the deviations of a unit of each parameter, of each motion and of the machine's
 //! slides.
 
-use super::{Contact, ParameterKind, WheelTerm};
+use super::{SurfacePoint, ParameterKind, WheelTerm};
 use crate::geometry::bounds;
 
 /// Minimum share of a column that remains without those before it; a column with less is a combination of them.
-const NOTHING_OWN: f64 = 1e-7;
+const MIN_INDEPENDENT_SHARE: f64 = 1e-7;
 
 /// Effect of one unit of a parameter, motion or slide at every point.
 pub(super) struct Column<K> {
@@ -49,33 +49,33 @@ impl Extent {
     }
 
     /// Returns the position of a contact in the extent, from -1 to 1 along x and along y.
-    fn relative_position(&self, contact: &Contact) -> [f64; 2] {
+    fn relative_position(&self, contact: &SurfacePoint) -> [f64; 2] {
         [0, 1].map(|k| (contact.point[k] - self.middle_mm[k]) / self.half_mm[k].max(f64::MIN_POSITIVE))
     }
 }
 
 /// Returns the effect of a unit of a motion of the part: a shift along x, y, z, or a turn about x, y, z through the
 /// origin of the model frame.
-pub(super) fn of_motion(contact: &Contact, motion: usize) -> f64 {
+pub(super) fn motion_effect(contact: &SurfacePoint, motion: usize) -> f64 {
     match motion {
         0..3 => contact.normal[motion],
         _ => contact.point.coords.cross(&contact.normal)[motion - 3],
     }
 }
 
-pub(super) fn motions(contacts: &[Contact], free: [bool; 6]) -> Vec<Column<&'static str>> {
-    let of = |k: usize| Column { kind: MOTIONS[k], values: contacts.iter().map(|c| of_motion(c, k)).collect() };
+pub(super) fn motions(contacts: &[SurfacePoint], free: [bool; 6]) -> Vec<Column<&'static str>> {
+    let of = |k: usize| Column { kind: MOTIONS[k], values: contacts.iter().map(|c| motion_effect(c, k)).collect() };
     (0..6).filter(|&k| free[k]).map(of).collect()
 }
 
 /// Returns the effects of slides that are not straight, guided in z: the second and the third Legendre polynomial
 /// along either axis.
-pub(super) fn slides(contacts: &[Contact], extent: &Extent) -> Vec<Column<&'static str>> {
-    let of = |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| of_slide(c, extent, k)).collect() };
+pub(super) fn slides(contacts: &[SurfacePoint], extent: &Extent) -> Vec<Column<&'static str>> {
+    let of = |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
     (0..SLIDES.len()).map(of).collect()
 }
 
-pub(super) fn of_slide(contact: &Contact, extent: &Extent, k: usize) -> f64 {
+pub(super) fn slide_effect(contact: &SurfacePoint, extent: &Extent, k: usize) -> f64 {
     let t = extent.relative_position(contact)[k / 2];
     contact.normal.z * if k.is_multiple_of(2) { 1.5 * t * t - 0.5 } else { 2.5 * t * t * t - 1.5 * t }
 }
@@ -83,7 +83,7 @@ pub(super) fn of_slide(contact: &Contact, extent: &Extent, k: usize) -> f64 {
 impl ParameterKind {
     /// Returns the effect of a unit of the parameter on the deviation at a contact; 0 for wear, which is no function
     /// of the place.
-    pub(super) fn effect(self, contact: &Contact, term: WheelTerm) -> f64 {
+    pub(super) fn effect(self, contact: &SurfacePoint, term: WheelTerm) -> f64 {
         let n = contact.normal;
         match self {
             Self::WheelRadius => match term {
@@ -94,15 +94,15 @@ impl ParameterKind {
             Self::SettingX => -n.x,
             Self::SettingY => -n.y,
             Self::SettingZ => n.z,
-            Self::TiltX => -of_motion(contact, 3),
-            Self::TiltY => -of_motion(contact, 4),
+            Self::TiltX => -motion_effect(contact, 3),
+            Self::TiltY => -motion_effect(contact, 4),
             Self::Wear => 0.0,
         }
     }
 }
 
 pub(super) fn candidates(
-    contacts: &[Contact],
+    contacts: &[SurfacePoint],
     progress: Option<&[f64]>,
     term: WheelTerm,
     extent: &Extent,
@@ -116,7 +116,7 @@ pub(super) fn candidates(
 }
 
 /// Orthonormal columns.
-pub(super) struct Basis {
+pub(super) struct OrthonormalBasis {
     pub(super) columns: Vec<Vec<f64>>,
 }
 
@@ -128,7 +128,7 @@ pub(super) fn rms(values: &[f64]) -> f64 {
     (dot(values, values) / values.len() as f64).sqrt()
 }
 
-impl Basis {
+impl OrthonormalBasis {
     /// Builds the basis by Gram-Schmidt, applied twice; columns that add nothing are left out.
     pub(super) fn new<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
         let mut basis = Self { columns: Vec::new() };
@@ -136,7 +136,7 @@ impl Basis {
             let size = dot(column, column).sqrt();
             let mut own = basis.orthogonal_part(column);
             let left = dot(&own, &own).sqrt();
-            if left > NOTHING_OWN * size {
+            if left > MIN_INDEPENDENT_SHARE * size {
                 own.iter_mut().for_each(|v| *v /= left);
                 basis.columns.push(own);
             }

@@ -31,38 +31,38 @@
 //! other value is left to the map. More than the tolerance is not compensated without a person.
 
 mod columns;
-mod set;
-mod words;
+mod corrections;
+mod texts;
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::geometry::{Point, Vector};
-use crate::model::{EffectEstimates, ModelError, Observed, Prior};
+use crate::model::{EffectEstimates, ModelError, Observations, Prior};
 pub use columns::Extent;
-use columns::{Basis, Column, candidates, dot, motions, rms, slides};
-pub use set::{Set, Smooth, smooth_of};
+use columns::{OrthonormalBasis, Column, candidates, dot, motions, rms, slides};
+pub use corrections::{ParameterCorrections, ExplainedDeviation, explained_by_parameters};
 
 /// Minimum number of points; fewer carry no information on a dozen unknowns.
-const LEAST_POINTS: usize = 30;
+const MIN_POINTS: usize = 30;
 /// Minimum z of a normal: the wheel comes from above.
-const LEAST_NZ: f64 = 0.05;
+const MIN_NZ: f64 = 0.05;
 /// Minimum share of a column that is independent of the others; a column with less is not separable from them.
-const LEAST_OWN: f64 = 0.02;
+const MIN_OWN_SHARE: f64 = 0.02;
 /// Expanded over standard uncertainty.
-const EXPANDED: f64 = 2.0;
+const COVERAGE_FACTOR: f64 = 2.0;
 /// Mean square effect below which a column is rounding.
-const NOTHING: f64 = 1e-18;
+const MIN_EFFECT_MM2: f64 = 1e-18;
 /// Number of trial strengths of the prior of values without a tolerance, from the rms of the deviations down to
 /// [`LEAST_STRENGTH`] of it.
-const STRENGTHS: i32 = 25;
+const PRIOR_STRENGTHS: i32 = 25;
 /// Minimum trial strength, as a share of the rms of the deviations.
-const LEAST_STRENGTH: f64 = 1e-3;
+const MIN_STRENGTH_SHARE: f64 = 1e-3;
 
 /// Point of the surface and its deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Contact {
+pub struct SurfacePoint {
     /// Position in the model frame, in millimetres.
     pub point: Point,
     /// Outward unit normal of the nominal surface at the point.
@@ -170,7 +170,7 @@ impl ParameterKind {
 
 /// Estimate of one parameter.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Parameter {
+pub struct EstimatedParameter {
     /// Kind of the parameter.
     pub kind: ParameterKind,
     /// Value in millimetres or radians; 0 if it is not separable.
@@ -196,9 +196,9 @@ pub struct Parameter {
 
 /// Estimated parameters, and the residuals without those that are offered.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Parameters {
+pub struct ParameterEstimation {
     /// Parameters in the order of [`ParameterKind::ALL`].
-    pub estimates: Vec<Parameter>,
+    pub estimates: Vec<EstimatedParameter>,
     /// Root mean square of the deviations without the part that the free motions explain, in millimetres.
     pub rms_mm: f64,
     /// Root mean square of `rest_mm`, in millimetres: as `rms_mm`, but also without the offered parameters.
@@ -207,7 +207,7 @@ pub struct Parameters {
     /// form and noise.
     pub residuals_mm: Vec<f64>,
     /// Part of the deviations that parameters and slides explain together, however it divides between them.
-    pub explained: Smooth,
+    pub explained: ExplainedDeviation,
 }
 
 /// Error that prevents the separation of parameters.
@@ -247,11 +247,11 @@ pub enum ParameterError {
 /// Too few points, values that are not finite, a number of `progress` values other than that of the contacts, normals
 /// that do not point up, a radius or a tolerance that is not above 0, a negative uncertainty of the datum, and points
 /// that do not determine a field.
-pub fn parameters(
-    contacts: &[Contact],
+pub fn estimate_parameters(
+    contacts: &[SurfacePoint],
     progress: Option<&[f64]>,
     options: &ParameterOptions,
-) -> Result<Parameters, ParameterError> {
+) -> Result<ParameterEstimation, ParameterError> {
     check(contacts, progress, options)?;
     let extent = Extent::from_places(contacts.iter().map(|c| [c.point.x, c.point.y]));
     let columns = Columns {
@@ -260,7 +260,7 @@ pub fn parameters(
         candidates: candidates(contacts, progress, options.wheel_term, &extent),
     };
     let deviations: Vec<f64> = contacts.iter().map(|c| c.deviation_mm).collect();
-    let unseen = Basis::new(columns.motions.iter().map(|m| &m.values));
+    let unseen = OrthonormalBasis::new(columns.motions.iter().map(|m| &m.values));
     let rms_mm = rms(&unseen.orthogonal_part(&deviations));
     let (told, own_shares) = columns.separability();
     let fitted = columns.fitted(contacts, &told, rms_mm, options)?;
@@ -280,13 +280,13 @@ pub fn parameters(
         (0..found.len()).map(|k| if found[k].is_offered { rms(&left(Some(k))) - rest_rms_mm } else { 0.0 }).collect();
     for (parameter, removes_rms_mm) in found.iter_mut().zip(removes) {
         parameter.rms_reduction_mm = removes_rms_mm;
-        parameter.message = words::message(parameter, rest_rms_mm, options);
+        parameter.message = texts::message(parameter, rest_rms_mm, options);
     }
-    let smooth = Smooth::new(contacts, &extent, options, &fitted);
-    Ok(Parameters { estimates: found, rms_mm, residual_rms_mm: rest_rms_mm, residuals_mm: rest_mm, explained: smooth })
+    let smooth = ExplainedDeviation::new(contacts, &extent, options, &fitted);
+    Ok(ParameterEstimation { estimates: found, rms_mm, residual_rms_mm: rest_rms_mm, residuals_mm: rest_mm, explained: smooth })
 }
 
-fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOptions) -> Result<(), ParameterError> {
+fn check(contacts: &[SurfacePoint], progress: Option<&[f64]>, options: &ParameterOptions) -> Result<(), ParameterError> {
     let points = contacts.len();
     let radius_mm = options.wheel_radius_mm;
     if !(radius_mm > 0.0 && radius_mm.is_finite()) {
@@ -302,17 +302,17 @@ fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOpti
         return Err(ParameterError::Progress { found: progress.len(), points });
     }
     let finite = |k: usize| {
-        let Contact { point, normal, deviation_mm } = contacts[k];
+        let SurfacePoint { point, normal, deviation_mm } = contacts[k];
         let along = progress.map_or(0.0, |p| p[k]);
         (point.coords.sum() + normal.sum() + deviation_mm + along).is_finite()
     };
     if let Some(index) = (0..points).find(|&k| !finite(k)) {
         return Err(ParameterError::NotFinite { index });
     }
-    if points < LEAST_POINTS {
+    if points < MIN_POINTS {
         return Err(ParameterError::TooFew { points });
     }
-    match contacts.iter().position(|c| c.normal.z < LEAST_NZ) {
+    match contacts.iter().position(|c| c.normal.z < MIN_NZ) {
         Some(index) => Err(ParameterError::Normal { index, nz: contacts[index].normal.z }),
         None => Ok(()),
     }
@@ -326,7 +326,7 @@ struct Columns {
 }
 
 /// Fitted values of the columns that are no combinations of others.
-struct Fitted {
+struct ColumnFit {
     /// Value of each slide and, after them, of each candidate; 0 if it was not fitted.
     values: DVector<f64>,
     covariance: DMatrix<f64>,
@@ -347,39 +347,39 @@ impl Columns {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
             let before = (0..k).filter(|&j| told[j]).map(|j| &self.candidates[j].values);
-            told.push(own_share(&self.candidates[k].values, &Basis::new(self.nuisance().chain(before))) > LEAST_OWN);
+            told.push(own_share(&self.candidates[k].values, &OrthonormalBasis::new(self.nuisance().chain(before))) > MIN_OWN_SHARE);
         }
         let share = |k: usize| {
             let others = (0..told.len()).filter(|&j| j != k && told[j]).map(|j| &self.candidates[j].values);
-            own_share(&self.candidates[k].values, &Basis::new(self.nuisance().chain(others)))
+            own_share(&self.candidates[k].values, &OrthonormalBasis::new(self.nuisance().chain(others)))
         };
         let shares: Vec<f64> = (0..told.len()).map(share).collect();
         // A candidate that is no longer separable once later ones are included is dropped in their favour.
-        (told.iter().zip(&shares).map(|(told, share)| *told && *share > LEAST_OWN).collect(), shares)
+        (told.iter().zip(&shares).map(|(told, share)| *told && *share > MIN_OWN_SHARE).collect(), shares)
     }
 
     /// Fits slides and candidates together with the motions and a field.
     fn fitted(
         &self,
-        contacts: &[Contact],
+        contacts: &[SurfacePoint],
         told: &[bool],
         rms_mm: f64,
         options: &ParameterOptions,
-    ) -> Result<Fitted, ParameterError> {
+    ) -> Result<ColumnFit, ParameterError> {
         let slides = self.slides.len();
         let all: Vec<&Vec<f64>> =
             self.slides.iter().map(|c| &c.values).chain(self.candidates.iter().map(|c| &c.values)).collect();
-        let unseen = Basis::new(self.motions.iter().map(|m| &m.values));
-        let mut basis = Basis::new(self.motions.iter().map(|m| &m.values));
+        let unseen = OrthonormalBasis::new(self.motions.iter().map(|m| &m.values));
+        let mut basis = OrthonormalBasis::new(self.motions.iter().map(|m| &m.values));
         let mut chosen = Vec::new();
         for k in (0..all.len()).filter(|&k| k < slides || told[k - slides]) {
-            if own_share(all[k], &basis) > LEAST_OWN {
+            if own_share(all[k], &basis) > MIN_OWN_SHARE {
                 chosen.push(k);
-                basis = Basis::new(basis.columns.iter().chain([all[k]]));
+                basis = OrthonormalBasis::new(basis.columns.iter().chain([all[k]]));
             }
         }
         let (mut values, mut covariance) = (DVector::zeros(all.len()), DMatrix::zeros(all.len(), all.len()));
-        if rms_mm * rms_mm > NOTHING {
+        if rms_mm * rms_mm > MIN_EFFECT_MM2 {
             let found = self.effects(contacts, &unseen, &chosen.iter().map(|&k| all[k]).collect::<Vec<_>>())?;
             let first = unseen.columns.len();
             for (a, &r) in chosen.iter().enumerate() {
@@ -398,14 +398,14 @@ impl Columns {
             }
         }
         let sizes = all.iter().map(|column| rms(column)).collect();
-        Ok(Fitted { values, covariance, sizes, rms_mm, slides })
+        Ok(ColumnFit { values, covariance, sizes, rms_mm, slides })
     }
 
     /// Returns the estimates for motions and for the chosen columns, in units of these.
     fn effects(
         &self,
-        contacts: &[Contact],
-        unseen: &Basis,
+        contacts: &[SurfacePoint],
+        unseen: &OrthonormalBasis,
         chosen: &[&Vec<f64>],
     ) -> Result<EffectEstimates, ModelError> {
         let n = contacts.len();
@@ -420,7 +420,7 @@ impl Columns {
         let places: Vec<[f64; 2]> = contacts.iter().map(|c| [c.point.x, c.point.y]).collect();
         let size_mm = Extent::from_places(places.iter().copied()).size_mm();
         let deviations_mm = contacts.iter().map(|c| c.deviation_mm).collect();
-        let observed = Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) };
+        let observed = Observations { fixed_effects: effects, ..Observations::without_effects(places, deviations_mm) };
         let mut found = EffectEstimates::estimate(&observed, &Prior::for_size(size_mm))?;
         for (c, size) in (of..).zip(&sizes) {
             found.values[c] /= size;
@@ -434,29 +434,29 @@ impl Columns {
     fn inseparable_from(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
         let before = self.candidates.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| (c.kind, &c.values));
         let others = self.motions.iter().chain(&self.slides).map(|c| (c.kind.to_owned(), &c.values));
-        let others: Vec<_> = others.chain(before.map(|(kind, of)| (words::name(kind).to_owned(), of))).collect();
+        let others: Vec<_> = others.chain(before.map(|(kind, of)| (texts::name(kind).to_owned(), of))).collect();
         let of = &self.candidates[k];
         match of.kind.motion() {
-            _ if options.lacks_locked_sigma(k) => vec![words::NO_DATUM.to_owned()],
+            _ if options.lacks_locked_sigma(k) => vec![texts::UNSTATED_LOCKED_SIGMA.to_owned()],
             Some(motion) if options.free_motions[motion] => vec![columns::MOTIONS[motion].to_owned()],
-            _ => words::alike(&of.values, &others),
+            _ => texts::inseparable_names(&of.values, &others),
         }
     }
 }
 
-impl Fitted {
+impl ColumnFit {
     /// Returns the estimate of each parameter, without its message and `removes_rms_mm`.
-    fn parameters(&self, alike: Vec<Vec<String>>, own_shares: &[f64], options: &ParameterOptions) -> Vec<Parameter> {
+    fn parameters(&self, alike: Vec<Vec<String>>, own_shares: &[f64], options: &ParameterOptions) -> Vec<EstimatedParameter> {
         let parameter = |(k, alike): (usize, Vec<String>)| {
             let is_told = alike.is_empty();
             let variance = self.covariance[(self.slides + k, self.slides + k)].max(0.0);
             let [value, sigma] = if is_told { [self.values[self.slides + k], variance.sqrt()] } else { [0.0; 2] };
-            Parameter {
+            EstimatedParameter {
                 kind: ParameterKind::ALL[k],
                 value,
                 sigma,
                 own_share: own_shares[k],
-                is_offered: is_told && value.abs() > EXPANDED * sigma,
+                is_offered: is_told && value.abs() > COVERAGE_FACTOR * sigma,
                 inseparable_from: alike,
                 compensated: 0.0,
                 exceeds_tolerance: false,
@@ -464,9 +464,9 @@ impl Fitted {
                 message: String::new(),
             }
         };
-        let mut found: Vec<Parameter> = alike.into_iter().enumerate().map(parameter).collect();
+        let mut found: Vec<EstimatedParameter> = alike.into_iter().enumerate().map(parameter).collect();
         let wanted = |k: &usize| {
-            let tolerance_2 = options.tolerances[*k].map(|tolerance| (tolerance / EXPANDED).powi(2));
+            let tolerance_2 = options.tolerances[*k].map(|tolerance| (tolerance / COVERAGE_FACTOR).powi(2));
             tolerance_2.filter(|_| found[*k].is_offered && found[*k].kind != ParameterKind::Wear).map(|t2| (*k, t2))
         };
         let chosen: Vec<(usize, f64)> = (0..found.len()).filter_map(|k| wanted(&k)).collect();
@@ -497,7 +497,7 @@ impl Fitted {
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);
         let stated = |k: usize| k.checked_sub(self.slides).and_then(|k| options.tolerances[k]);
         let variance = |k: usize, strength_mm: f64| match stated(k) {
-            Some(tolerance) => (tolerance / EXPANDED).powi(2),
+            Some(tolerance) => (tolerance / COVERAGE_FACTOR).powi(2),
             None => (strength_mm / self.sizes[k]).powi(2),
         };
         let by = |strength_mm: f64| {
@@ -510,7 +510,7 @@ impl Fitted {
             Some((prior.component_mul(&solved), -0.5 * told.dot(&solved) - 0.5 * factor.ln_determinant()))
         };
         let strengths =
-            (0..STRENGTHS).map(|k| self.rms_mm * LEAST_STRENGTH.powf(f64::from(k) / f64::from(STRENGTHS - 1)));
+            (0..PRIOR_STRENGTHS).map(|k| self.rms_mm * MIN_STRENGTH_SHARE.powf(f64::from(k) / f64::from(PRIOR_STRENGTHS - 1)));
         let seen: Vec<_> = strengths.filter_map(by).collect();
         let top = seen.iter().map(|(_, likely)| *likely).fold(f64::NEG_INFINITY, f64::max);
         let weight = |likely: f64| (likely - top).exp();
@@ -525,11 +525,11 @@ impl Fitted {
     }
 }
 
-fn own_share(column: &[f64], others: &Basis) -> f64 {
+fn own_share(column: &[f64], others: &OrthonormalBasis) -> f64 {
     let own = others.orthogonal_part(column);
     let size = dot(column, column);
     // On a level surface the effect of the wheel's radius is only rounding.
-    if size > NOTHING * column.len() as f64 { (dot(&own, &own) / size).sqrt() } else { 0.0 }
+    if size > MIN_EFFECT_MM2 * column.len() as f64 { (dot(&own, &own) / size).sqrt() } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -538,9 +538,9 @@ mod tests {
 
     /// Fit with a slide of 2 mm rms per unit and a radius of 1 mm rms per unit, each with a standard uncertainty of
     /// 1 um, and a setting that was not fitted.
-    fn fitted(values_um: [f64; 2]) -> Fitted {
+    fn fitted(values_um: [f64; 2]) -> ColumnFit {
         let [slide, radius] = values_um.map(|value| 1e-3 * value);
-        Fitted {
+        ColumnFit {
             values: DVector::from_column_slice(&[slide, radius, 0.0]),
             covariance: DMatrix::from_diagonal(&DVector::from_column_slice(&[1e-6, 1e-6, 0.0])),
             sizes: vec![2.0, 1.0, 1.0],

@@ -20,10 +20,10 @@ use crate::geometry::{Point, Vector};
 const WINDOW: usize = 1024;
 /// Maximum ratio of the half chord to the distance of the centre from the chord. At 1 the arc is a quarter of a turn,
 /// so that no control can take the longer way round.
-const WIDEST: f64 = 1.0;
+const MAX_CHORD_RATIO: f64 = 1.0;
 /// Maximum travel of the third axis, as a share of the chord. Some controls apply the feed in the plane, others along
 /// the helix. With this limit the two differ by 0.5 % at most.
-const STEEPEST: f64 = 0.1;
+const MAX_HELIX_SLOPE: f64 = 0.1;
 
 /// Plane of an arc: indices of its first axis, its second axis, and the axis across. A turn from the first to the
 /// second is counter-clockwise.
@@ -75,14 +75,14 @@ pub struct Arc {
 
 /// Content of one program block, or of two blocks that belong together.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Block {
+pub enum ProgramBlock {
     /// Straight move.
     Straight(Move),
     /// An arc.
     Arc(Arc),
 }
 
-impl From<Move> for Block {
+impl From<Move> for ProgramBlock {
     fn from(one: Move) -> Self {
         Self::Straight(one)
     }
@@ -109,8 +109,8 @@ impl ToolPath {
     /// exists.
     ///
     /// Frame: model. Units: mm, mm/min.
-    pub fn arcs_by_track(&self, options: &ArcOptions) -> Vec<Arcs<Sampled<'_>>> {
-        self.moves_by_track().into_iter().map(|moves| Arcs::new(Sampled(moves), options)).collect()
+    pub fn arcs_by_track(&self, options: &ArcOptions) -> Vec<ArcBlocks<MovesWithMiddles<'_>>> {
+        self.moves_by_track().into_iter().map(|moves| ArcBlocks::new(MovesWithMiddles(moves), options)).collect()
     }
 
     /// Converts the whole path into arcs, with all tracks in parallel, and returns the counts, the largest deviation
@@ -118,30 +118,30 @@ impl ToolPath {
     pub fn arc_summary(&self, options: &ArcOptions) -> ArcSummary {
         let one = |k: usize| {
             let mut one = ArcSummary::default();
-            let moves = || Moves::of(self, k, k + 1);
-            corners(Arcs::new(Sampled(moves()), options), |block, corner| one.take(block, corner));
-            corners(moves().map(Block::from), |_, corner| one.corner_rad[1] = one.corner_rad[1].max(corner));
+            let moves = || Moves::new(self, k, k + 1);
+            corners(ArcBlocks::new(MovesWithMiddles(moves()), options), |block, corner| one.add_block(block, corner));
+            corners(moves().map(ProgramBlock::from), |_, corner| one.corner_rad[1] = one.corner_rad[1].max(corner));
             one
         };
-        (0..self.tracks()).into_par_iter().map(one).reduce(ArcSummary::default, ArcSummary::and)
+        (0..self.track_count()).into_par_iter().map(one).reduce(ArcSummary::default, ArcSummary::merge)
     }
 }
 
 impl ArcSummary {
-    fn take(&mut self, block: &Block, corner: f64) {
+    fn add_block(&mut self, block: &ProgramBlock, corner: f64) {
         self.moves += 1;
         self.corner_rad[0] = self.corner_rad[0].max(corner);
         match block {
-            Block::Arc(arc) => {
+            ProgramBlock::Arc(arc) => {
                 self.arcs += 1;
                 self.deviation_mm = self.deviation_mm.max(arc.deviation_mm);
             }
-            Block::Straight(Move::Feed { .. }) => self.lines += 1,
-            Block::Straight(_) => {}
+            ProgramBlock::Straight(Move::Feed { .. }) => self.lines += 1,
+            ProgramBlock::Straight(_) => {}
         }
     }
 
-    fn and(self, other: Self) -> Self {
+    fn merge(self, other: Self) -> Self {
         Self {
             moves: self.moves + other.moves,
             arcs: self.arcs + other.arcs,
@@ -154,9 +154,9 @@ impl ArcSummary {
 
 /// Iterator over the moves of a path, each with the middle of its step. A move without a middle stays a line.
 #[derive(Clone, Debug)]
-pub struct Sampled<'a>(Moves<'a>);
+pub struct MovesWithMiddles<'a>(Moves<'a>);
 
-impl Iterator for Sampled<'_> {
+impl Iterator for MovesWithMiddles<'_> {
     type Item = (Move, Option<Point>);
 
     fn next(&mut self) -> Option<Self::Item> {
@@ -167,7 +167,7 @@ impl Iterator for Sampled<'_> {
 
 /// Point of the path, middle of the step to it, and feed.
 #[derive(Clone, Copy, Debug)]
-struct Sample {
+struct PathPoint {
     middle: Point,
     point: Point,
     feed_mm_min: f64,
@@ -175,19 +175,19 @@ struct Sample {
 
 /// Iterator over the blocks of a path: arcs where a fit within the tolerance exists, straight moves otherwise.
 #[derive(Clone, Debug)]
-pub struct Arcs<S> {
+pub struct ArcBlocks<S> {
     source: S,
     options: ArcOptions,
     /// End point of the last block.
     from: Point,
-    window: VecDeque<Sample>,
+    window: VecDeque<PathPoint>,
     /// Number of points at the front of the window that stay lines.
     lines: usize,
     /// Move after the window that cannot be part of an arc.
     after: Option<Move>,
 }
 
-impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
+impl<S: Iterator<Item = (Move, Option<Point>)>> ArcBlocks<S> {
     fn new(source: S, options: &ArcOptions) -> Self {
         let (from, window) = (Point::origin(), VecDeque::new());
         Self { source, options: *options, from, window, lines: 0, after: None }
@@ -197,7 +197,7 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
         while self.window.len() < WINDOW && self.after.is_none() {
             match self.source.next() {
                 Some((Move::Feed { to: at, feed_mm_min }, Some(middle))) => {
-                    self.window.push_back(Sample { middle, point: at, feed_mm_min });
+                    self.window.push_back(PathPoint { middle, point: at, feed_mm_min });
                 }
                 Some((other, _)) => self.after = Some(other),
                 None => break,
@@ -207,7 +207,7 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
 
     /// Returns the longest arc from the current point and the number of points that it replaces, or `None` and the
     /// number of points that stay lines. The search doubles the number of points, then bisects.
-    fn longest(&mut self) -> (usize, Option<Arc>) {
+    fn longest_arc(&mut self) -> (usize, Option<Arc>) {
         let least = self.options.min_lines.max(2);
         let from = self.from;
         let window = self.window.make_contiguous();
@@ -216,63 +216,63 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
         if most < least {
             return (most, None);
         }
-        let fit = |count: usize| fit(from, &window[..count], &self.options);
+        let fit = |count: usize| fit_arc(from, &window[..count], &self.options);
         let mut found = match fit(least) {
-            Fit::Neither => return (1, None),
+            ArcFit::Neither => return (1, None),
             found => (least, found),
         };
         let mut beyond = most + 1;
         while 2 * found.0 < beyond {
             match fit(2 * found.0) {
-                Fit::Neither => beyond = 2 * found.0,
+                ArcFit::Neither => beyond = 2 * found.0,
                 better => found = (2 * found.0, better),
             }
         }
         while beyond - found.0 > 1 {
             let count = usize::midpoint(found.0, beyond);
             match fit(count) {
-                Fit::Neither => beyond = count,
+                ArcFit::Neither => beyond = count,
                 better => found = (count, better),
             }
         }
         match found {
-            (count, Fit::Arc(arc)) => (count, Some(arc)),
+            (count, ArcFit::Arc(arc)) => (count, Some(arc)),
             (count, _) => (count, None),
         }
     }
 }
 
-impl<S: Iterator<Item = (Move, Option<Point>)>> Iterator for Arcs<S> {
-    type Item = Block;
+impl<S: Iterator<Item = (Move, Option<Point>)>> Iterator for ArcBlocks<S> {
+    type Item = ProgramBlock;
 
-    fn next(&mut self) -> Option<Block> {
+    fn next(&mut self) -> Option<ProgramBlock> {
         self.fill();
         if self.window.is_empty() {
             let one = self.after.take()?;
             if let Move::Feed { to: at, .. } = one {
                 self.from = at;
             }
-            return Some(Block::Straight(one));
+            return Some(ProgramBlock::Straight(one));
         }
         if self.lines == 0 {
-            match self.longest() {
+            match self.longest_arc() {
                 (count, Some(arc)) => {
                     self.window.drain(..count);
                     self.from = arc.to;
-                    return Some(Block::Arc(arc));
+                    return Some(ProgramBlock::Arc(arc));
                 }
                 (count, None) => self.lines = count,
             }
         }
         self.lines -= 1;
-        let Sample { point: at, feed_mm_min, .. } = self.window.pop_front()?;
+        let PathPoint { point: at, feed_mm_min, .. } = self.window.pop_front()?;
         self.from = at;
-        Some(Block::Straight(Move::Feed { to: at, feed_mm_min }))
+        Some(ProgramBlock::Straight(Move::Feed { to: at, feed_mm_min }))
     }
 }
 
 /// Result of a fit to successive points.
-enum Fit {
+enum ArcFit {
     /// An arc.
     Arc(Arc),
     /// A straight line within the tolerance.
@@ -282,15 +282,15 @@ enum Fit {
 }
 
 /// Fits an arc from a point through the samples. The last sample is its end.
-fn fit(from: Point, samples: &[Sample], options: &ArcOptions) -> Fit {
-    let Some(frame) = Chord::of(from, samples, options) else { return Fit::Neither };
-    let Some([low, high]) = frame.bends(samples, options.tolerance_mm) else { return Fit::Neither };
+fn fit_arc(from: Point, samples: &[PathPoint], options: &ArcOptions) -> ArcFit {
+    let Some(frame) = Chord::new(from, samples, options) else { return ArcFit::Neither };
+    let Some([low, high]) = frame.curvature_interval(samples, options.tolerance_mm) else { return ArcFit::Neither };
     if low <= 0.0 && 0.0 <= high {
-        return if frame.is_level(samples, options.tolerance_mm) { Fit::Straight } else { Fit::Neither };
+        return if frame.is_level(samples, options.tolerance_mm) { ArcFit::Straight } else { ArcFit::Neither };
     }
     match frame.arc(from, samples, 0.5 * (low + high), options) {
-        Some(arc) if arc.deviation_mm <= options.tolerance_mm => Fit::Arc(arc),
-        _ => Fit::Neither,
+        Some(arc) if arc.deviation_mm <= options.tolerance_mm => ArcFit::Arc(arc),
+        _ => ArcFit::Neither,
     }
 }
 
@@ -305,7 +305,7 @@ struct Chord {
 }
 
 impl Chord {
-    fn of(from: Point, samples: &[Sample], options: &ArcOptions) -> Option<Self> {
+    fn new(from: Point, samples: &[PathPoint], options: &ArcOptions) -> Option<Self> {
         let last = samples.last()?.point;
         let ends = [from, last].map(|p| p.map(|v| written(v, options)));
         // Choose the plane in which the points turn most: half-way they are farthest from their chord.
@@ -317,7 +317,7 @@ impl Chord {
         let [a, b, c] = plane.0;
         let by = ends[1] - ends[0];
         let length = by[a].hypot(by[b]);
-        let moves_along = if options.allows_helix { STEEPEST * length } else { 0.0 };
+        let moves_along = if options.allows_helix { MAX_HELIX_SLOPE * length } else { 0.0 };
         if by[c].abs() > moves_along || length < 2.0 / options.steps_per_mm {
             return None;
         }
@@ -327,7 +327,7 @@ impl Chord {
 
     /// Returns the coordinates of a point relative to the middle of the chord: along the chord, then to its left, in
     /// mm.
-    fn beside(&self, p: &Point) -> [f64; 2] {
+    fn coordinates(&self, p: &Point) -> [f64; 2] {
         let [a, b, _] = self.plane.0;
         let [x, y] = [p[a] - self.middle[0], p[b] - self.middle[1]];
         let [s, t] = self.along;
@@ -341,11 +341,11 @@ impl Chord {
     /// u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2.
     /// Multiplied by 1 / t, this is linear in 1 / t except for d^2 and the factor (1 + h^2 / t^2)^(1/2) of d.
     /// The bounds omit both. The factor is at least 1 and would only make the interval wider.
-    fn bends(&self, samples: &[Sample], within_mm: f64) -> Option<[f64; 2]> {
-        let widest = WIDEST / self.half;
+    fn curvature_interval(&self, samples: &[PathPoint], within_mm: f64) -> Option<[f64; 2]> {
+        let widest = MAX_CHORD_RATIO / self.half;
         let [mut low, mut high] = [-widest, widest];
         for p in samples.iter().flat_map(|s| [&s.middle, &s.point]) {
-            let [u, v] = self.beside(p);
+            let [u, v] = self.coordinates(p);
             let w = u * u + v * v - self.half * self.half;
             if w.abs() < f64::EPSILON {
                 continue;
@@ -361,11 +361,11 @@ impl Chord {
     }
 
     /// Returns true if the third axis moves in proportion to the position along the chord, within the tolerance.
-    fn is_level(&self, samples: &[Sample], within_mm: f64) -> bool {
+    fn is_level(&self, samples: &[PathPoint], within_mm: f64) -> bool {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
         samples.iter().all(|sample| {
-            let share = 0.5 * (1.0 + self.beside(&sample.point)[0] / self.half);
+            let share = 0.5 * (1.0 + self.coordinates(&sample.point)[0] / self.half);
             (sample.point[c] - first - share * (last - first)).abs() <= within_mm
         })
     }
@@ -373,20 +373,20 @@ impl Chord {
     /// Returns the arc with the given value of 1 / t, rounded as it is written, with an upper bound of its deviation
     /// from the path. Returns `None` if the centre is too far away, the radius error is too large, or a point is not
     /// between the ends.
-    fn arc(&self, from: Point, samples: &[Sample], bend: f64, options: &ArcOptions) -> Option<Arc> {
+    fn arc(&self, from: Point, samples: &[PathPoint], bend: f64, options: &ArcOptions) -> Option<Arc> {
         let [s, t] = self.along;
         let centre_mm = [self.middle[0] - t / bend, self.middle[1] + s / bend].map(|v| written(v, options));
-        let circle = Circle::of(self, centre_mm);
+        let circle = Circle::new(self, centre_mm);
         let [a, b, _] = self.plane.0;
         let from_start = [centre_mm[0] - self.ends[0][a], centre_mm[1] - self.ends[0][b]];
         let too_far = centre_mm.iter().chain(&from_start).any(|v| v.abs() > options.max_coordinate_mm);
         if too_far || circle.radius_error().abs() > options.max_radius_error_mm {
             return None;
         }
-        let mut last = circle.off(&from)?;
+        let mut last = circle.deviation_mm(&from)?;
         let [mut most, mut between] = [size(last), 0.0f64];
         for sample in samples {
-            let (half_way, now) = (circle.off(&sample.middle)?, circle.off(&sample.point)?);
+            let (half_way, now) = (circle.deviation_mm(&sample.middle)?, circle.deviation_mm(&sample.point)?);
             most = most.max(size(half_way)).max(size(now));
             // The deviation curves a quarter as much between a point and the middle as between two points.
             let bend = [0, 1].map(|k| half_way[k] - 0.5 * (last[k] + now[k]));
@@ -395,7 +395,7 @@ impl Chord {
         }
         // Controls differ in where along the arc they put the difference between the radii.
         let deviation_mm = most + between + circle.radius_error().abs();
-        let Sample { point: to, feed_mm_min, .. } = *samples.last()?;
+        let PathPoint { point: to, feed_mm_min, .. } = *samples.last()?;
         Some(Arc { plane: self.plane, clockwise: bend < 0.0, to, centre_mm, feed_mm_min, deviation_mm })
     }
 }
@@ -412,7 +412,7 @@ struct Circle {
 }
 
 impl Circle {
-    fn of(chord: &Chord, centre_mm: [f64; 2]) -> Self {
+    fn new(chord: &Chord, centre_mm: [f64; 2]) -> Self {
         let plane = chord.plane;
         let [a, b, c] = plane.0;
         let arm = |p: &Point| [p[a] - centre_mm[0], p[b] - centre_mm[1]];
@@ -428,7 +428,7 @@ impl Circle {
 
     /// Returns the deviation of a point along the radius and across the plane, in mm, or `None` if the point is not
     /// between the ends.
-    fn off(&self, p: &Point) -> Option<[f64; 2]> {
+    fn deviation_mm(&self, p: &Point) -> Option<[f64; 2]> {
         let [a, b, c] = self.plane.0;
         let arm = [p[a] - self.centre_mm[0], p[b] - self.centre_mm[1]];
         let share = angle(self.arm, arm) / self.sweep;
@@ -459,12 +459,12 @@ fn written(value_mm: f64, options: &ArcOptions) -> f64 {
 
 /// Calls `tell` for every block with the angle between its start direction and the end direction of the previous
 /// block, in rad. The angle is 0 for rapid moves and for the first moves at feed of a track.
-fn corners(blocks: impl Iterator<Item = Block>, mut tell: impl FnMut(&Block, f64)) {
+fn corners(blocks: impl Iterator<Item = ProgramBlock>, mut tell: impl FnMut(&ProgramBlock, f64)) {
     let (mut from, mut heading): (Option<Point>, Option<Vector>) = (None, None);
     for block in blocks {
         let (to, directions) = match (&block, from) {
-            (Block::Straight(Move::Feed { to: at, .. }), from) => (Some(*at), from.map(|from| [at - from; 2])),
-            (Block::Arc(arc), Some(from)) => (Some(arc.to), Some(arc.directions(from))),
+            (ProgramBlock::Straight(Move::Feed { to: at, .. }), from) => (Some(*at), from.map(|from| [at - from; 2])),
+            (ProgramBlock::Arc(arc), Some(from)) => (Some(arc.to), Some(arc.directions(from))),
             _ => (None, None),
         };
         let corner = heading.zip(directions).map_or(0.0, |(a, [b, _])| a.cross(&b).norm().atan2(a.dot(&b)));
@@ -492,8 +492,8 @@ impl Arc {
 
 #[cfg(test)]
 mod tests {
-    use super::super::fit::tests::{ball, path, quadric};
-    use super::super::{PathOptions, Pattern};
+    use super::super::wheel_fit::tests::{ball, path, quadric};
+    use super::super::{PathOptions, TrackPattern};
     use super::*;
 
     const OPTIONS: ArcOptions = ArcOptions {
@@ -524,8 +524,8 @@ mod tests {
         [(Move::RapidZ(9.0), None), (began, None)].into_iter().chain(along).chain(ends)
     }
 
-    fn arcs_of(blocks: &[Block]) -> Vec<Arc> {
-        blocks.iter().filter_map(|block| if let Block::Arc(arc) = block { Some(*arc) } else { None }).collect()
+    fn arcs_of(blocks: &[ProgramBlock]) -> Vec<Arc> {
+        blocks.iter().filter_map(|block| if let ProgramBlock::Arc(arc) = block { Some(*arc) } else { None }).collect()
     }
 
     /// Returns an arc of 0.4 rad with a radius of 40 mm about (3, 7, -5), from +z towards +x, while y rises by `y_mm`.
@@ -539,17 +539,17 @@ mod tests {
     #[test]
     fn a_planted_circle_is_one_arc_about_its_centre() {
         for y_mm in [0.0, 0.3] {
-            let blocks: Vec<Block> = Arcs::new(track(quarter(y_mm), 300), &OPTIONS).collect();
-            assert!(matches!(blocks[..2], [Block::Straight(Move::RapidZ(9.0)), Block::Straight(Move::Feed { .. })]));
-            assert!(matches!(blocks[3..], [Block::Straight(Move::RapidZ(10.0))]), "{blocks:?}");
-            let Block::Arc(arc) = blocks[2] else { panic!("{blocks:?}") };
+            let blocks: Vec<ProgramBlock> = ArcBlocks::new(track(quarter(y_mm), 300), &OPTIONS).collect();
+            assert!(matches!(blocks[..2], [ProgramBlock::Straight(Move::RapidZ(9.0)), ProgramBlock::Straight(Move::Feed { .. })]));
+            assert!(matches!(blocks[3..], [ProgramBlock::Straight(Move::RapidZ(10.0))]), "{blocks:?}");
+            let ProgramBlock::Arc(arc) = blocks[2] else { panic!("{blocks:?}") };
             // A turn from z towards x is counter-clockwise in the plane of z and x.
             assert!(arc.plane == Plane::ZX && !arc.clockwise && arc.to == quarter(y_mm)(1.0));
             // With a sagitta of 0.8 mm the radius is 25 times less certain than the middle of the arc.
             assert!((arc.centre_mm[0] + 5.0).abs() < 0.01 && (arc.centre_mm[1] - 3.0).abs() < 0.01, "{arc:?}");
             assert!(arc.deviation_mm < 1e-4);
             let flat = ArcOptions { allows_helix: false, ..OPTIONS };
-            let flat = arcs_of(&Arcs::new(track(quarter(y_mm), 300), &flat).collect::<Vec<_>>()).len();
+            let flat = arcs_of(&ArcBlocks::new(track(quarter(y_mm), 300), &flat).collect::<Vec<_>>()).len();
             assert_eq!(flat, usize::from(y_mm == 0.0));
         }
     }
@@ -560,7 +560,7 @@ mod tests {
         let expected = [(Plane::ZX, true), (Plane::YZ, false), (Plane::XY, false)];
         for (k, (plane, clockwise)) in expected.into_iter().enumerate() {
             let curve = move |t| turned(quarter(0.0)(t))[k];
-            let arcs = arcs_of(&Arcs::new(track(curve, 100), &OPTIONS).collect::<Vec<_>>());
+            let arcs = arcs_of(&ArcBlocks::new(track(curve, 100), &OPTIONS).collect::<Vec<_>>());
             assert_eq!(arcs.iter().map(|a| (a.plane, a.clockwise)).collect::<Vec<_>>(), [(plane, clockwise)], "{k}");
         }
     }
@@ -578,8 +578,8 @@ mod tests {
             (track(jump, 30).collect(), 30),
         ];
         for (moves, steps) in all {
-            let blocks: Vec<Block> = Arcs::new(moves.clone().into_iter(), &OPTIONS).collect();
-            let same: Vec<Block> = moves.into_iter().map(|(one, _)| Block::Straight(one)).collect();
+            let blocks: Vec<ProgramBlock> = ArcBlocks::new(moves.clone().into_iter(), &OPTIONS).collect();
+            let same: Vec<ProgramBlock> = moves.into_iter().map(|(one, _)| ProgramBlock::Straight(one)).collect();
             assert_eq!(blocks, same, "{steps}");
         }
     }
@@ -587,7 +587,7 @@ mod tests {
     #[test]
     fn no_arc_joins_feeds_that_differ_nor_two_curves() {
         let slower = |k: usize| if k > 120 { 300.0 } else { 600.0 };
-        let arcs = arcs_of(&Arcs::new(fed(quarter(0.0), 300, slower), &OPTIONS).collect::<Vec<_>>());
+        let arcs = arcs_of(&ArcBlocks::new(fed(quarter(0.0), 300, slower), &OPTIONS).collect::<Vec<_>>());
         assert_eq!(arcs.iter().map(|a| a.feed_mm_min).collect::<Vec<_>>(), [600.0, 300.0]);
         assert_eq!(arcs[0].to, quarter(0.0)(0.4));
         // A line that continues into a circle: the line stays a line except for its last points.
@@ -595,7 +595,7 @@ mod tests {
             let (s, c) = (t.max(0.0)).sin_cos();
             if t < 0.0 { Point::new(20.0 * t, 0.0, 20.0) } else { Point::new(20.0 * s, 0.0, 20.0 * c) }
         };
-        let blocks: Vec<Block> = Arcs::new(track(|t| joined(t - 0.5), 200), &OPTIONS).collect();
+        let blocks: Vec<ProgramBlock> = ArcBlocks::new(track(|t| joined(t - 0.5), 200), &OPTIONS).collect();
         let arcs = arcs_of(&blocks);
         assert!(arcs.len() <= 2 && blocks.len() > 95 && blocks.len() < 110, "{} {}", arcs.len(), blocks.len());
     }
@@ -618,7 +618,7 @@ mod tests {
 
     #[test]
     fn the_whole_of_every_arc_is_as_near_to_the_path_as_is_told() {
-        let spiral = PathOptions { pattern: Pattern::Spiral, ..ball(8.0) };
+        let spiral = PathOptions { pattern: TrackPattern::Spiral, ..ball(8.0) };
         let below = PathOptions { from_below: true, ..ball(8.0) };
         for (options, per_mm) in [(ball(8.0), 1e6), (ball(8.0), 1e4), (spiral, 1e6), (below, 1e6)] {
             let path = path(quadric(0.01, -0.006), PathOptions { chord_error_mm: 2e-4, ..options }).unwrap();
@@ -628,17 +628,17 @@ mod tests {
                 let span = path.tracks.spans[k];
                 let (first, last) = span.with_leads(path.options());
                 let centre = |t: f64| {
-                    let p = path.stand(&span, t).programmed_point;
-                    Point::new(p.x, p.y, path.upright(p.z))
+                    let p = path.wheel_position(&span, t).programmed_point;
+                    Point::new(p.x, p.y, path.flipped_height_mm(p.z))
                 };
                 let (mut from, mut t) = (Point::origin(), first);
                 for block in blocks {
-                    if let Block::Arc(arc) = block {
+                    if let ProgramBlock::Arc(arc) = block {
                         assert!(arc.deviation_mm <= 2e-4);
                         for share in 0..=40 {
                             let at = along(&arc, from, f64::from(share) / 40.0);
                             // The nearest place of the path, a little after the last one.
-                            let speed = span.speed_mm(t) * (last - first).signum();
+                            let speed = span.length_per_parameter_mm(t) * (last - first).signum();
                             for _ in 0..60 {
                                 let [p, q] = [centre(t), centre(t + 1e-4 / speed)];
                                 let along = (q - p) * 1e4;
@@ -652,7 +652,7 @@ mod tests {
                             );
                         }
                         from = written(arc.to);
-                    } else if let Block::Straight(Move::Feed { to: at, .. }) = block {
+                    } else if let ProgramBlock::Straight(Move::Feed { to: at, .. }) = block {
                         from = written(at);
                     }
                 }
@@ -662,12 +662,12 @@ mod tests {
 
     #[test]
     fn a_path_in_arcs_is_much_shorter_and_its_summary_counts_it() {
-        for pattern in [Pattern::Raster, Pattern::Spiral] {
+        for pattern in [TrackPattern::Raster, TrackPattern::Spiral] {
             // On a surface that is rotationally symmetric about its middle a spiral rises evenly.
             let path = path(quadric(0.01, 0.01), PathOptions { pattern, ..ball(8.0) }).unwrap();
             let plain = path.summary().unwrap();
             let summary = path.arc_summary(&OPTIONS);
-            let blocks: Vec<Block> = path.arcs_by_track(&OPTIONS).into_iter().flatten().collect();
+            let blocks: Vec<ProgramBlock> = path.arcs_by_track(&OPTIONS).into_iter().flatten().collect();
             assert_eq!(summary.moves, blocks.len() as u64);
             assert_eq!(summary.arcs, arcs_of(&blocks).len() as u64);
             assert!(summary.deviation_mm <= OPTIONS.tolerance_mm && summary.deviation_mm > 0.3 * OPTIONS.tolerance_mm);

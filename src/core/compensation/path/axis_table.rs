@@ -7,8 +7,8 @@
 
 use rayon::prelude::*;
 
-use super::{PathError, Wanted, Wheel};
-use crate::compensation::level::nearest_known;
+use super::{PathError, TargetSurface, Wheel};
+use crate::compensation::level_off::nearest_known;
 use crate::geometry::{Grid, Point};
 
 const STEPS: usize = 40;
@@ -20,7 +20,7 @@ const STEPS: usize = 40;
 ///
 /// # Errors
 /// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.
-pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, grid: &Grid) -> Result<Vec<f64>, PathError> {
+pub fn axis_offsets(before: &TargetSurface, after: &TargetSurface, wheel: &Wheel, grid: &Grid) -> Result<Vec<f64>, PathError> {
     let one = |node: usize| {
         let axes = grid.place_mm(node);
         Ok(height_mm(after, wheel, axes)? - height_mm(before, wheel, axes)?)
@@ -36,7 +36,7 @@ pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, grid: &Grid)
 
 /// Computes the height z of the wheel's centre at the axis positions X and Y, in mm. Newton's method finds the contact
 /// point.
-fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, PathError> {
+fn height_mm(wanted: &TargetSurface, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, PathError> {
     let refused = |[x_mm, y_mm]: [f64; 2]| PathError::CannotTouch { x_mm, y_mm };
     let centre = |place: [f64; 2]| wheel.centre(&wanted.at(place)).ok_or_else(|| refused(place));
     let off = |at: &Point| [at.x - axes[0], at.y - axes[1]];
@@ -75,17 +75,17 @@ fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, Path
 mod tests {
     use super::*;
     use crate::compensation::Correction;
-    use crate::compensation::path::Field;
+    use crate::compensation::path::HeightField;
     use crate::geometry::{Grid, Vector};
 
     #[test]
     fn a_slope_raises_the_offset_by_one_over_the_cosine() {
         let on = Grid { columns: 41, rows: 41, first_mm: [-20.0, -20.0], spacing_mm: [1.0, 1.0] };
         let heights: Vec<f64> = (0..41 * 41).map(|k| 0.5 * (f64::from(k % 41) - 20.0)).collect();
-        let slope = Field::hermite(on, &heights, &vec![[0.5, 0.0]; 41 * 41]);
+        let slope = HeightField::hermite(on, &heights, &vec![[0.5, 0.0]; 41 * 41]);
         let grid = Grid { columns: 3, rows: 3, first_mm: [-2.0, -2.0], spacing_mm: [2.0, 2.0] };
         let corrected = |e: f64| Correction { grid, values_mm: vec![e; 9], cycle: 1, level_mm: 0.01, set: None };
-        let [before, after] = [0.0, 0.004].map(|e| Wanted::new(slope.clone(), &corrected(e), 5.0).unwrap());
+        let [before, after] = [0.0, 0.004].map(|e| TargetSurface::new(slope.clone(), &corrected(e), 5.0).unwrap());
         for wheel in
             [Wheel::Sphere { radius_mm: 5.0 }, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }]
         {
@@ -112,7 +112,7 @@ mod tests {
             let grid = Grid { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
             let corrected = |e: f64| Correction { grid, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0, set: None };
             let [before, after] =
-                [0.0, 0.004].map(|e| Wanted::new(Field::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
+                [0.0, 0.004].map(|e| TargetSurface::new(HeightField::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
             axis_offsets(&before, &after, &wheel, &grid)
         };
         let found = offsets(-20.0).unwrap();

@@ -104,7 +104,7 @@ pub enum PathError {
 impl PathError {
     /// Returns true if only our own path planning fails. A controller that makes its own path from the correction map
     /// may still be able to grind the part.
-    pub fn is_ours(&self) -> bool {
+    pub fn is_planning_failure(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }
 }

@@ -2,14 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::wheel::LEAST_LEAN;
-use super::{Lean, PathError, Rotary, Wheel};
+use super::wheel::MIN_SPINDLE_ANGLE_SINE;
+use super::{TiltMode, PathError, RotaryAxis, Wheel};
 
 /// Pattern of the tracks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
-pub enum Pattern {
+pub enum TrackPattern {
     /// Along x, one after the other from the lowest y to the highest.
     #[default]
     Raster,
@@ -53,14 +53,14 @@ pub struct PathOptions {
     /// Shape and size of the wheel, with the spindle upright.
     pub wheel: Wheel,
     /// Rotary axis of the machine's head, if it has one.
-    pub rotary: Option<Rotary>,
+    pub rotary: Option<RotaryAxis>,
     /// Tilt of the wheel about this axis. With `None` the axis does not move, and programs do not contain it.
-    pub tilt: Option<Lean>,
+    pub tilt: Option<TiltMode>,
     /// True if the wheel comes from -z. The surface and the wheel (spindle, heights) are then given as seen from
     /// there, mirrored in z. The moves of the path are in the model frame.
     pub from_below: bool,
     /// Pattern of the tracks.
-    pub pattern: Pattern,
+    pub pattern: TrackPattern,
     /// True if every track of a raster runs towards +x. Otherwise the direction alternates.
     pub one_way: bool,
     /// Distance between neighbouring tracks.
@@ -93,7 +93,7 @@ impl PathOptions {
             rotary: None,
             tilt: None,
             from_below: false,
-            pattern: Pattern::Raster,
+            pattern: TrackPattern::Raster,
             one_way: false,
             spacing: TrackSpacing::Distance(track_mm),
             chord_error_mm: 1e-4,
@@ -140,12 +140,12 @@ impl PathOptions {
                 return Err(PathError::Option { key, found, allowed: "a finite number, 0 or above" });
             }
         }
-        self.check_lean()
+        self.check_tilt()
     }
 
     /// Rejects a tilt that is not possible: no rotary axis, a wheel from below, an angle that is not finite, or a
     /// following tilt that keeps the pole of a ball on the surface.
-    fn check_lean(&self) -> Result<(), PathError> {
+    fn check_tilt(&self) -> Result<(), PathError> {
         let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {
             return Err(PathError::NoRotary);
@@ -153,12 +153,12 @@ impl PathOptions {
         if self.from_below {
             return Err(PathError::TiltBelow);
         }
-        let (Lean::Constant { angle_rad: found } | Lean::Following { lead_rad: found }) = lean;
+        let (TiltMode::Constant { angle_rad: found } | TiltMode::Following { lead_rad: found }) = lean;
         if !found.is_finite() {
             return Err(PathError::Option { key: "tilt (rad)", found, allowed: "a finite number" });
         }
         let is_ball = matches!(self.wheel, Wheel::Sphere { .. });
-        if is_ball && matches!(lean, Lean::Following { .. }) && found.abs() < LEAST_LEAN {
+        if is_ball && matches!(lean, TiltMode::Following { .. }) && found.abs() < MIN_SPINDLE_ANGLE_SINE {
             let allowed = "at least 2° to either side: the pole of a sphere has no cutting speed";
             return Err(PathError::Option { key: "lead of a ball (rad)", found, allowed });
         }

@@ -14,13 +14,13 @@
 
 use rayon::prelude::*;
 
-use super::fit::{PLACES, on_grid, wheel_in};
-use super::wanted::{Bend, Contact};
-use super::{Pattern, ToolPath, Wanted, Wheel};
+use super::wheel_fit::{PLACES, on_grid, wheel_curvatures};
+use super::target_surface::{SurfaceCurvature, Contact};
+use super::{TrackPattern, ToolPath, TargetSurface, Wheel};
 use crate::geometry::{Aperture, Vector};
 
 /// Ratio of the rms of a parabola about its mean to its height: 2 / (3 sqrt 5).
-const RMS_OF_HEIGHT: f64 = 0.298_142_396_999_972;
+const RMS_PER_HEIGHT: f64 = 0.298_142_396_999_972;
 
 /// Size of the scallops that the tracks of a pass leave.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -40,17 +40,17 @@ pub struct Scallops {
 impl Scallops {
     /// Computes the scallops on a target surface. `wheel_at` returns the wheel in its orientation at a contact. Places
     /// where the wheel does not fit the surface count as zero height; no path is laid for them.
-    pub fn between(
-        wanted: &Wanted,
+    pub fn compute(
+        wanted: &TargetSurface,
         outline: &Aperture,
         wheel_at: impl Fn(&Contact) -> Wheel + Sync,
-        pattern: Pattern,
+        pattern: TrackPattern,
         track_mm: f64,
     ) -> Self {
         let height = |place: &[f64; 2]| {
-            let bend = wanted.bend(*place);
+            let bend = wanted.curvature_at(*place);
             let wheel = wheel_at(&bend.contact);
-            let Groove { curvature_per_mm: bend, stretch } = groove(&bend, from_middle(outline, *place), &wheel, pattern);
+            let Groove { curvature_per_mm: bend, stretch } = groove(&bend, relative_to_middle(outline, *place), &wheel, pattern);
             let height = (track_mm * stretch).powi(2) * bend / 8.0;
             if height.is_finite() { height } else { 0.0 }
         };
@@ -60,14 +60,14 @@ impl Scallops {
         Self {
             track_mm,
             height_mm: inside.iter().copied().fold(border, f64::max),
-            rms_mm: RMS_OF_HEIGHT * mean_of(2).sqrt(),
+            rms_mm: RMS_PER_HEIGHT * mean_of(2).sqrt(),
             mean_mm: mean_of(1) / 3.0,
         }
     }
 
     /// Returns the largest distance between tracks, in millimetres, that keeps the scallops within this height and
     /// this rms. It is infinite if no distance leaves scallops.
-    pub fn track_for_mm(&self, height_mm: f64, rms_mm: f64) -> f64 {
+    pub fn max_track_mm(&self, height_mm: f64, rms_mm: f64) -> f64 {
         let by = |most: f64, found: f64| if found > 0.0 { (most / found).sqrt() } else { f64::INFINITY };
         self.track_mm * by(height_mm, self.height_mm).min(by(rms_mm, self.rms_mm))
     }
@@ -75,7 +75,7 @@ impl Scallops {
     /// Returns the scallops for another distance between tracks. Heights are proportional to the square of the
     /// distance.
     #[must_use]
-    pub fn at_mm(&self, track_mm: f64) -> Self {
+    pub fn with_track_mm(&self, track_mm: f64) -> Self {
         let times = (track_mm / self.track_mm).powi(2);
         let [height_mm, rms_mm, mean_mm] = [self.height_mm, self.rms_mm, self.mean_mm].map(|value| times * value);
         Self { track_mm, height_mm, rms_mm, mean_mm }
@@ -87,7 +87,7 @@ impl ToolPath {
     pub fn scallops(&self) -> Scallops {
         let options = self.options();
         let wheel_at = |contact: &Contact| options.wheel_at(contact);
-        Scallops::between(self.wanted(), self.outline(), wheel_at, options.pattern, self.track_mm())
+        Scallops::compute(self.target(), self.outline(), wheel_at, options.pattern, self.track_mm())
     }
 }
 
@@ -100,25 +100,25 @@ pub(super) struct Groove {
 }
 
 /// Returns a place relative to the middle of the part, about which a spiral winds, in mm.
-pub(super) fn from_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2] {
+pub(super) fn relative_to_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2] {
     let [low, high] = outline.bounds();
     std::array::from_fn(|k| place[k] - 0.5 * (low[k] + high[k]))
 }
 
 /// Returns the groove at a place. `[x, y]` is the place relative to the middle of the part.
-pub(super) fn groove(bend: &Bend, [x, y]: [f64; 2], wheel: &Wheel, pattern: Pattern) -> Groove {
+pub(super) fn groove(bend: &SurfaceCurvature, [x, y]: [f64; 2], wheel: &Wheel, pattern: TrackPattern) -> Groove {
     // Direction of the track over x and y; the next track is at a right angle to it.
     let radius = x.hypot(y);
     let [east, north] = match pattern {
-        Pattern::Spiral if radius > 0.0 => [-y / radius, x / radius],
-        Pattern::Spiral | Pattern::Raster => [1.0, 0.0],
+        TrackPattern::Spiral if radius > 0.0 => [-y / radius, x / radius],
+        TrackPattern::Spiral | TrackPattern::Raster => [1.0, 0.0],
     };
     let n = &bend.contact.normal;
     let on_surface = |east: f64, north: f64| Vector::new(east, north, -(east * n.x + north * n.y) / n.z);
     let track = on_surface(east, north).normalize();
     let across = n.cross(&track);
     let stretch = on_surface(-north, east).dot(&across).abs();
-    let wheel = wheel_in(bend, wheel);
+    let wheel = wheel_curvatures(bend, wheel);
     let gap: [f64; 3] = std::array::from_fn(|k| wheel[k] - bend.second_form_per_mm[k]);
     let [c, s] = [0, 1].map(|k| track.dot(&bend.tangents[k]));
     let [along, mixed, over] = [
@@ -133,16 +133,16 @@ pub(super) fn groove(bend: &Bend, [x, y]: [f64; 2], wheel: &Wheel, pattern: Patt
 #[cfg(test)]
 mod tests {
     use super::super::PathOptions;
-    use super::super::fit::tests::{PART, ball, path, quadric};
+    use super::super::wheel_fit::tests::{PART, ball, path, quadric};
     use super::*;
 
-    fn between(wanted: &Wanted, wheel: Wheel, track_mm: f64) -> Scallops {
-        Scallops::between(wanted, &PART, |_| wheel, Pattern::Raster, track_mm)
+    fn scallops_on(wanted: &TargetSurface, wheel: Wheel, track_mm: f64) -> Scallops {
+        Scallops::compute(wanted, &PART, |_| wheel, TrackPattern::Raster, track_mm)
     }
 
     #[test]
     fn by_hand() {
-        let of = |b: f64| between(&quadric(0.0, b), Wheel::Sphere { radius_mm: 12.5 }, 0.5);
+        let of = |b: f64| scallops_on(&quadric(0.0, b), Wheel::Sphere { radius_mm: 12.5 }, 0.5);
         // 0.25 / (8 * 12.5) on a plane. On a hollow or a dome with a radius of 50 mm it is a quarter less or more.
         let flat = of(0.0);
         assert!((flat.height_mm - 2.5e-3).abs() < 1e-12, "{flat:?}");
@@ -156,18 +156,18 @@ mod tests {
         nearly(of(0.01), 2.5e-3 * 0.75);
         nearly(of(-0.01), 2.5e-3 * 1.25);
         // A quarter of the distance gives a sixteenth of the height.
-        let near = between(&quadric(0.0, 0.0), Wheel::Sphere { radius_mm: 12.5 }, 0.125);
+        let near = scallops_on(&quadric(0.0, 0.0), Wheel::Sphere { radius_mm: 12.5 }, 0.125);
         assert!(
-            (near.height_mm - flat.at_mm(0.125).height_mm).abs() < 1e-15 && near.rms_mm == flat.at_mm(0.125).rms_mm
+            (near.height_mm - flat.with_track_mm(0.125).height_mm).abs() < 1e-15 && near.rms_mm == flat.with_track_mm(0.125).rms_mm
         );
     }
 
     #[test]
     fn the_distance_for_a_height_and_an_rms_leaves_just_these() {
-        let unit = between(&quadric(0.004, -0.006), Wheel::Sphere { radius_mm: 12.5 }, 1.0);
-        let by_rms = unit.at_mm(unit.track_for_mm(1.0, 2e-4));
+        let unit = scallops_on(&quadric(0.004, -0.006), Wheel::Sphere { radius_mm: 12.5 }, 1.0);
+        let by_rms = unit.with_track_mm(unit.max_track_mm(1.0, 2e-4));
         assert!((by_rms.rms_mm - 2e-4).abs() < 1e-15, "{by_rms:?}");
-        let by_height = unit.at_mm(unit.track_for_mm(5e-4, 1.0));
+        let by_height = unit.with_track_mm(unit.max_track_mm(5e-4, 1.0));
         assert!((by_height.height_mm - 5e-4).abs() < 1e-15, "{by_height:?}");
     }
 
@@ -180,15 +180,15 @@ mod tests {
             // A hollow of radius 20 mm and a wheel of radius 30 mm: no path is laid for this pair.
             (quadric(0.0, 0.025), Wheel::Sphere { radius_mm: 30.0 }),
         ] {
-            let none = between(&wanted, wheel, 0.5);
+            let none = scallops_on(&wanted, wheel, 0.5);
             assert_eq!([none.height_mm.max(1e-18), none.rms_mm.max(1e-18)], [1e-18; 2], "{wheel:?}");
-            assert!(none.track_for_mm(1e-3, 1e-3) > 1e3);
+            assert!(none.max_track_mm(1e-3, 1e-3) > 1e3);
         }
         // Across the tracks a disc is as sharp as its rim. A cup that touches with one point of its ring is blunt
         // there.
         let disc = Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::y() };
-        assert!((between(&quadric(0.0, 0.0), disc, 0.5).height_mm - 0.25 / 40.0).abs() < 1e-12);
-        let cup = between(&quadric(0.0, 0.0), Wheel::tilted_cup(20.0, 1.0, 0.5), 0.5);
+        assert!((scallops_on(&quadric(0.0, 0.0), disc, 0.5).height_mm - 0.25 / 40.0).abs() < 1e-12);
+        let cup = scallops_on(&quadric(0.0, 0.0), Wheel::tilted_cup(20.0, 1.0, 0.5), 0.5);
         let blunt = 0.5f64.sin() / (20.0 + 0.5f64.sin());
         assert!((cup.height_mm - 0.25 * blunt / 8.0).abs() < 1e-12, "{cup:?}");
     }
@@ -197,9 +197,9 @@ mod tests {
     fn on_a_slope_tracks_are_farther_apart_than_over_x_and_y() {
         // A plane that rises along x and y: tracks run along (1, 0, p), and the offset to the next one is (0, t, q t).
         let [p, q] = [0.4, 0.3];
-        let slope = super::super::fit::tests::surface(|[x, y]| (p * x + q * y, [p, q]));
+        let slope = super::super::wheel_fit::tests::surface(|[x, y]| (p * x + q * y, [p, q]));
         let expected = 0.25 * (1.0 + p * p + q * q) / (1.0 + p * p) / (8.0 * 12.5);
-        let found = between(&slope, Wheel::Sphere { radius_mm: 12.5 }, 0.5);
+        let found = scallops_on(&slope, Wheel::Sphere { radius_mm: 12.5 }, 0.5);
         assert!((found.height_mm / expected - 1.0).abs() < 1e-9, "{found:?} {expected}");
     }
 
@@ -207,7 +207,7 @@ mod tests {
     fn a_path_tells_its_own() {
         let laid = path(quadric(0.0, 0.0), ball(12.5)).unwrap();
         assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 100.0).abs() < 1e-12);
-        let spiral = path(quadric(0.0, 0.0), PathOptions { pattern: Pattern::Spiral, ..ball(12.5) }).unwrap();
+        let spiral = path(quadric(0.0, 0.0), PathOptions { pattern: TrackPattern::Spiral, ..ball(12.5) }).unwrap();
         assert!((spiral.scallops().height_mm - 2.5e-3).abs() < 1e-12);
     }
 }

@@ -2,15 +2,15 @@
 
 use rayon::prelude::*;
 
-use super::{Move, Moves, PathError, Rotary, ToolPath};
+use super::{Move, Moves, PathError, RotaryAxis, ToolPath};
 use crate::geometry::{Point, Vector};
 
 /// Maximum number of points of a path.
-const MOST_POINTS: u64 = 200_000_000;
+const MAX_POINTS: u64 = 200_000_000;
 
 /// Limits of a machine; `None` if a limit is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Limits {
+pub struct MachineLimits {
     /// Minimum and maximum x, y, z of the programmed point, in the frame of the program.
     pub travel_mm: Option<[[f64; 3]; 2]>,
     /// Maximum speed of an axis.
@@ -21,7 +21,7 @@ pub struct Limits {
     pub jerk_mm_s3: Option<f64>,
 }
 
-impl Limits {
+impl MachineLimits {
     /// Returns the distance from standstill to a feed, in millimetres. The acceleration rises and falls within the
     /// jerk limit: the distance is v / 2 (v / a + a / j), or v (v / j)^(1/2) if the acceleration a is not reached.
     /// Without a jerk limit it is v^2 / (2 a). Without either limit it is 0.
@@ -36,7 +36,7 @@ impl Limits {
     }
 
     /// Returns the feed whose run-up takes this distance, in mm/min.
-    fn feed_of_run_up(&self, way_mm: f64) -> f64 {
+    fn feed_for_run_up(&self, way_mm: f64) -> f64 {
         let (mut low, mut high) = (0.0, 1.0);
         while self.run_up_mm(high) < way_mm && high < 1e9 {
             high *= 2.0;
@@ -62,9 +62,9 @@ pub struct Peak {
 
 /// Rotation of the head along a path. Angles are right-handed, in rad.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Turned {
+pub struct HeadRotation {
     /// Rotary axis of the head.
-    pub rotary: Rotary,
+    pub rotary: RotaryAxis,
     /// Smallest tilt.
     pub min_tilt_rad: Peak,
     /// Largest tilt.
@@ -75,7 +75,7 @@ pub struct Turned {
 
 /// Summary of a whole path.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Summary {
+pub struct PathSummary {
     /// Number of moves, including rapid moves.
     pub moves: u64,
     /// Number of points at feed.
@@ -103,7 +103,7 @@ pub struct Summary {
     /// Distance from standstill to the part: overrun plus lead.
     pub run_up_mm: f64,
     /// Rotation of the head; `None` if the wheel is not tilted.
-    pub head_rotation: Option<Turned>,
+    pub head_rotation: Option<HeadRotation>,
 }
 
 impl ToolPath {
@@ -111,9 +111,9 @@ impl ToolPath {
     ///
     /// # Errors
     /// Returns [`PathError::TooManyPoints`] for more than 2e8 points.
-    pub fn summary(&self) -> Result<Summary, PathError> {
+    pub fn summary(&self) -> Result<PathSummary, PathError> {
         let options = self.options();
-        let empty = Summary {
+        let empty = PathSummary {
             moves: 0,
             points: 0,
             min_mm: [f64::INFINITY; 3],
@@ -126,30 +126,30 @@ impl ToolPath {
             jerk_mm_s3: Peak::default(),
             feed_mm_min: options.feed_mm_min,
             run_up_mm: options.overrun_mm + options.lead_mm,
-            head_rotation: options.leaning().map(Turned::not_yet),
+            head_rotation: options.tilting_axis().map(HeadRotation::empty),
         };
-        let tracks: Vec<Summary> = (0..self.tracks())
+        let tracks: Vec<PathSummary> = (0..self.track_count())
             .into_par_iter()
             .map(|k| {
                 let mut one = empty;
-                one.take(Moves::of(self, k, k + 1), self.safe_z_mm());
+                one.add_track(Moves::new(self, k, k + 1), self.safe_z_mm());
                 one
             })
             .collect();
         // Add up in the order of the tracks, so that the length does not depend on the order of the threads.
-        let whole = tracks.into_iter().fold(empty, Summary::and);
-        if whole.points > MOST_POINTS {
-            return Err(PathError::TooManyPoints { points: whole.points, limit: MOST_POINTS });
+        let whole = tracks.into_iter().fold(empty, PathSummary::merge);
+        if whole.points > MAX_POINTS {
+            return Err(PathError::TooManyPoints { points: whole.points, limit: MAX_POINTS });
         }
         Ok(whole)
     }
 }
 
-impl Summary {
+impl PathSummary {
     /// Adds the moves of one track.
-    fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
+    fn add_track(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
-        let mut before: Option<Bend> = None;
+        let mut before: Option<ChordCurvature> = None;
         let (mut height, mut tilted) = (safe_z_mm, None);
         while let Some(one) = moves.next() {
             self.moves += 1;
@@ -163,15 +163,15 @@ impl Summary {
                 Move::RapidXy(_) => {}
                 Move::RapidTilted { to_mm, tilt_rad } => {
                     tilted = Some(tilt_rad);
-                    self.head_rotation.iter_mut().for_each(|turned| turned.to(tilt_rad, to_mm));
+                    self.head_rotation.iter_mut().for_each(|turned| turned.add_tilt(tilt_rad, to_mm));
                 }
                 Move::FeedTilted { to: at, tilt_rad, feed_mm_min, centre_mm } => {
                     let seconds = 60.0 * centre_mm / feed_mm_min;
                     let by_rad = tilted.replace(tilt_rad).map_or(0.0, |from| tilt_rad - from);
-                    self.head_rotation.iter_mut().for_each(|turned| turned.by(by_rad, tilt_rad, seconds, &at, feed_mm_min));
-                    self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, Some(centre_mm)));
+                    self.head_rotation.iter_mut().for_each(|turned| turned.add_rotation(by_rad, tilt_rad, seconds, &at, feed_mm_min));
+                    self.add_feed(&mut last, &mut before, &moves, (at, feed_mm_min, Some(centre_mm)));
                 }
-                Move::Feed { to: at, feed_mm_min } => self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
+                Move::Feed { to: at, feed_mm_min } => self.add_feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
             }
         }
     }
@@ -179,10 +179,10 @@ impl Summary {
     /// Adds a move at feed. `centre_mm` is the distance that the wheel's centre moves; with `None` it is the distance
     /// of the slides.
     #[inline]
-    fn feed(
+    fn add_feed(
         &mut self,
         last: &mut Option<Point>,
-        before: &mut Option<Bend>,
+        before: &mut Option<ChordCurvature>,
         moves: &Moves,
         (at, feed_mm_min, centre_mm): (Point, f64, Option<f64>),
     ) {
@@ -192,10 +192,10 @@ impl Summary {
         }
         if let Some(from) = *last {
             let chord_mm = centre_mm.unwrap_or_else(|| (at - from).norm());
-            self.step(&(at - from), chord_mm, &at, feed_mm_min, moves.curvature_per_mm);
-            let now = moves.on_span.then_some(Bend { curvature_per_mm: moves.curvature_per_mm, chord_mm });
+            self.add_step(&(at - from), chord_mm, &at, feed_mm_min, moves.curvature_per_mm);
+            let now = moves.on_span.then_some(ChordCurvature { curvature_per_mm: moves.curvature_per_mm, chord_mm });
             if let Some((before, now)) = before.zip(now) {
-                self.bends_anew(before, now, from, feed_mm_min);
+                self.update_jerk(before, now, from, feed_mm_min);
             }
             *before = now;
         }
@@ -203,7 +203,7 @@ impl Summary {
     }
 
     #[inline]
-    fn step(&mut self, by: &Vector, length: f64, at: &Point, feed_mm_min: f64, bend: f64) {
+    fn add_step(&mut self, by: &Vector, length: f64, at: &Point, feed_mm_min: f64, bend: f64) {
         let speed = feed_mm_min / 60.0;
         self.length_mm += length;
         self.duration_s += length / speed;
@@ -221,7 +221,7 @@ impl Summary {
 
     /// Updates the largest jerk from two successive chords, at the place between them.
     #[inline]
-    fn bends_anew(&mut self, before: Bend, now: Bend, at: Point, feed_mm_min: f64) {
+    fn update_jerk(&mut self, before: ChordCurvature, now: ChordCurvature, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
         let changes = (now.curvature_per_mm - before.curvature_per_mm) / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
         let value = speed.powi(3) * changes.hypot(now.curvature_per_mm.max(before.curvature_per_mm).powi(2));
@@ -230,7 +230,7 @@ impl Summary {
         }
     }
 
-    fn and(self, other: Self) -> Self {
+    fn merge(self, other: Self) -> Self {
         let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
         Self {
             moves: self.moves + other.moves,
@@ -243,7 +243,7 @@ impl Summary {
             speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
             acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
             jerk_mm_s3: larger(self.jerk_mm_s3, other.jerk_mm_s3),
-            head_rotation: self.head_rotation.zip(other.head_rotation).map(|(a, b)| a.and(b)),
+            head_rotation: self.head_rotation.zip(other.head_rotation).map(|(a, b)| a.merge(b)),
             ..self
         }
     }
@@ -254,7 +254,7 @@ impl Summary {
     /// Returns an error if the path exceeds, in this order: the travel of an axis, the speed of an axis, the range or
     /// the angular speed of the head, the acceleration across the path, the jerk on the part, or if the run-up is
     /// longer than the distance to the part.
-    pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
+    pub fn check(&self, limits: &MachineLimits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
                 for found_mm in [self.min_mm[k], self.max_mm[k]] {
@@ -287,20 +287,20 @@ impl Summary {
         }
         let found_mm = limits.run_up_mm(self.feed_mm_min);
         if found_mm > self.run_up_mm {
-            let feed_mm_min = limits.feed_of_run_up(self.run_up_mm).floor();
+            let feed_mm_min = limits.feed_for_run_up(self.run_up_mm).floor();
             return Err(PathError::RunUp { found_mm, limit_mm: self.run_up_mm, feed_mm_min });
         }
         Ok(())
     }
 }
 
-impl Turned {
-    fn not_yet(rotary: &Rotary) -> Self {
+impl HeadRotation {
+    fn empty(rotary: &RotaryAxis) -> Self {
         let [least, most] = [f64::INFINITY, f64::NEG_INFINITY].map(|value| Peak { value, ..Peak::default() });
         Self { rotary: *rotary, min_tilt_rad: least, max_tilt_rad: most, max_rate_rad_s: Peak::default() }
     }
 
-    fn to(&mut self, tilt_rad: f64, at_mm: [f64; 2]) {
+    fn add_tilt(&mut self, tilt_rad: f64, at_mm: [f64; 2]) {
         let here = Peak { value: tilt_rad, place_mm: at_mm, feed_mm_min: 0.0 };
         if tilt_rad < self.min_tilt_rad.value {
             self.min_tilt_rad = here;
@@ -310,16 +310,16 @@ impl Turned {
         }
     }
 
-    fn by(&mut self, by_rad: f64, tilt_rad: f64, seconds: f64, at: &Point, feed_mm_min: f64) {
+    fn add_rotation(&mut self, by_rad: f64, tilt_rad: f64, seconds: f64, at: &Point, feed_mm_min: f64) {
         let at_mm = [at.x, at.y];
-        self.to(tilt_rad, at_mm);
+        self.add_tilt(tilt_rad, at_mm);
         let value = if by_rad == 0.0 { 0.0 } else { by_rad.abs() / seconds.max(f64::MIN_POSITIVE) };
         if value > self.max_rate_rad_s.value {
             self.max_rate_rad_s = Peak { value, place_mm: at_mm, feed_mm_min };
         }
     }
 
-    fn and(self, other: Self) -> Self {
+    fn merge(self, other: Self) -> Self {
         let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
         let less = |a: Peak, b: Peak| if b.value < a.value { b } else { a };
         Self {
@@ -331,10 +331,10 @@ impl Turned {
     }
 
     fn check(&self) -> Result<(), PathError> {
-        let Rotary { letter, range_rad, rate_rad_s, .. } = self.rotary;
+        let RotaryAxis { letter, range_rad, rate_rad_s, .. } = self.rotary;
         let [min_deg, max_deg] = range_rad.map(f64::to_degrees);
         for Peak { value, place_mm: [x_mm, y_mm], .. } in [self.min_tilt_rad, self.max_tilt_rad] {
-            let found_deg = self.rotary.on_scale_rad(value).to_degrees();
+            let found_deg = self.rotary.scale_reading_rad(value).to_degrees();
             // Tolerate rounding errors.
             let by_deg = (min_deg - found_deg).max(found_deg - max_deg);
             if by_deg > 1e-9 {
@@ -354,7 +354,7 @@ impl Turned {
 
 /// Curvature of a path along a chord, in 1/mm, and length of the chord.
 #[derive(Clone, Copy)]
-struct Bend {
+struct ChordCurvature {
     curvature_per_mm: f64,
     chord_mm: f64,
 }
@@ -362,7 +362,7 @@ struct Bend {
 #[cfg(test)]
 mod tests {
     use super::super::PathOptions;
-    use super::super::fit::tests::{PART, ball, path, quadric, surface};
+    use super::super::wheel_fit::tests::{PART, ball, path, quadric, surface};
     use super::*;
 
     #[test]
@@ -373,23 +373,23 @@ mod tests {
         let Peak { value, .. } = summary.acceleration_mm_s2;
         // The lead-in has a radius of 5 mm over x and y, which is a little more along the slope.
         assert!((value - 100.0 / 5.0).abs() < 1.5, "{value}");
-        assert!(summary.check(&Limits::default()).is_ok());
+        assert!(summary.check(&MachineLimits::default()).is_ok());
         let travel_mm = Some([[-9.0, -50.0, 0.0], [50.0, 50.0, 50.0]]);
         assert!(matches!(
-            summary.check(&Limits { travel_mm, ..Limits::default() }),
+            summary.check(&MachineLimits { travel_mm, ..MachineLimits::default() }),
             Err(PathError::Travel { axis: 'X', .. })
         ));
         let speed_mm_s = Some(9.0);
         assert!(matches!(
-            summary.check(&Limits { speed_mm_s, ..Limits::default() }),
+            summary.check(&MachineLimits { speed_mm_s, ..MachineLimits::default() }),
             Err(PathError::Speed { axis: 'X', .. })
         ));
-        let limited = |a: f64| summary.check(&Limits { acceleration_mm_s2: Some(a), ..Limits::default() });
+        let limited = |a: f64| summary.check(&MachineLimits { acceleration_mm_s2: Some(a), ..MachineLimits::default() });
         assert!(limited(25.0).is_ok());
         let Err(PathError::Acceleration { feed_mm_min, .. }) = limited(10.0) else { panic!() };
         assert!((feed_mm_min - 600.0 * (10.0 / value).sqrt()).abs() < 1.0);
-        let straight = Summary { acceleration_mm_s2: Peak::default(), ..summary };
-        let slow = Limits { acceleration_mm_s2: Some(1.0), ..Limits::default() };
+        let straight = PathSummary { acceleration_mm_s2: Peak::default(), ..summary };
+        let slow = MachineLimits { acceleration_mm_s2: Some(1.0), ..MachineLimits::default() };
         assert!(matches!(straight.check(&slow), Err(PathError::RunUp { .. })));
     }
 
@@ -403,21 +403,21 @@ mod tests {
         let summary = path(wave, options).unwrap().summary().unwrap();
         let of = 10.0_f64.powi(3) * h * k.powi(3);
         assert!((summary.jerk_mm_s3.value / of - 1.0).abs() < 0.02, "{} for {of}", summary.jerk_mm_s3.value);
-        let limited = |j: f64| summary.check(&Limits { jerk_mm_s3: Some(j), ..Limits::default() });
+        let limited = |j: f64| summary.check(&MachineLimits { jerk_mm_s3: Some(j), ..MachineLimits::default() });
         let Err(PathError::Jerk { feed_mm_min, .. }) = limited(0.5 * of) else { panic!("{:?}", limited(0.5 * of)) };
         assert!((feed_mm_min - 600.0 * 0.5f64.cbrt()).abs() < 6.0, "{feed_mm_min}");
         let slower = path(
             surface(move |[x, _]| (h * (k * x).sin(), [h * k * (k * x).cos(), 0.0])),
             PathOptions { feed_mm_min, lead_mm: 50.0, ..options },
         );
-        let limits = Limits { jerk_mm_s3: Some(0.5 * of), ..Limits::default() };
+        let limits = MachineLimits { jerk_mm_s3: Some(0.5 * of), ..MachineLimits::default() };
         assert_eq!(slower.unwrap().summary().unwrap().check(&limits), Ok(()));
     }
 
     #[test]
     fn a_run_up_takes_what_acceleration_and_jerk_leave() {
         let limits =
-            |a: Option<f64>, j: Option<f64>| Limits { acceleration_mm_s2: a, jerk_mm_s3: j, ..Limits::default() };
+            |a: Option<f64>, j: Option<f64>| MachineLimits { acceleration_mm_s2: a, jerk_mm_s3: j, ..MachineLimits::default() };
         // 10 mm/s with 100 mm/s²: 0.1 s, 0.5 mm. With 1000 mm/s³ the acceleration rises for 0.1 s and falls for 0.1 s;
         // its limit is just reached.
         assert!((limits(Some(100.0), None).run_up_mm(600.0) - 0.5).abs() < 1e-12);
@@ -428,10 +428,10 @@ mod tests {
         assert!((limits(Some(100.0), Some(1000.0)).run_up_mm(1200.0) - 3.0).abs() < 1e-12);
         for feed in [1.0, 600.0, 1e5] {
             for limits in [limits(Some(100.0), None), limits(Some(100.0), Some(1000.0)), limits(None, Some(50.0))] {
-                assert!((limits.feed_of_run_up(limits.run_up_mm(feed)) / feed - 1.0).abs() < 1e-9);
+                assert!((limits.feed_for_run_up(limits.run_up_mm(feed)) / feed - 1.0).abs() < 1e-9);
             }
         }
-        assert_eq!(Limits::default().run_up_mm(600.0), 0.0);
+        assert_eq!(MachineLimits::default().run_up_mm(600.0), 0.0);
     }
 
     #[test]
@@ -447,12 +447,12 @@ mod tests {
                 let nearest = |p: &Point| {
                     let mut place = [p.x, p.y];
                     for _ in 0..50 {
-                        let contact = path.wanted().at(place);
+                        let contact = path.target().at(place);
                         let off = p - contact.point;
                         let aside = off - contact.normal * off.dot(&contact.normal);
                         place = [place[0] + 0.7 * aside.x, place[1] + 0.7 * aside.y];
                     }
-                    (p - path.wanted().at(place).point).norm()
+                    (p - path.target().at(place).point).norm()
                 };
                 let off = nearest(&middle) - 10.0;
                 let on_part = PART.contains(middle.x, middle.y);

@@ -15,12 +15,12 @@
 use crate::geometry::{Point, Vector};
 
 use super::options::PathOptions;
-use super::wanted::Contact;
+use super::target_surface::Contact;
 use super::{PathError, Wheel};
 
 /// Axis of the model frame about which a head rotates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TurnAxis {
+pub enum RotationAxis {
     /// x, the axis of an A rotation.
     X,
     /// y, the axis of a B rotation.
@@ -29,11 +29,11 @@ pub enum TurnAxis {
 
 /// Rotary axis of a head.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rotary {
+pub struct RotaryAxis {
     /// Letter of the axis in programs.
     pub letter: char,
     /// Axis of rotation, right-handed.
-    pub axis: TurnAxis,
+    pub axis: RotationAxis,
     /// True if the scale of the axis counts in the opposite direction.
     pub reversed: bool,
     /// Minimum and maximum angle on the scale of the axis.
@@ -49,7 +49,7 @@ pub struct Rotary {
 
 /// Tilt of a wheel, right-handed about the axis of its head.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Lean {
+pub enum TiltMode {
     /// The same angle everywhere.
     Constant {
         /// Tilt angle.
@@ -64,7 +64,7 @@ pub enum Lean {
 
 /// Position and tilt of the wheel at a place of a track: exact, and as a program writes them.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Stand {
+pub(super) struct WheelPosition {
     /// Centre of the wheel and tilt, not rounded to the increment of the axis.
     pub(super) centre: Point,
     pub(super) tilt_rad: f64,
@@ -75,7 +75,7 @@ pub(super) struct Stand {
 
 /// Deviation of a straight step from the path, in millimetres.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sag {
+pub(super) struct StepDeviation {
     /// Distance between the middle of the path's step and the position to which the control moves the wheel.
     pub(super) sag_mm: f64,
     /// Distance that the wheel's centre moves.
@@ -84,34 +84,34 @@ pub(super) struct Sag {
     pub(super) slide_sag_mm: f64,
 }
 
-impl Rotary {
+impl RotaryAxis {
     /// Returns a vector of the upright head after a rotation of the head.
     #[inline]
-    pub fn turned(&self, v: &Vector, angle_rad: f64) -> Vector {
+    pub fn rotated(&self, v: &Vector, angle_rad: f64) -> Vector {
         let (s, c) = angle_rad.sin_cos();
         match self.axis {
-            TurnAxis::X => Vector::new(v.x, v.y * c - v.z * s, v.y * s + v.z * c),
-            TurnAxis::Y => Vector::new(v.x * c + v.z * s, v.y, v.z * c - v.x * s),
+            RotationAxis::X => Vector::new(v.x, v.y * c - v.z * s, v.y * s + v.z * c),
+            RotationAxis::Y => Vector::new(v.x * c + v.z * s, v.y, v.z * c - v.x * s),
         }
     }
 
     /// Converts a right-handed angle into the reading of the axis' scale, in rad.
-    pub fn on_scale_rad(&self, angle_rad: f64) -> f64 {
+    pub fn scale_reading_rad(&self, angle_rad: f64) -> f64 {
         if self.reversed { 0.0 - angle_rad } else { angle_rad }
     }
 
     /// Returns the offset of the slides that keeps the wheel's centre in place when the head tilts: (R - 1) v, in mm.
     #[inline]
-    pub fn shift_mm(&self, angle_rad: f64) -> Vector {
-        self.pivot_mm.map_or_else(Vector::zeros, |pivot| self.turned(&pivot, angle_rad) - pivot)
+    pub fn pivot_shift_mm(&self, angle_rad: f64) -> Vector {
+        self.pivot_mm.map_or_else(Vector::zeros, |pivot| self.rotated(&pivot, angle_rad) - pivot)
     }
 
     /// Returns the rotation that brings z onto a normal, seen along the axis, in rad.
     #[inline]
-    fn along(&self, normal: &Vector) -> f64 {
+    fn normal_tilt_rad(&self, normal: &Vector) -> f64 {
         match self.axis {
-            TurnAxis::X => (-normal.y).atan2(normal.z),
-            TurnAxis::Y => normal.x.atan2(normal.z),
+            RotationAxis::X => (-normal.y).atan2(normal.z),
+            RotationAxis::Y => normal.x.atan2(normal.z),
         }
     }
 
@@ -121,13 +121,13 @@ impl Rotary {
     }
 
     /// Returns the largest rise of the slides over all angles in the range, in mm.
-    fn most_lift_mm(&self) -> f64 {
-        let [a, b] = self.range_rad.map(|angle| self.on_scale_rad(angle));
+    fn max_lift_mm(&self) -> f64 {
+        let [a, b] = self.range_rad.map(|angle| self.scale_reading_rad(angle));
         // The height is a sine of the angle: this number of samples finds its maximum to a millionth of the distance
         // to the pivot.
         const SAMPLES: u32 = 2000;
         let at = |k: u32| a + (b - a) * f64::from(k) / f64::from(SAMPLES);
-        (0..=SAMPLES).map(|k| self.shift_mm(at(k)).z).fold(f64::NEG_INFINITY, f64::max)
+        (0..=SAMPLES).map(|k| self.pivot_shift_mm(at(k)).z).fold(f64::NEG_INFINITY, f64::max)
     }
 }
 
@@ -136,8 +136,8 @@ impl PathOptions {
     #[inline]
     pub fn tilt_rad(&self, contact: &Contact) -> f64 {
         match (self.tilt, &self.rotary) {
-            (Some(Lean::Constant { angle_rad }), _) => angle_rad,
-            (Some(Lean::Following { lead_rad }), Some(rotary)) => rotary.along(&contact.normal) + lead_rad,
+            (Some(TiltMode::Constant { angle_rad }), _) => angle_rad,
+            (Some(TiltMode::Following { lead_rad }), Some(rotary)) => rotary.normal_tilt_rad(&contact.normal) + lead_rad,
             _ => 0.0,
         }
     }
@@ -151,7 +151,7 @@ impl PathOptions {
     /// Returns the direction of the head's axis at a contact: z rotated by the tilt.
     #[inline]
     pub fn head_at(&self, contact: &Contact) -> Vector {
-        let turned = |rotary: &Rotary| rotary.turned(&Vector::z(), self.tilt_rad(contact));
+        let turned = |rotary: &RotaryAxis| rotary.rotated(&Vector::z(), self.tilt_rad(contact));
         self.rotary.as_ref().map_or_else(Vector::z, turned)
     }
 
@@ -159,73 +159,73 @@ impl PathOptions {
         let Some(rotary) = &self.rotary else { return self.wheel };
         let mut wheel = self.wheel;
         if let Wheel::Torus { spindle, .. } | Wheel::Cup { spindle, .. } = &mut wheel {
-            *spindle = rotary.turned(spindle, angle_rad);
+            *spindle = rotary.rotated(spindle, angle_rad);
         }
         wheel
     }
 
     /// Returns the rotary axis if the wheel is tilted by it.
     #[inline]
-    pub fn leaning(&self) -> Option<&Rotary> {
+    pub fn tilting_axis(&self) -> Option<&RotaryAxis> {
         self.tilt.and(self.rotary.as_ref())
     }
 
     /// Returns position and tilt of the wheel at a contact, lifted off by `lifted_mm` along the normal, or `None` if a
     /// rim cannot touch there.
     #[inline]
-    pub(super) fn stand(&self, contact: &Contact, lifted_mm: f64) -> Option<Stand> {
+    pub(super) fn wheel_position(&self, contact: &Contact, lifted_mm: f64) -> Option<WheelPosition> {
         let centre = |wheel: Wheel| {
             let touching = wheel.centre(contact)?;
             Some(if lifted_mm > 0.0 { touching + contact.normal * lifted_mm } else { touching })
         };
-        let Some(rotary) = self.leaning() else {
+        let Some(rotary) = self.tilting_axis() else {
             let centre = centre(self.wheel)?;
-            return Some(Stand { centre, tilt_rad: 0.0, programmed_point: centre, programmed_tilt_rad: 0.0 });
+            return Some(WheelPosition { centre, tilt_rad: 0.0, programmed_point: centre, programmed_tilt_rad: 0.0 });
         };
         let tilt_rad = self.tilt_rad(contact);
         // `at` belongs to the rounded angle, so the rounding of the angle causes no error of the surface.
         let written_rad = rotary.rounded(tilt_rad);
-        let at = centre(self.wheel_turned(written_rad))? + rotary.shift_mm(written_rad);
-        Some(Stand { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, programmed_point: at, programmed_tilt_rad: written_rad })
+        let at = centre(self.wheel_turned(written_rad))? + rotary.pivot_shift_mm(written_rad);
+        Some(WheelPosition { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, programmed_point: at, programmed_tilt_rad: written_rad })
     }
 
     /// Computes the deviation of a step at its middle. The control moves slides and head in proportion. An error of
     /// the tilt counts as the distance that it moves the points of the ring.
     #[inline]
-    pub(super) fn sag_mm(&self, from: &Stand, middle: &Stand, to: &Stand) -> Sag {
+    pub(super) fn step_deviation(&self, from: &WheelPosition, middle: &WheelPosition, to: &WheelPosition) -> StepDeviation {
         let (chord, half) = (to.centre - from.centre, middle.centre - from.centre);
         let length2 = chord.norm_squared();
         let share = if length2 > 0.0 { half.dot(&chord) / length2 } else { 0.0 };
-        let (Some(rotary), Some(Lean::Following { .. })) = (self.leaning(), self.tilt) else {
+        let (Some(rotary), Some(TiltMode::Following { .. })) = (self.tilting_axis(), self.tilt) else {
             let sag = (half - chord * share).norm();
-            return Sag { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: sag };
+            return StepDeviation { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: sag };
         };
-        let turn = |stand: &Stand| rotary.shift_mm(stand.tilt_rad);
+        let turn = |stand: &WheelPosition| rotary.pivot_shift_mm(stand.tilt_rad);
         let turned = from.tilt_rad + share * (to.tilt_rad - from.tilt_rad);
         let slides = chord * share + turn(from) + (turn(to) - turn(from)) * share;
         let bent = (half + turn(middle) - slides).norm();
-        let off = half - (slides - rotary.shift_mm(turned));
+        let off = half - (slides - rotary.pivot_shift_mm(turned));
         let along = if length2 > 0.0 { off.dot(&chord) / length2 } else { 0.0 };
         let ring_mm = match self.wheel {
             Wheel::Sphere { .. } => 0.0,
             Wheel::Torus { ring_mm, .. } | Wheel::Cup { ring_mm, .. } => ring_mm,
         };
         let sag = (off - chord * along).norm() + ring_mm * (middle.tilt_rad - turned).abs();
-        Sag { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
+        StepDeviation { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
     }
 
     /// Returns how far the slides must be above the highest place of the wheel's centre, for any angle of the head, in
     /// mm.
     pub(super) fn lift_mm(&self) -> f64 {
-        self.leaning().map_or(0.0, Rotary::most_lift_mm)
+        self.tilting_axis().map_or(0.0, RotaryAxis::max_lift_mm)
     }
 
     /// Returns the height that rapid moves must clear at a contact, in mm. It is the height of the wheel's centre. If
     /// the wheel rotates in the air, it is at least the height of the contact plus the reach of the wheel.
     #[inline]
-    pub(super) fn height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &Stand) -> f64 {
+    pub(super) fn clearance_height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &WheelPosition) -> f64 {
         match self.tilt {
-            None | Some(Lean::Constant { angle_rad: 0.0 }) => stand.centre.z,
+            None | Some(TiltMode::Constant { angle_rad: 0.0 }) => stand.centre.z,
             _ => {
                 let place = contact.point + contact.normal * lifted_mm;
                 stand.centre.z.max(place.z + self.wheel.reach_mm())
@@ -238,7 +238,7 @@ impl PathOptions {
 ///
 /// Tries constant tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns
 /// [`PathError::Upright`] with the first tilt for which `would_do` is true; otherwise returns the error unchanged.
-pub(super) fn or_tilted(
+pub(super) fn suggest_tilt(
     refused: PathError,
     options: &PathOptions,
     mut would_do: impl FnMut(PathOptions) -> bool,
@@ -254,8 +254,8 @@ pub(super) fn or_tilted(
     };
     let [least, most] = rotary.range_rad;
     let steps = (1..=(MAX_TILT_DEG / STEP_DEG) as i32).flat_map(|k| [k, -k]).map(|k| STEP_DEG * f64::from(k));
-    let found = steps.filter(|deg| (least..=most).contains(&rotary.on_scale_rad(deg.to_radians()))).find(|deg| {
-        let lean = Some(Lean::Constant { angle_rad: deg.to_radians() });
+    let found = steps.filter(|deg| (least..=most).contains(&rotary.scale_reading_rad(deg.to_radians()))).find(|deg| {
+        let lean = Some(TiltMode::Constant { angle_rad: deg.to_radians() });
         would_do(PathOptions { tilt: lean, ..*options })
     });
     match found {
@@ -266,15 +266,15 @@ pub(super) fn or_tilted(
 
 #[cfg(test)]
 mod tests {
-    use super::super::fit::tests::{PART, ball, path, quadric, surface};
-    use super::super::{Limits, Move, Scallops, ToolPath};
+    use super::super::wheel_fit::tests::{PART, ball, path, quadric, surface};
+    use super::super::{MachineLimits, Move, Scallops, ToolPath};
     use super::*;
 
     const PIVOT: Vector = Vector::new(0.0, 0.0, 200.0);
 
-    fn head(about: TurnAxis) -> Rotary {
-        let letter = if about == TurnAxis::X { 'A' } else { 'B' };
-        Rotary {
+    fn head(about: RotationAxis) -> RotaryAxis {
+        let letter = if about == RotationAxis::X { 'A' } else { 'B' };
+        RotaryAxis {
             letter,
             axis: about,
             reversed: false,
@@ -285,7 +285,7 @@ mod tests {
         }
     }
 
-    fn leaning(rotary: Rotary, lean: Lean, wheel: Wheel) -> PathOptions {
+    fn tilted_options(rotary: RotaryAxis, lean: TiltMode, wheel: Wheel) -> PathOptions {
         PathOptions { wheel, rotary: Some(rotary), tilt: Some(lean), ..ball(1.0) }
     }
 
@@ -301,8 +301,8 @@ mod tests {
     #[test]
     fn a_ball_tilted_by_thirty_degrees_on_a_plane_by_hand() {
         let tilted = |about| {
-            let lean = Lean::Constant { angle_rad: 30f64.to_radians() };
-            path(quadric(0.0, 0.0), leaning(head(about), lean, Wheel::Sphere { radius_mm: 10.0 })).unwrap()
+            let lean = TiltMode::Constant { angle_rad: 30f64.to_radians() };
+            path(quadric(0.0, 0.0), tilted_options(head(about), lean, Wheel::Sphere { radius_mm: 10.0 })).unwrap()
         };
         let upright: Vec<Point> = path(quadric(0.0, 0.0), ball(10.0))
             .unwrap()
@@ -311,8 +311,8 @@ mod tests {
             .collect();
         // The pivot moves by 200 sin 30° to +x when B rotates, or to -y when A rotates, and down by 200 (1 - cos 30°).
         for (about, by) in [
-            (TurnAxis::Y, Vector::new(100.0, 0.0, -26.794_919_243_112_27)),
-            (TurnAxis::X, Vector::new(0.0, -100.0, -26.794_919_243_112_27)),
+            (RotationAxis::Y, Vector::new(100.0, 0.0, -26.794_919_243_112_27)),
+            (RotationAxis::X, Vector::new(0.0, -100.0, -26.794_919_243_112_27)),
         ] {
             let found = feeds(&tilted(about));
             assert_eq!(found.len(), upright.len());
@@ -329,8 +329,8 @@ mod tests {
             Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() },
             Wheel::tilted_cup(6.0, 1.0, 0.5),
         ] {
-            let lean = Lean::Constant { angle_rad: 0.0 };
-            let tilted = path(quadric(0.01, -0.004), leaning(head(TurnAxis::Y), lean, wheel)).unwrap();
+            let lean = TiltMode::Constant { angle_rad: 0.0 };
+            let tilted = path(quadric(0.01, -0.004), tilted_options(head(RotationAxis::Y), lean, wheel)).unwrap();
             let plain = path(quadric(0.01, -0.004), PathOptions { wheel, ..ball(1.0) }).unwrap();
             for (a, b) in tilted.moves().zip(plain.moves()) {
                 let upright = match a {
@@ -349,15 +349,15 @@ mod tests {
     fn a_wheel_that_follows_keeps_its_lead() {
         // Along x the normal rotates by -atan(2 a x), and B follows it. Seen along y there is no other rotation.
         let (a, lead) = (0.02f64, 0.5);
-        let follows = leaning(head(TurnAxis::Y), Lean::Following { lead_rad: lead }, Wheel::Sphere { radius_mm: 8.0 });
+        let follows = tilted_options(head(RotationAxis::Y), TiltMode::Following { lead_rad: lead }, Wheel::Sphere { radius_mm: 8.0 });
         let laid = path(quadric(a, 0.0), follows).unwrap();
         for x in [-7.0, 0.0, 5.0] {
-            let contact = laid.wanted().at([x, 1.0]);
+            let contact = laid.target().at([x, 1.0]);
             let tilt = follows.tilt_rad(&contact);
             assert!((tilt - (lead - (2.0 * a * x).atan())).abs() < 1e-6, "{tilt} at {x}");
             assert!((contact.normal.angle(&follows.head_at(&contact)) - lead).abs() < 1e-6);
         }
-        assert!((laid.least_lean_rad() - lead).abs() < 1e-6);
+        assert!((laid.min_head_angle_rad() - lead).abs() < 1e-6);
         let turned = laid.summary().unwrap().head_rotation.unwrap();
         assert!(turned.min_tilt_rad.value < 0.2 && turned.max_tilt_rad.value > 0.8 && turned.max_rate_rad_s.value > 0.1);
     }
@@ -366,22 +366,22 @@ mod tests {
     fn between_its_points_the_wheel_touches_too_when_slides_and_head_move_in_proportion() {
         let part = || quadric(0.02, -0.01);
         for (about, wheel) in [
-            (TurnAxis::Y, Wheel::Sphere { radius_mm: 8.0 }),
-            (TurnAxis::X, Wheel::Sphere { radius_mm: 8.0 }),
-            (TurnAxis::Y, Wheel::tilted_cup(6.0, 1.0, 0.2)),
-            (TurnAxis::X, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }),
+            (RotationAxis::Y, Wheel::Sphere { radius_mm: 8.0 }),
+            (RotationAxis::X, Wheel::Sphere { radius_mm: 8.0 }),
+            (RotationAxis::Y, Wheel::tilted_cup(6.0, 1.0, 0.2)),
+            (RotationAxis::X, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }),
         ] {
-            let rotary = Rotary { step_rad: 1e-4f64.to_radians(), ..head(about) };
-            let laid = path(part(), leaning(rotary, Lean::Following { lead_rad: -0.4 }, wheel)).unwrap();
+            let rotary = RotaryAxis { step_rad: 1e-4f64.to_radians(), ..head(about) };
+            let laid = path(part(), tilted_options(rotary, TiltMode::Following { lead_rad: -0.4 }, wheel)).unwrap();
             let found = feeds(&laid);
             let ground: Vec<Point> = (0..400 * 121)
                 .map(|k| [-8.0 + 0.04 * f64::from(k % 400), f64::from(k / 400) * 0.1 - 6.0])
-                .map(|at| laid.wanted().at(at).point)
+                .map(|at| laid.target().at(at).point)
                 .collect();
             let mut looked = 0;
             for pair in found.windows(2).step_by(97).filter(|pair| (pair[1].0 - pair[0].0).norm() < 5.0) {
                 let (at, tilt) = (nalgebra::center(&pair[0].0, &pair[1].0), 0.5 * (pair[0].1 + pair[1].1));
-                let centre = at - rotary.shift_mm(tilt);
+                let centre = at - rotary.pivot_shift_mm(tilt);
                 let stands = laid.options().wheel_turned(tilt);
                 let near = |p: &&Point| (**p - centre).norm() < wheel.reach_mm() + 0.1;
                 let nearest = ground.iter().filter(near).map(|p| stands.distance_mm(&(p - centre)));
@@ -399,22 +399,22 @@ mod tests {
 
     #[test]
     fn what_the_head_cannot_do_is_refused_with_what_would_do() {
-        let follows = Lean::Following { lead_rad: 0.5 };
+        let follows = TiltMode::Following { lead_rad: 0.5 };
         let wheel = Wheel::Sphere { radius_mm: 8.0 };
-        let of = |rotary| path(quadric(0.02, 0.0), leaning(rotary, follows, wheel)).unwrap().summary().unwrap();
-        let limits = Limits::default();
-        assert_eq!(of(head(TurnAxis::Y)).check(&limits), Ok(()));
-        let narrow = Rotary { range_rad: [-1.0, 0.7], ..head(TurnAxis::Y) };
+        let of = |rotary| path(quadric(0.02, 0.0), tilted_options(rotary, follows, wheel)).unwrap().summary().unwrap();
+        let limits = MachineLimits::default();
+        assert_eq!(of(head(RotationAxis::Y)).check(&limits), Ok(()));
+        let narrow = RotaryAxis { range_rad: [-1.0, 0.7], ..head(RotationAxis::Y) };
         let Err(PathError::Tilt { letter: 'B', found_deg, x_mm, by_deg, .. }) = of(narrow).check(&limits) else {
             panic!()
         };
         assert!(x_mm > -20.0 && found_deg > 40.2 && (found_deg - 0.7f64.to_degrees() - by_deg).abs() < 1e-9);
         // The scale of the axis counts in the opposite direction.
-        let reversed = Rotary { reversed: true, range_rad: [-1.0, -0.1], ..head(TurnAxis::Y) };
+        let reversed = RotaryAxis { reversed: true, range_rad: [-1.0, -0.1], ..head(RotationAxis::Y) };
         assert_eq!(of(reversed).check(&limits), Ok(()));
-        let lazy = Rotary { rate_rad_s: 0.05, ..head(TurnAxis::Y) };
+        let lazy = RotaryAxis { rate_rad_s: 0.05, ..head(RotationAxis::Y) };
         let Err(PathError::Rate { feed_mm_min, .. }) = of(lazy).check(&limits) else { panic!() };
-        let slower = PathOptions { feed_mm_min: 0.999 * feed_mm_min, ..leaning(lazy, follows, wheel) };
+        let slower = PathOptions { feed_mm_min: 0.999 * feed_mm_min, ..tilted_options(lazy, follows, wheel) };
         assert_eq!(path(quadric(0.02, 0.0), slower).unwrap().summary().unwrap().check(&limits), Ok(()));
         for (options, expected) in [
             (PathOptions { rotary: None, ..slower }, PathError::NoRotary),
@@ -422,7 +422,7 @@ mod tests {
         ] {
             assert_eq!(path(quadric(0.0, 0.0), options).unwrap_err(), expected);
         }
-        let pole = PathOptions { tilt: Some(Lean::Following { lead_rad: 0.01 }), ..slower };
+        let pole = PathOptions { tilt: Some(TiltMode::Following { lead_rad: 0.01 }), ..slower };
         assert!(matches!(path(quadric(0.0, 0.0), pole), Err(PathError::Option { key: "lead of a ball (rad)", .. })));
     }
 
@@ -430,22 +430,22 @@ mod tests {
     fn a_wheel_that_cannot_reach_upright_is_told_by_how_much_to_tilt() {
         // A flank of 74°: the spindle of an upright wheel is in the way.
         let flank = || surface(|[x, y]| (3.5 * y + 0.01 * x * x, [0.02 * x, 3.5]));
-        let upright = PathOptions { rotary: Some(head(TurnAxis::X)), ..ball(5.0) };
+        let upright = PathOptions { rotary: Some(head(RotationAxis::X)), ..ball(5.0) };
         let Err(PathError::NeedsTilt { refused, letter: 'A', angle_deg }) = path(flank(), upright) else { panic!() };
         assert!(matches!(*refused, PathError::Steep { .. }), "{refused}");
         // At least 74.05° - 68.75°, towards the normal, which points to -y.
         assert_eq!(angle_deg, 10.0);
-        let tilted = PathOptions { tilt: Some(Lean::Constant { angle_rad: angle_deg.to_radians() }), ..upright };
+        let tilted = PathOptions { tilt: Some(TiltMode::Constant { angle_rad: angle_deg.to_radians() }), ..upright };
         assert!(path(flank(), tilted).is_ok());
         // A rotation about y does not help. A machine without a rotary axis gets the original error.
-        let about_y = PathOptions { rotary: Some(head(TurnAxis::Y)), ..upright };
+        let about_y = PathOptions { rotary: Some(head(RotationAxis::Y)), ..upright };
         assert!(matches!(path(flank(), about_y), Err(PathError::Steep { .. })));
         assert!(matches!(path(flank(), ball(5.0)), Err(PathError::Steep { .. })));
         // A cup that is tilted less than the slope of the dome.
         let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..about_y };
         let refused = path(quadric(-0.0125, -0.001), cup).unwrap_err();
         let PathError::NeedsTilt { angle_deg, .. } = refused else { panic!("{refused}") };
-        let lean = Some(Lean::Constant { angle_rad: angle_deg.to_radians() });
+        let lean = Some(TiltMode::Constant { angle_rad: angle_deg.to_radians() });
         assert!(angle_deg < 0.0 && path(quadric(-0.0125, -0.001), PathOptions { tilt, ..cup }).is_ok(), "{angle_deg}");
     }
 
@@ -454,10 +454,10 @@ mod tests {
         // A disc that rolls along the track, tilted across it by 0.5 rad: the curvature of its ring changes, that of
         // its rim does not.
         let disc = Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::y() };
-        let lean = Lean::Constant { angle_rad: 0.5 };
-        let laid = path(quadric(0.0, 0.0), leaning(head(TurnAxis::X), lean, disc)).unwrap();
-        let found = Scallops::between(
-            laid.wanted(),
+        let lean = TiltMode::Constant { angle_rad: 0.5 };
+        let laid = path(quadric(0.0, 0.0), tilted_options(head(RotationAxis::X), lean, disc)).unwrap();
+        let found = Scallops::compute(
+            laid.target(),
             &PART,
             |contact| laid.options().wheel_at(contact),
             laid.options().pattern,
@@ -465,7 +465,7 @@ mod tests {
         );
         assert!((found.height_mm - 0.25 / 8.0 / 5.0).abs() < 1e-12, "{found:?}");
         let across =
-            leaning(head(TurnAxis::X), lean, Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::x() });
+            tilted_options(head(RotationAxis::X), lean, Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::x() });
         let laid = path(quadric(0.0, 0.0), across).unwrap();
         // With its spindle along the tracks, the disc has the curvature of its outer circle across the tracks.
         assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 8.0 / 45.0).abs() < 1e-12);

@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 
 use super::options::PathOptions;
-use super::tilt::{Stand, or_tilted};
+use super::tilt::{WheelPosition, suggest_tilt};
 use super::tracks::{Span, Tracks};
-use super::{PathError, Wanted, fit};
+use super::{PathError, TargetSurface, wheel_fit};
 use crate::geometry::{Aperture, Point};
 
 /// Approximate number of tracks that are searched for the highest place.
@@ -14,7 +14,7 @@ const SOME_TRACKS: usize = 200;
 /// Path of a wheel over a part. Its points are computed on demand by [`ToolPath::moves`].
 #[derive(Clone, Debug)]
 pub struct ToolPath {
-    target: Wanted,
+    target: TargetSurface,
     outline: Aperture,
     options: PathOptions,
     pub(super) tracks: Tracks,
@@ -33,35 +33,35 @@ impl ToolPath {
     /// Returns an error for invalid options and for a wheel that does not fit. Each error gives place, value, limit
     /// and remedy. If a constant tilt of the head solves the problem, the error is [`PathError::Upright`] with that
     /// angle.
-    pub fn new(wanted: Wanted, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
+    pub fn new(wanted: TargetSurface, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
-        let grain_mm = wanted.grain_mm();
+        let grain_mm = wanted.min_node_spacing_mm();
         let tracks = Tracks { spans: Vec::new(), track_mm: f64::NAN };
         let mut path = Self { target: wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, min_node_spacing_mm: grain_mm };
         match path.lay() {
             Ok(()) => Ok(path),
-            Err(refused) => Err(or_tilted(refused, &options, |tilted| {
+            Err(refused) => Err(suggest_tilt(refused, &options, |tilted| {
                 path.options = tilted;
-                fit::may_fit(&path.target, &path.outline, &tilted) && path.lay().is_ok()
+                wheel_fit::may_fit(&path.target, &path.outline, &tilted) && path.lay().is_ok()
             })),
         }
     }
 
     fn lay(&mut self) -> Result<(), PathError> {
-        let track_mm = fit::track_mm(&self.target, &self.outline, &self.options)?;
+        let track_mm = wheel_fit::track_mm(&self.target, &self.outline, &self.options)?;
         self.tracks = Tracks::lay(&self.outline, &self.options, track_mm)?;
-        self.safe_z_mm = self.highest_mm()? + self.options.safe_height_mm + self.options.lift_mm();
-        fit::check_body(&self.target, &self.outline, &self.options)
+        self.safe_z_mm = self.max_clearance_height_mm()? + self.options.safe_height_mm + self.options.lift_mm();
+        wheel_fit::check_body(&self.target, &self.outline, &self.options)
     }
 
     /// Returns the smallest angle between the axis of the head and a normal of the part, in rad. At 0 a ball touches
     /// with its pole, which has no cutting speed.
-    pub fn least_lean_rad(&self) -> f64 {
+    pub fn min_head_angle_rad(&self) -> f64 {
         let lean = |place: [f64; 2]| {
             let contact = self.target.at(place);
             contact.normal.angle(&self.options.head_at(&contact))
         };
-        fit::on_grid(&self.outline, fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
+        wheel_fit::on_grid(&self.outline, wheel_fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
     }
 
     /// Returns the distance between tracks over x and y, in millimetres.
@@ -70,13 +70,13 @@ impl ToolPath {
     }
 
     /// Returns the number of tracks. A track that leaves the part and comes back counts once for each piece.
-    pub fn tracks(&self) -> usize {
+    pub fn track_count(&self) -> usize {
         self.tracks.spans.len()
     }
 
     /// Returns the height z of the rapid moves in x and y, in millimetres, in the model frame.
     pub fn safe_z_mm(&self) -> f64 {
-        self.upright(self.safe_z_mm)
+        self.flipped_height_mm(self.safe_z_mm)
     }
 
     /// Returns the height of the rapid moves as seen from the side from which the wheel comes, in millimetres.
@@ -87,12 +87,12 @@ impl ToolPath {
     /// Converts a height as seen from the wheel's side into the model frame, or back. The sign changes for a wheel
     /// from below.
     #[inline]
-    pub(super) fn upright(&self, z_mm: f64) -> f64 {
+    pub(super) fn flipped_height_mm(&self, z_mm: f64) -> f64 {
         if self.options.from_below { -z_mm } else { z_mm }
     }
 
     /// Returns the smallest node spacing of the surface, in millimetres.
-    pub(super) fn grain_mm(&self) -> f64 {
+    pub(super) fn min_node_spacing_mm(&self) -> f64 {
         self.min_node_spacing_mm
     }
 
@@ -102,7 +102,7 @@ impl ToolPath {
     }
 
     /// Returns the target surface of the path.
-    pub fn wanted(&self) -> &Wanted {
+    pub fn target(&self) -> &TargetSurface {
         &self.target
     }
 
@@ -114,31 +114,31 @@ impl ToolPath {
     /// Returns the position and tilt of the wheel at parameter `t` of a track. They are NaN if a rim cannot touch
     /// there; [`ToolPath::new`] rejects these paths.
     #[inline]
-    pub(super) fn stand(&self, span: &Span, t: f64) -> Stand {
+    pub(super) fn wheel_position(&self, span: &Span, t: f64) -> WheelPosition {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
         let nowhere = Point::new(f64::NAN, f64::NAN, f64::NAN);
-        let none = Stand { centre: nowhere, tilt_rad: f64::NAN, programmed_point: nowhere, programmed_tilt_rad: f64::NAN };
-        self.options.stand(&contact, lifted).unwrap_or(none)
+        let none = WheelPosition { centre: nowhere, tilt_rad: f64::NAN, programmed_point: nowhere, programmed_tilt_rad: f64::NAN };
+        self.options.wheel_position(&contact, lifted).unwrap_or(none)
     }
 
     /// Returns the height that rapid moves must clear at parameter `t` of a track, in mm; NaN if the wheel cannot
     /// touch there.
-    fn height_mm(&self, span: &Span, t: f64) -> f64 {
+    fn clearance_height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
-        self.options.stand(&contact, lifted).map_or(f64::NAN, |stand| self.options.height_mm(&contact, lifted, &stand))
+        self.options.wheel_position(&contact, lifted).map_or(f64::NAN, |stand| self.options.clearance_height_mm(&contact, lifted, &stand))
     }
 
     /// Returns the largest height that rapid moves must clear, in mm. The search uses steps of about 1 mm on some of
     /// the tracks; the safe height above it leaves enough room.
-    fn highest_mm(&self) -> Result<f64, PathError> {
+    fn max_clearance_height_mm(&self) -> Result<f64, PathError> {
         let highest = |span: &Span| {
             let (from, to) = span.with_leads(&self.options);
             let count = (span.length_mm(from, to).ceil() as usize).clamp(8, 20_000);
             (0..=count)
                 .map(|k| from + (to - from) * k as f64 / count as f64)
-                .map(|t| (self.height_mm(span, t), t))
+                .map(|t| (self.clearance_height_mm(span, t), t))
                 .try_fold(
                     f64::NEG_INFINITY,
                     |most, (z, t)| if z.is_finite() { Ok(most.max(z)) } else { Err(span.place(t)) },
@@ -157,12 +157,12 @@ impl ToolPath {
 
 #[cfg(test)]
 mod tests {
-    use super::super::fit::tests::{PART, surface};
-    use super::super::{Move, Pattern, Wheel};
+    use super::super::wheel_fit::tests::{PART, surface};
+    use super::super::{Move, TrackPattern, Wheel};
     use super::*;
 
     /// Returns a surface without symmetry, seen from +z (1) or from -z (-1).
-    fn seen(from: f64) -> Wanted {
+    fn asymmetric_target(from: f64) -> TargetSurface {
         surface(move |[x, y]| {
             let z = 0.01 * x * x - 0.004 * y * y + 0.05 * x + 0.03 * (0.3 * y).sin();
             (from * z, [from * (0.02 * x + 0.05), from * (-0.008 * y + 0.009 * (0.3 * y).cos())])
@@ -173,15 +173,15 @@ mod tests {
     fn the_mirrored_world_has_the_mirrored_path() {
         let cup = Wheel::tilted_cup(6.0, 1.0, 0.5);
         for (wheel, pattern) in [
-            (Wheel::Sphere { radius_mm: 10.0 }, Pattern::Raster),
-            (Wheel::Sphere { radius_mm: 10.0 }, Pattern::Spiral),
-            (cup, Pattern::Raster),
+            (Wheel::Sphere { radius_mm: 10.0 }, TrackPattern::Raster),
+            (Wheel::Sphere { radius_mm: 10.0 }, TrackPattern::Spiral),
+            (cup, TrackPattern::Raster),
         ] {
             let options = PathOptions { pattern, ..PathOptions::new(wheel, 1.5, 600.0) };
-            let above = ToolPath::new(seen(1.0), PART, options).unwrap();
+            let above = ToolPath::new(asymmetric_target(1.0), PART, options).unwrap();
             // A hanging part: its lower side is the mirror image of the upper side of the other part.
-            let below = ToolPath::new(seen(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
-            assert_eq!(above.tracks(), below.tracks());
+            let below = ToolPath::new(asymmetric_target(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
+            assert_eq!(above.track_count(), below.track_count());
             for (up, down) in above.moves().zip(below.moves()) {
                 let mirrored = match up {
                     Move::RapidZ(z) => Move::RapidZ(-z),
@@ -202,8 +202,8 @@ mod tests {
         // The surface is in the model frame; the wheel is under it.
         let options =
             PathOptions { from_below: true, ..PathOptions::new(Wheel::Sphere { radius_mm: 10.0 }, 1.5, 600.0) };
-        let below = ToolPath::new(seen(-1.0), PART, options).unwrap();
-        let model = seen(1.0);
+        let below = ToolPath::new(asymmetric_target(-1.0), PART, options).unwrap();
+        let model = asymmetric_target(1.0);
         let mut touching = 0;
         for one in below.moves() {
             let Move::Feed { to: at, .. } = one else { continue };

@@ -5,25 +5,25 @@ use std::f64::consts::TAU;
 use crate::geometry::Aperture;
 
 use super::PathError;
-use super::options::{PathOptions, Pattern};
+use super::options::{PathOptions, TrackPattern};
 
 /// Maximum number of tracks of a path.
-const MOST_TRACKS: f64 = 1e6;
+const MAX_TRACKS: f64 = 1e6;
 /// Number of intervals at whose ends a track is tested for being on the part. Shorter pieces of the track can be
 /// missed.
-const LOOKS: usize = 720;
+const TESTS_PER_TRACK: usize = 720;
 
 /// Track, or a piece of one, on a curve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Span {
-    curve: Curve,
+    curve: TrackCurve,
     /// Parameters of the curve at which the track enters and leaves the part with its overrun.
     pub(super) from: f64,
     pub(super) to: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Curve {
+enum TrackCurve {
     /// Line along x. The parameter is x, in mm.
     Line { y_mm: f64 },
     /// Spiral r = b |angle|. The parameter is the angle, in rad, which falls to 0 in the middle.
@@ -42,8 +42,8 @@ impl Span {
     #[inline]
     pub(super) fn place(&self, t: f64) -> [f64; 2] {
         match self.curve {
-            Curve::Line { y_mm } => [t, y_mm],
-            Curve::Spiral { centre_mm: [x, y], rise_mm } => {
+            TrackCurve::Line { y_mm } => [t, y_mm],
+            TrackCurve::Spiral { centre_mm: [x, y], rise_mm } => {
                 let (sine, cosine) = t.sin_cos();
                 [x + rise_mm * t * cosine, y + rise_mm * t * sine]
             }
@@ -54,17 +54,17 @@ impl Span {
     #[inline]
     fn arc_mm(&self, t: f64) -> f64 {
         match self.curve {
-            Curve::Line { .. } => t,
-            Curve::Spiral { rise_mm, .. } => 0.5 * rise_mm * (t * (1.0 + t * t).sqrt() + t.asinh()),
+            TrackCurve::Line { .. } => t,
+            TrackCurve::Spiral { rise_mm, .. } => 0.5 * rise_mm * (t * (1.0 + t * t).sqrt() + t.asinh()),
         }
     }
 
     /// Returns the length over x and y per unit of the parameter, in mm.
     #[inline]
-    pub(super) fn speed_mm(&self, t: f64) -> f64 {
+    pub(super) fn length_per_parameter_mm(&self, t: f64) -> f64 {
         match self.curve {
-            Curve::Line { .. } => 1.0,
-            Curve::Spiral { rise_mm, .. } => rise_mm * (1.0 + t * t).sqrt(),
+            TrackCurve::Line { .. } => 1.0,
+            TrackCurve::Spiral { rise_mm, .. } => rise_mm * (1.0 + t * t).sqrt(),
         }
     }
 
@@ -75,14 +75,14 @@ impl Span {
 
     /// Returns the parameter at a signed arc length `by_mm` from parameter `t`. On a spiral Newton's method solves for
     /// it.
-    fn beyond(&self, t: f64, by_mm: f64) -> f64 {
+    fn parameter_beyond(&self, t: f64, by_mm: f64) -> f64 {
         match self.curve {
-            Curve::Line { .. } => t + by_mm,
-            Curve::Spiral { .. } => {
+            TrackCurve::Line { .. } => t + by_mm,
+            TrackCurve::Spiral { .. } => {
                 let wanted = self.arc_mm(t) + by_mm;
-                let mut at = t + by_mm / self.speed_mm(t);
+                let mut at = t + by_mm / self.length_per_parameter_mm(t);
                 for _ in 0..60 {
-                    let step = (self.arc_mm(at) - wanted) / self.speed_mm(at);
+                    let step = (self.arc_mm(at) - wanted) / self.length_per_parameter_mm(at);
                     at -= step;
                     if step.abs() < 1e-12 * (1.0 + at.abs()) {
                         break;
@@ -96,7 +96,7 @@ impl Span {
     /// Returns the parameters at the start of the lead-in and at the end of the lead-out.
     pub(super) fn with_leads(&self, options: &PathOptions) -> (f64, f64) {
         let ahead = (self.to - self.from).signum() * options.lead_mm;
-        (self.beyond(self.from, -ahead), self.beyond(self.to, ahead))
+        (self.parameter_beyond(self.from, -ahead), self.parameter_beyond(self.to, ahead))
     }
 }
 
@@ -110,12 +110,12 @@ impl Tracks {
         let [low, high] = outline.bounds();
         let size = [high[0] - low[0], high[1] - low[1]];
         let turns = size[1].max(size[0]) / track_mm;
-        if turns.is_nan() || turns >= MOST_TRACKS {
-            return Err(PathError::TooManyTracks { tracks: turns, track_mm, limit: MOST_TRACKS });
+        if turns.is_nan() || turns >= MAX_TRACKS {
+            return Err(PathError::TooManyTracks { tracks: turns, track_mm, limit: MAX_TRACKS });
         }
         let tracks = match options.pattern {
-            Pattern::Raster => raster(outline, options.overrun_mm, track_mm, options.one_way),
-            Pattern::Spiral => spiral(outline, options.overrun_mm, track_mm),
+            TrackPattern::Raster => raster(outline, options.overrun_mm, track_mm, options.one_way),
+            TrackPattern::Spiral => spiral(outline, options.overrun_mm, track_mm),
         };
         if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }
     }
@@ -145,7 +145,7 @@ fn raster(outline: &Aperture, overrun_mm: f64, track_mm: f64, one_way: bool) -> 
     let mut spans = Vec::new();
     let mut backwards = false;
     for k in 0..=steps as usize {
-        let line = Span { curve: Curve::Line { y_mm: y0 + k as f64 * step_mm }, from: 0.0, to: 0.0 };
+        let line = Span { curve: TrackCurve::Line { y_mm: y0 + k as f64 * step_mm }, from: 0.0, to: 0.0 };
         let mut pieces = on_part(&line, outline, overrun_mm, x0 - overrun_mm, x1 + overrun_mm);
         if backwards {
             pieces.reverse();
@@ -160,10 +160,10 @@ fn raster(outline: &Aperture, overrun_mm: f64, track_mm: f64, one_way: bool) -> 
 fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
     let [[x0, y0], [x1, y1]] = outline.bounds();
     let centre_mm = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
-    let rim = outline.outline_mm(LOOKS).into_iter().map(|[x, y]| (x - centre_mm[0]).hypot(y - centre_mm[1]));
+    let rim = outline.outline_mm(TESTS_PER_TRACK).into_iter().map(|[x, y]| (x - centre_mm[0]).hypot(y - centre_mm[1]));
     let rim_mm = rim.fold(0.0, f64::max);
     let rise_mm = track_mm / TAU;
-    let curve = Curve::Spiral { centre_mm, rise_mm };
+    let curve = TrackCurve::Spiral { centre_mm, rise_mm };
     // Start one full turn beyond the rim; `on_part` keeps the pieces within the overrun.
     let outermost = rim_mm / rise_mm + TAU;
     let turns = (outermost / TAU).ceil() as usize;
@@ -195,10 +195,10 @@ fn on_part(curve: &Span, outline: &Aperture, overrun_mm: f64, least: f64, most: 
         }
         if at_a { a } else { b }
     };
-    let at = |k: usize| least + (most - least) * k as f64 / LOOKS as f64;
+    let at = |k: usize| least + (most - least) * k as f64 / TESTS_PER_TRACK as f64;
     let mut pieces = Vec::new();
     let mut began = None;
-    for k in 0..=LOOKS {
+    for k in 0..=TESTS_PER_TRACK {
         match (began, inside(at(k))) {
             (None, true) => began = Some(if k == 0 { at(0) } else { border(at(k - 1), at(k)) }),
             (Some(from), false) => {

@@ -22,11 +22,11 @@
 
 use crate::geometry::{Point, Vector};
 
-use super::wanted::Contact;
+use super::target_surface::Contact;
 
 /// Sine of the minimum angle between the normal and the spindle of a rim or a ring. At smaller angles the contact
 /// point runs around the wheel.
-pub(super) const LEAST_LEAN: f64 = 0.035;
+pub(super) const MIN_SPINDLE_ANGLE_SINE: f64 = 0.035;
 
 /// Shape and size of a wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -72,7 +72,7 @@ impl Wheel {
             Self::Torus { ring_mm, tube_mm, spindle } | Self::Cup { ring_mm, tube_mm, spindle } => {
                 let across = normal - spindle * normal.dot(spindle);
                 let lean = across.norm();
-                (lean >= LEAST_LEAN).then(|| point + normal * *tube_mm + across * (ring_mm / lean))
+                (lean >= MIN_SPINDLE_ANGLE_SINE).then(|| point + normal * *tube_mm + across * (ring_mm / lean))
             }
         }
     }
@@ -112,7 +112,7 @@ impl Wheel {
 
     /// Returns a ball with its radius increased by `mm`; returns any other wheel unchanged.
     #[must_use]
-    pub fn larger_by(self, mm: f64) -> Self {
+    pub fn with_larger_radius(self, mm: f64) -> Self {
         match self {
             Self::Sphere { radius_mm } => Self::Sphere { radius_mm: radius_mm + mm },
             other => other,

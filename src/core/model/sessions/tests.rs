@@ -1,45 +1,45 @@
 use nalgebra::{DMatrix, DVector};
 
-use super::super::normals::Normals;
+use super::super::random_normals::NormalGenerator;
 use super::*;
 
 const COMMON: Hyperparameters =
     Hyperparameters { field: Field::new(5e-3, 40.0), noise_sigma_mm: 1e-3, noise_autocorrelation: 0.0 };
-const OWN: Field = Field::new(4e-3, 150.0);
-const A_SESSION: usize = 40;
+const SESSION_FIELD: Field = Field::new(4e-3, 150.0);
+const POINTS_PER_SESSION: usize = 40;
 
 /// Simulates points of a part of 102 x 62 mm that is measured in several sessions, each with a random field of its own:
 /// first the known sessions, then the unseen ones, of the same part.
 fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
-    let n = A_SESSION * (known + unseen) as usize;
+    let n = POINTS_PER_SESSION * (known + unseen) as usize;
     let places: Vec<[f64; 2]> = (0..n)
         .map(|k| k as f64 + 0.5)
         .map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0])
         .collect();
-    let session = |k: usize| (k / A_SESSION) as u32;
-    let own = Field { sigma_mm: own_mm, ..OWN };
+    let session = |k: usize| (k / POINTS_PER_SESSION) as u32;
+    let own = Field { sigma_mm: own_mm, ..SESSION_FIELD };
     let covariance = DMatrix::from_fn(n, n, |r, c| {
         let of_session = if session(r) == session(c) { own.covariance_mm2(places[r], places[c]) } else { 0.0 };
         COMMON.field.covariance_mm2(places[r], places[c]) + of_session + if r == c { 1e-13 } else { 0.0 }
     });
-    let mut normals = Normals::new(seed, 0);
+    let mut normals = NormalGenerator::new(seed, 0);
     let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
     let found: Vec<f64> = field.iter().map(|f| f + COMMON.noise_sigma_mm * normals.next()).collect();
     let of = |sessions: std::ops::Range<u32>| {
-        let parts: Vec<Observed> = sessions.clone().map(|s| fitted(&places, &found, s as usize)).collect();
-        let numbers = sessions.flat_map(|s| [s; A_SESSION]).collect();
+        let parts: Vec<Observations> = sessions.clone().map(|s| fitted(&places, &found, s as usize)).collect();
+        let numbers = sessions.flat_map(|s| [s; POINTS_PER_SESSION]).collect();
         Sessions::new(joined(&parts), numbers).unwrap()
     };
     [of(0..known), of(known..known + unseen)]
 }
 
 /// Returns a session after its best fit of height and tilts.
-fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observed {
-    let rows = session * A_SESSION..(session + 1) * A_SESSION;
+fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observations {
+    let rows = session * POINTS_PER_SESSION..(session + 1) * POINTS_PER_SESSION;
     let (places, found) = (&places[rows.clone()], &found[rows]);
-    let effects = DMatrix::from_fn(A_SESSION, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-    let left = BestFitBasis::of(&effects).after_best_fit(found);
-    Observed { fixed_effects: effects, ..Observed::without_effects(places.to_vec(), left) }
+    let effects = DMatrix::from_fn(POINTS_PER_SESSION, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
+    let left = BestFitBasis::new(&effects).after_best_fit(found);
+    Observations { fixed_effects: effects, ..Observations::without_effects(places.to_vec(), left) }
 }
 
 /// Returns the share of the deviations of the unseen sessions that lie within the 95 % interval.
@@ -54,11 +54,11 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
     const PARTS: u32 = 12;
     let (mut strength, mut scatter, mut covered) = (0.0, 0.0, 0.0);
     for seed in 0..PARTS {
-        let sessions = planted(OWN.sigma_mm, 6, 2, u64::from(seed));
+        let sessions = planted(SESSION_FIELD.sigma_mm, 6, 2, u64::from(seed));
         let between = sessions[0].between_session_variance(&Prior::for_size(102.0)).unwrap();
         // Each session is after its best fit: only strength and range together determine what remains of its field.
         let bent = |field: Field| field.sigma_mm / field.range_mm.powi(2);
-        strength += (bent(between.session_field) / bent(OWN)).ln() / f64::from(PARTS);
+        strength += (bent(between.session_field) / bent(SESSION_FIELD)).ln() / f64::from(PARTS);
         scatter += (between.hyperparameters.noise_sigma_mm / COMMON.noise_sigma_mm).ln() / f64::from(PARTS);
         covered += within(&between, &sessions) / f64::from(PARTS);
     }
@@ -82,7 +82,7 @@ fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
     // By hand: common variance 4, session variance 1, noise variance 0.25, and two sessions with a point each at one
     // place. So K = 4 + 1.25 I, mean = 4 (d1 + d2) / 9.25.
     let one = |deviations: Vec<f64>, of: Vec<u32>| {
-        Sessions::new(Observed::without_effects(vec![[1.0, 2.0]; deviations.len()], deviations), of).unwrap()
+        Sessions::new(Observations::without_effects(vec![[1.0, 2.0]; deviations.len()], deviations), of).unwrap()
     };
     let own_u = 0.25;
     let between = BetweenSessionVariance {
@@ -108,14 +108,14 @@ fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
 #[test]
 fn the_quantiles_of_student_are_those_of_the_tables() {
     for (degrees, t, share) in [(2.0, 4.3027, 0.02), (3.0, 3.1824, 5e-3), (5.0, 2.5706, 1e-3), (30.0, 2.0423, 1e-4)] {
-        assert!((student(degrees) / t - 1.0).abs() < share, "{degrees}: {}", student(degrees));
+        assert!((student_t_quantile(degrees) / t - 1.0).abs() < share, "{degrees}: {}", student_t_quantile(degrees));
     }
-    assert!((student(f64::INFINITY) - 1.959_964).abs() < 1e-6);
+    assert!((student_t_quantile(f64::INFINITY) - 1.959_964).abs() < 1e-6);
 }
 
 #[test]
 fn what_are_no_sessions_is_refused_in_words() {
-    let points = || Observed::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
+    let points = || Observations::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
     let odd = Sessions::new(points(), vec![1]).err().unwrap().to_string();
     assert_eq!(odd, "2 points and 1 numbers of their sessions do not match");
     let one =

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::error::{self, DefinitionError};
 
 /// Largest power of an asphere.
-const LARGEST_POWER: u32 = 60;
+const MAX_POWER: u32 = 60;
 
 /// A conic of revolution about z, its vertex at the origin; a sphere has the conic constant 0, a plane no curvature.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,8 +44,8 @@ impl Conic {
     /// # Errors
     /// A radius that is NaN or less than 1e-6 mm in magnitude, or a conic constant that is not finite.
     pub fn new(radius_mm: f64, conic: f64) -> Result<Self, DefinitionError> {
-        let curvature_per_mm = error::curvature("radius_mm", radius_mm)?;
-        Ok(Self { curvature_per_mm, conic: error::finite("conic", conic)? })
+        let curvature_per_mm = error::checked_curvature("radius_mm", radius_mm)?;
+        Ok(Self { curvature_per_mm, conic: error::check_finite("conic", conic)? })
     }
 
     /// Returns the curvature at the vertex in 1/mm.
@@ -77,7 +77,7 @@ impl TryFrom<&ConicDefinition> for Conic {
 }
 
 /// Checks the conic that polynomials are added to; none is the plane.
-pub(super) fn base(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
+pub(super) fn base_conic(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
     written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.in_table("base")))
 }
 
@@ -117,13 +117,13 @@ impl Asphere {
         sorted.sort_by_key(|term| term.0);
         for (i, &(power, coefficient)) in sorted.iter().enumerate() {
             let key = || format!("coefficients.A{power}");
-            if !(2..=LARGEST_POWER).contains(&power) {
+            if !(2..=MAX_POWER).contains(&power) {
                 return Err(DefinitionError::Term { key: key(), expected: "a power is a whole number from 2 to 60" });
             }
             if i > 0 && sorted[i - 1].0 == power {
                 return Err(DefinitionError::RepeatedTerm { key: key() });
             }
-            error::finite(&key(), coefficient)?;
+            error::check_finite(&key(), coefficient)?;
         }
         Ok(Self { base, terms: sorted })
     }
@@ -153,13 +153,13 @@ impl TryFrom<&AsphereDefinition> for Asphere {
 
     fn try_from(written: &AsphereDefinition) -> Result<Self, DefinitionError> {
         let expected = "a coefficient is named by its power, as in `A4` or `4`";
-        let terms = numbered("coefficients", 'A', expected, &written.coefficients)?;
+        let terms = parse_coefficients("coefficients", 'A', expected, &written.coefficients)?;
         Self::new(Conic::new(written.radius_mm, written.conic)?, &terms)
     }
 }
 
 /// Reads a table of coefficients whose keys are numbers, with or without a letter before them.
-pub(super) fn numbered(
+pub(super) fn parse_coefficients(
     table: &str,
     letter: char,
     expected: &'static str,
@@ -172,7 +172,7 @@ pub(super) fn numbered(
         // `parse` would take a sign as well.
         let number = digits.parse::<u32>().ok().filter(|_| digits.bytes().all(|b| b.is_ascii_digit()));
         let number = number.ok_or_else(|| DefinitionError::Term { key: key(), expected })?;
-        error::finite(&key(), coefficient)?;
+        error::check_finite(&key(), coefficient)?;
         if terms.insert(number, coefficient).is_some() {
             return Err(DefinitionError::RepeatedTerm { key: key() });
         }

@@ -212,8 +212,8 @@ impl SurfaceDefinition {
             return Err(toml_error(text, Some(name.span()), &message));
         }
         Ok(Self {
-            surface: FormulaByKind::deserialize(by_kind(text, "surface", surface)?).map_err(in_text)?,
-            aperture: ApertureByKind::deserialize(by_kind(text, "aperture", aperture)?).map_err(in_text)?,
+            surface: FormulaByKind::deserialize(deserialize_by_kind(text, "surface", surface)?).map_err(in_text)?,
+            aperture: ApertureByKind::deserialize(deserialize_by_kind(text, "aperture", aperture)?).map_err(in_text)?,
             sampling: sampling
                 .map(|table| SamplingDefinition::deserialize(ValueDeserializer::from(table)))
                 .transpose()
@@ -261,7 +261,7 @@ impl SamplingDefinition {
     /// Checks the numbers.
     fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
-            (Some(spacing), None) => Ok(Sampling::Spacing { spacing_mm: error::positive("spacing_mm", spacing)? }),
+            (Some(spacing), None) => Ok(Sampling::Spacing { spacing_mm: error::check_positive("spacing_mm", spacing)? }),
             (None, Some(nm)) if nm > 0.0 && nm <= 1e6 => Ok(Sampling::Accuracy { accuracy_mm: 1e-6 * nm }),
             (None, Some(nm)) => {
                 let limit = "greater than 0 and at most 1e6 nm";
@@ -308,7 +308,7 @@ impl DefinedSurface {
     /// # Errors
     /// Whatever is wrong with the text or with a value, with line and column.
     pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
-        SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| at_its_place(text, error))
+        SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| with_location(text, error))
     }
 
     /// Returns the formula.
@@ -328,14 +328,14 @@ impl DefinedSurface {
 }
 
 /// Adds line and column to an error of value, where its key stands in the text; else the error stays as it is.
-fn at_its_place(text: &str, error: DefinitionError) -> DefinitionError {
-    let Some(span) = error.key().and_then(|key| place_of(text, &key)) else { return error };
+fn with_location(text: &str, error: DefinitionError) -> DefinitionError {
+    let Some(span) = error.key().and_then(|key| key_span(text, &key)) else { return error };
     let (line, column) = line_and_column(text, span.start);
     DefinitionError::Located { line, column, source: Box::new(error) }
 }
 
 /// Returns where the value of a key stands; for one that is not in the text, its innermost table that is.
-fn place_of(text: &str, path: &str) -> Option<Range<usize>> {
+fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     let root = DeTable::parse(text).ok()?;
     let mut table = root.get_ref();
     let mut found = None;
@@ -351,7 +351,7 @@ fn place_of(text: &str, path: &str) -> Option<Range<usize>> {
 }
 
 /// Turns `{ kind = "a", b = 1 }` into `{ a = { b = 1 } }`, every part at its place in the text.
-fn by_kind<'t>(text: &str, name: &str, table: Spanned<DeValue<'t>>) -> Result<ValueDeserializer<'t>, DefinitionError> {
+fn deserialize_by_kind<'t>(text: &str, name: &str, table: Spanned<DeValue<'t>>) -> Result<ValueDeserializer<'t>, DefinitionError> {
     let span = table.span();
     let DeValue::Table(mut keys) = table.into_inner() else {
         return Err(toml_error(text, Some(span), &format!("`{name}` must be a table, [{name}]")));

@@ -124,7 +124,7 @@ impl DefinitionError {
 }
 
 /// Checks a number that must be finite.
-pub(super) fn finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
+pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
     if value.is_finite() {
         return Ok(value);
     }
@@ -132,7 +132,7 @@ pub(super) fn finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
 }
 
 /// Checks a radius of curvature, which may be infinite, and returns its curvature.
-pub(super) fn curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionError> {
+pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionError> {
     if radius_mm.abs() >= 1e-6 {
         return Ok(1.0 / radius_mm);
     }
@@ -141,7 +141,7 @@ pub(super) fn curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionErro
 }
 
 /// Checks a length that must be positive.
-pub(super) fn positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError> {
+pub(super) fn check_positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError> {
     if length_mm > 0.0 && length_mm <= 1e6 {
         return Ok(length_mm);
     }

@@ -11,10 +11,10 @@ use serde::{Deserialize, Serialize};
 
 use super::conic::Conic;
 use super::error::{self, DefinitionError};
-use super::{EXTRAPOLATION, jacobi};
+use super::{MAX_EXTRAPOLATION, jacobi};
 
 /// Most coefficients of one surface.
-const MOST_COEFFICIENTS: usize = 200;
+const MAX_COEFFICIENTS: usize = 200;
 
 /// A conic and a sum of Qcon polynomials.
 #[derive(Clone, Debug, PartialEq)]
@@ -65,8 +65,8 @@ impl TryFrom<&QconDefinition> for Qcon {
     fn try_from(written: &QconDefinition) -> Result<Self, DefinitionError> {
         Ok(Self {
             base: Conic::new(written.radius_mm, written.conic)?,
-            normalisation_radius_mm: error::positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
-            coefficients_mm: checked(&written.coefficients_mm)?.iter().map(|&a| [a]).collect(),
+            normalisation_radius_mm: error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
+            coefficients_mm: check_coefficients(&written.coefficients_mm)?.iter().map(|&a| [a]).collect(),
         })
     }
 }
@@ -123,8 +123,8 @@ impl TryFrom<&QbfsDefinition> for Qbfs {
     fn try_from(written: &QbfsDefinition) -> Result<Self, DefinitionError> {
         Ok(Self {
             sphere: Conic::new(written.radius_mm, 0.0)?,
-            normalisation_radius_mm: error::positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
-            p_coefficients_mm: p_coefficients(checked(&written.coefficients_mm)?),
+            normalisation_radius_mm: error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
+            p_coefficients_mm: p_coefficients(check_coefficients(&written.coefficients_mm)?),
         })
     }
 }
@@ -133,17 +133,17 @@ impl TryFrom<&QbfsDefinition> for Qbfs {
 fn square(q: f64, normalisation_radius_mm: f64) -> Option<[f64; 2]> {
     let per_mm2 = 1.0 / (normalisation_radius_mm * normalisation_radius_mm);
     let v = q * per_mm2;
-    (v <= EXTRAPOLATION * EXTRAPOLATION).then_some([v, per_mm2])
+    (v <= MAX_EXTRAPOLATION * MAX_EXTRAPOLATION).then_some([v, per_mm2])
 }
 
 /// Checks a list of coefficients.
-fn checked(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError> {
+fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError> {
     let expected = "at most 200 coefficients are summed";
-    if coefficients_mm.len() > MOST_COEFFICIENTS {
-        return Err(DefinitionError::Term { key: format!("coefficients_mm.{MOST_COEFFICIENTS}"), expected });
+    if coefficients_mm.len() > MAX_COEFFICIENTS {
+        return Err(DefinitionError::Term { key: format!("coefficients_mm.{MAX_COEFFICIENTS}"), expected });
     }
     for (m, &a) in coefficients_mm.iter().enumerate() {
-        error::finite(&format!("coefficients_mm.{m}"), a)?;
+        error::check_finite(&format!("coefficients_mm.{m}"), a)?;
     }
     Ok(coefficients_mm)
 }

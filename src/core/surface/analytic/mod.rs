@@ -37,7 +37,7 @@ use crate::geometry::{Aperture, Vector};
 
 /// How far beyond the normalisation radius polynomials on a disc are still evaluated, as a multiple of it: a sampling takes one
 /// ring of nodes beyond the aperture.
-const EXTRAPOLATION: f64 = 1.5;
+const MAX_EXTRAPOLATION: f64 = 1.5;
 
 /// A surface given by a formula, checked.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,7 +90,7 @@ impl AnalyticSurface {
 
     /// Returns the unit normal on the +z side at a place; none where the formula has no value.
     pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
-        self.sag_and_gradient(x, y).map(|(_, gradient)| normal_of(gradient))
+        self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
     }
 
     /// The radius of the disc on which the polynomials are meant, if they are meant on a disc.
@@ -127,7 +127,7 @@ impl AnalyticSurface {
 }
 
 /// Returns the unit normal on the +z side of a surface with a gradient.
-fn normal_of([gx, gy]: [f64; 2]) -> Vector {
+fn normal_from_gradient([gx, gy]: [f64; 2]) -> Vector {
     Vector::new(-gx, -gy, 1.0).normalize()
 }
 

@@ -8,7 +8,7 @@ use super::{AnalyticSurface, Formula};
 use crate::geometry::{Point, Vector};
 
 /// Steps of the way from the section's centre, where Newton's method does not come straight to a place.
-const WAY_STEPS: u32 = 64;
+const CONTINUATION_STEPS: u32 = 64;
 
 /// The frame in which a section and its aperture are described.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
@@ -69,12 +69,12 @@ impl OffAxis {
             let remedy = "for the other side turn `azimuth_deg` by 180°";
             return Err(DefinitionError::out_of_range("distance_mm", distance_mm, "from 0 to 1e6 mm", remedy));
         }
-        let (sine, cosine) = error::finite("azimuth_deg", azimuth_rad)?.sin_cos();
+        let (sine, cosine) = error::check_finite("azimuth_deg", azimuth_rad)?.sin_cos();
         let (x_mm, y_mm) = (distance_mm * cosine, distance_mm * sine);
         let Some((z, gradient)) = parent.sag_and_gradient(x_mm, y_mm) else {
             return Err(DefinitionError::SectionOffParent { x_mm, y_mm });
         };
-        let parent_from_tilted = smallest_rotation(&super::normal_of(gradient));
+        let parent_from_tilted = min_rotation(&super::normal_from_gradient(gradient));
         Ok(Self { parent: Box::new(parent), frame, centre: Point::new(x_mm, y_mm, z), parent_from_tilted })
     }
 
@@ -150,9 +150,9 @@ impl OffAxis {
 
     /// Follows the surface from the section's centre to a place, where the tangent plane there misses the parent.
     fn continue_from_centre(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
-        let step = 1.0 / f64::from(WAY_STEPS);
+        let step = 1.0 / f64::from(CONTINUATION_STEPS);
         let (mut z, mut gradient) = self.newton(0.0, 0.0, 0.0)?;
-        for i in 1..=WAY_STEPS {
+        for i in 1..=CONTINUATION_STEPS {
             let t = f64::from(i) * step;
             let ahead = z + (gradient[0] * x + gradient[1] * y) * step;
             (z, gradient) = self.newton(t * x, t * y, ahead)?;
@@ -180,7 +180,7 @@ impl TryFrom<&OffAxisDefinition> for OffAxis {
 }
 
 /// Returns the rotation about an axis across z that takes z to a unit vector on the +z side.
-fn smallest_rotation(n: &Vector) -> Matrix3<f64> {
+fn min_rotation(n: &Vector) -> Matrix3<f64> {
     let s = 1.0 / (1.0 + n.z);
     Matrix3::new(
         1.0 - n.x * n.x * s,

@@ -6,7 +6,7 @@ use super::conic::{Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 
 /// Largest power of x or y.
-const LARGEST_POWER: u32 = 60;
+const MAX_POWER: u32 = 60;
 
 /// A conic and a sum of products of powers: `z = conic + sum a_ij (x / Rn)^i (y / Rn)^j`, Rn being the normalisation radius.
 ///
@@ -36,7 +36,7 @@ pub struct XyPolynomialDefinition {
 /// What a list of terms looks like: powers up to [`LARGEST_POWER`].
 #[cfg(feature = "schema")]
 fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-    let power = schemars::json_schema!({ "type": "integer", "minimum": 0, "maximum": LARGEST_POWER });
+    let power = schemars::json_schema!({ "type": "integer", "minimum": 0, "maximum": MAX_POWER });
     let term = [power.clone(), power, schemars::json_schema!({ "type": "number" })];
     schemars::json_schema!({
         "type": "array",
@@ -76,21 +76,21 @@ impl TryFrom<&XyPolynomialDefinition> for XyPolynomial {
     type Error = DefinitionError;
 
     fn try_from(written: &XyPolynomialDefinition) -> Result<Self, DefinitionError> {
-        let normalisation_radius_mm = error::positive("normalisation_radius_mm", written.normalisation_radius_mm)?;
+        let normalisation_radius_mm = error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?;
         let mut terms = written.terms.clone();
         terms.sort_by_key(|term| (term.0, term.1));
         for (n, &(i, j, coefficient)) in terms.iter().enumerate() {
             let key = || format!("terms.[{i}, {j}]");
-            if i.max(j) > LARGEST_POWER {
+            if i.max(j) > MAX_POWER {
                 let expected = "a term is [i, j, coefficient_mm] with powers from 0 to 60";
                 return Err(DefinitionError::Term { key: key(), expected });
             }
             if n > 0 && (terms[n - 1].0, terms[n - 1].1) == (i, j) {
                 return Err(DefinitionError::RepeatedTerm { key: key() });
             }
-            error::finite(&key(), coefficient)?;
+            error::check_finite(&key(), coefficient)?;
         }
-        let base = super::conic::base(written.base.as_ref())?;
+        let base = super::conic::base_conic(written.base.as_ref())?;
         Ok(Self { base, normalisation_radius_mm, terms })
     }
 }

@@ -4,21 +4,21 @@ use rayon::prelude::*;
 
 use super::definition::{DefinedSurface, Sampling};
 use super::error::{self, DefinitionError};
-use super::normal_of;
+use super::normal_from_gradient;
 use crate::geometry::{Aperture, Point, Vector};
 
 /// Most nodes of a sampling.
-const MOST_NODES: f64 = 2e7;
+const MAX_NODES: f64 = 2e7;
 
 /// Most terms and corners evaluated in a sampling; about a minute on one core.
-const MOST_WORK: f64 = 2e10;
+const MAX_WORK: f64 = 2e10;
 
 /// Nodes farther outside the aperture than this many spacings are left out. A cell that touches the aperture has its corners
 /// within a diagonal, 1.42 spacings.
 const MARGIN: f64 = 1.5;
 
 /// The coarsest spacing that is tried for an accuracy, as a part of the aperture's smaller side.
-const COARSEST: f64 = 1.0 / 8.0;
+const MAX_SPACING_SHARE: f64 = 1.0 / 8.0;
 
 /// How often the spacing is halved before an accuracy is out of reach.
 const HALVINGS: u32 = 14;
@@ -49,7 +49,7 @@ impl DefinedSurface {
     /// # Errors
     /// A spacing that is not positive, more than 2e7 nodes, or a computation of more than about a minute.
     pub fn sample(&self, spacing_mm: f64) -> Result<SampledSurface, DefinitionError> {
-        error::positive("sampling.spacing_mm", spacing_mm)?;
+        error::check_positive("sampling.spacing_mm", spacing_mm)?;
         let bounds = self.aperture().bounds();
         let cells = [0, 1].map(|k| ((bounds[1][k] - bounds[0][k]) / spacing_mm * (1.0 - 1e-12)).ceil().max(1.0));
         let nodes = (cells[0] + 3.0) * (cells[1] + 3.0);
@@ -90,11 +90,11 @@ impl DefinedSurface {
     /// # Errors
     /// An accuracy that is not positive, or one that no spacing reaches.
     fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
-        error::positive("sampling.accuracy_mm", accuracy_mm)?;
+        error::check_positive("sampling.accuracy_mm", accuracy_mm)?;
         let [least, most] = self.aperture().bounds();
         let places = self.aperture().places_mm();
         let error = |h: f64| 2.0 * places.par_iter().map(|&place| self.cell_error(place, h)).reduce(|| 0.0, f64::max);
-        let coarsest = COARSEST * (most[0] - least[0]).min(most[1] - least[1]);
+        let coarsest = MAX_SPACING_SHARE * (most[0] - least[0]).min(most[1] - least[1]);
         let mut fine = coarsest;
         for halving in 0.. {
             let found = error(fine);
@@ -120,14 +120,14 @@ impl DefinedSurface {
 
     /// Refuses a sampling that would be too large or take too long.
     fn check_size(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
-        if nodes > MOST_NODES {
-            return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MOST_NODES });
+        if nodes > MAX_NODES {
+            return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MAX_NODES });
         }
         let corners = if let Aperture::Polygon { corners_mm } = self.aperture() { corners_mm.len() } else { 0 };
         let terms = self.formula().term_count() + corners;
         let work = nodes * terms as f64;
-        if work > MOST_WORK {
-            return Err(DefinitionError::TooMuchWork { nodes, terms, work, limit: MOST_WORK });
+        if work > MAX_WORK {
+            return Err(DefinitionError::TooMuchWork { nodes, terms, work, limit: MAX_WORK });
         }
         Ok(())
     }
@@ -136,7 +136,7 @@ impl DefinedSurface {
     fn node(&self, x: f64, y: f64, margin: f64) -> (Point, Vector) {
         let near = self.aperture().distance_mm(x, y) <= margin;
         match self.formula().sag_and_gradient(x, y).filter(|_| near) {
-            Some((z, gradient)) => (Point::new(x, y, z), normal_of(gradient)),
+            Some((z, gradient)) => (Point::new(x, y, z), normal_from_gradient(gradient)),
             None => (Point::new(f64::NAN, f64::NAN, f64::NAN), Vector::repeat(f64::NAN)),
         }
     }
@@ -157,12 +157,12 @@ impl DefinedSurface {
         // Whichever way the cell is cut in two.
         let triangles = [[a, b, c], [a, c, d], [a, b, d], [b, c, d]];
         let errors = triangles.iter().flat_map(|corners| {
-            INSIDE.iter().map(|&weights| {
+            TEST_WEIGHTS.iter().map(|&weights| {
                 let [px, py] = [0, 1].map(|k| (0..3).map(|i| weights[i] * corners[i].0[k]).sum::<f64>());
                 let curved =
                     curved_triangle_sag(corners.map(|v| v.0), corners.map(|v| v.1), corners.map(|v| v.2), weights);
                 let found = self.formula().sag_and_gradient(px, py);
-                found.map_or(0.0, |(z, gradient)| (curved - z).abs() * normal_of(gradient).z)
+                found.map_or(0.0, |(z, gradient)| (curved - z).abs() * normal_from_gradient(gradient).z)
             })
         });
         errors.fold(0.0, f64::max)
@@ -170,7 +170,7 @@ impl DefinedSurface {
 }
 
 /// Where in a triangle the error is looked for: the middles of the edges, the centroid, and three places between.
-const INSIDE: [[f64; 3]; 7] = [
+const TEST_WEIGHTS: [[f64; 3]; 7] = [
     [0.5, 0.5, 0.0],
     [0.0, 0.5, 0.5],
     [0.5, 0.0, 0.5],
@@ -265,7 +265,7 @@ mod tests {
         };
         let cubic = |[x, y]: [f64; 2]| (x * x * x - x * y * y, [3.0 * x * x - y * y, -2.0 * x * y]);
         let at = |weights: [f64; 3]| [0, 1].map(|k| (0..3).map(|i| weights[i] * places[i][k]).sum::<f64>());
-        for weights in INSIDE {
+        for weights in TEST_WEIGHTS {
             let found =
                 curved_triangle_sag(places, places.map(|p| quadratic(p).0), places.map(|p| quadratic(p).1), weights);
             assert!((found - quadratic(at(weights)).0).abs() < 1e-14);
@@ -300,7 +300,7 @@ mod tests {
                     weights,
                 );
                 let (z, gradient) = surface.formula().sag_and_gradient(x, y).unwrap();
-                worst = worst.max((curved - z).abs() * normal_of(gradient).z);
+                worst = worst.max((curved - z).abs() * normal_from_gradient(gradient).z);
             }
         }
         worst

@@ -43,7 +43,7 @@ impl Toroid {
     /// # Errors
     /// A radius that is NaN or less than 1e-6 mm in magnitude.
     pub fn new(radius_x_mm: f64, curve: Asphere) -> Result<Self, DefinitionError> {
-        Ok(Self { rotation_per_mm: error::curvature("radius_x_mm", radius_x_mm)?, curve })
+        Ok(Self { rotation_per_mm: error::checked_curvature("radius_x_mm", radius_x_mm)?, curve })
     }
 
     /// Returns the sag and its gradient; none where the line of rotation is too near.
@@ -71,8 +71,8 @@ impl TryFrom<&ToroidDefinition> for Toroid {
     type Error = DefinitionError;
 
     fn try_from(written: &ToroidDefinition) -> Result<Self, DefinitionError> {
-        error::curvature("radius_y_mm", written.radius_y_mm)?;
-        error::finite("conic_y", written.conic_y)?;
+        error::checked_curvature("radius_y_mm", written.radius_y_mm)?;
+        error::check_finite("conic_y", written.conic_y)?;
         let curve = AsphereDefinition {
             radius_mm: written.radius_y_mm,
             conic: written.conic_y,
@@ -131,9 +131,9 @@ impl TryFrom<&BiconicDefinition> for Biconic {
     type Error = DefinitionError;
 
     fn try_from(written: &BiconicDefinition) -> Result<Self, DefinitionError> {
-        let cx = error::curvature("radius_x_mm", written.radius_x_mm)?;
-        let cy = error::curvature("radius_y_mm", written.radius_y_mm)?;
-        let conics = [error::finite("conic_x", written.conic_x)?, error::finite("conic_y", written.conic_y)?];
+        let cx = error::checked_curvature("radius_x_mm", written.radius_x_mm)?;
+        let cy = error::checked_curvature("radius_y_mm", written.radius_y_mm)?;
+        let conics = [error::check_finite("conic_x", written.conic_x)?, error::check_finite("conic_y", written.conic_y)?];
         Ok(Self { curvatures_per_mm: [cx, cy], conics })
     }
 }

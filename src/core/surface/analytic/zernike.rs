@@ -14,10 +14,10 @@ use serde::{Deserialize, Serialize};
 
 use super::conic::{self, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
-use super::{EXTRAPOLATION, jacobi};
+use super::{MAX_EXTRAPOLATION, jacobi};
 
 /// Largest degree n.
-const LARGEST_DEGREE: u32 = 100;
+const MAX_DEGREE: u32 = 100;
 
 /// Numbering of the terms: the degree and azimuthal order of an index.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
@@ -40,7 +40,7 @@ impl ZernikeNumbering {
             Self::Ansi => ansi(index)?,
             Self::Fringe => fringe(index)?,
         };
-        (n <= LARGEST_DEGREE).then_some((n, m))
+        (n <= MAX_DEGREE).then_some((n, m))
     }
 
     /// The normalisation that goes with the numbering.
@@ -98,7 +98,7 @@ impl Zernike {
         let scale = 1.0 / self.normalisation_radius_mm;
         let (u, v) = (x * scale, y * scale);
         let q = u * u + v * v;
-        if q.is_nan() || q > EXTRAPOLATION * EXTRAPOLATION {
+        if q.is_nan() || q > MAX_EXTRAPOLATION * MAX_EXTRAPOLATION {
             return None;
         }
         let (mut z, mut gu, mut gv) = (0.0, 0.0, 0.0);
@@ -132,7 +132,7 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
                         from 1 to 37 in fringe, of a degree up to 100";
         let normalisation = written.normalisation.unwrap_or(written.numbering.normalisation());
         let mut orders: BTreeMap<u32, Vec<[f64; 2]>> = BTreeMap::new();
-        for (index, coefficient) in conic::numbered("coefficients_mm", 'Z', expected, &written.coefficients_mm)? {
+        for (index, coefficient) in conic::parse_coefficients("coefficients_mm", 'Z', expected, &written.coefficients_mm)? {
             let Some((n, m)) = written.numbering.degree_and_order(index) else {
                 return Err(DefinitionError::Term { key: format!("coefficients_mm.{index}"), expected });
             };
@@ -146,8 +146,8 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
             row[k][usize::from(m < 0)] = factor * coefficient;
         }
         Ok(Self {
-            base: conic::base(written.base.as_ref())?,
-            normalisation_radius_mm: error::positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
+            base: conic::base_conic(written.base.as_ref())?,
+            normalisation_radius_mm: error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?,
             orders: orders.into_iter().collect(),
         })
     }

@@ -2,8 +2,8 @@
 
 use crate::common::points;
 use regrind_core::geometry::Point;
-use regrind_core::surface::accuracy::{Accuracy, Samples, Trust, accuracy};
-use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
+use regrind_core::surface::accuracy::{Accuracy, NominalPoints, Reliability, estimate_accuracy};
+use regrind_core::surface::{DistanceModel, Nominal, OffsetSurface, FacetIndex, PlaneProjection, Side, SurfaceError};
 use regrind_sim::shape::{FreeForm, Shape};
 
 fn free_form(columns: usize, rows: usize) -> Vec<Point> {
@@ -26,9 +26,9 @@ fn scattered(columns: usize, rows: usize) -> Vec<Point> {
 }
 
 /// PV and rms of the true error in nanometres, at exact probe centres well inside the part.
-fn truth(points: Vec<Point>, distance: Distance, step_mm: f64) -> [f64; 2] {
+fn true_error_nm(points: Vec<Point>, distance: DistanceModel, step_mm: f64) -> [f64; 2] {
     let shape = FreeForm::default();
-    let nominal = Nominal::from_points(points, Projection::Auto).unwrap();
+    let nominal = Nominal::from_points(points, PlaneProjection::Auto).unwrap();
     let surface = OffsetSurface::new(&nominal, 1.5, Side::Normal).unwrap().with_distance_model(distance);
     let at = |i: usize, n: usize, size: f64| (size - 6.0 * step_mm) * ((i as f64 + 0.37) / n as f64 - 0.5);
     let (mut low, mut high, mut sum) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
@@ -37,22 +37,22 @@ fn truth(points: Vec<Point>, distance: Distance, step_mm: f64) -> [f64; 2] {
         let (x, y) = (at(k % COUNT[0], COUNT[0], 102.0), at(k / COUNT[0], COUNT[1], 62.0));
         let (s, n) = (shape.point(x, y), shape.normal(x, y));
         let centre = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + 1.5 * n[k]));
-        let error = surface.project(&centre, Place::UNKNOWN).distance_mm * 1e6;
+        let error = surface.project(&centre, FacetIndex::UNKNOWN).distance_mm * 1e6;
         (low, high, sum) = (low.min(error), high.max(error), sum + error * error);
     }
     [high - low, (sum / (COUNT[0] * COUNT[1]) as f64).sqrt()]
 }
 
 fn predicted(points: &[Point]) -> Accuracy {
-    accuracy(Samples::Points { points, projection: Projection::Auto }).unwrap()
+    estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap()
 }
 
 /// Asserts that the predicted PV and rms agree with the true ones within a factor of two.
 fn assert_agrees(points: Vec<Point>) {
     const FACTOR: f64 = 2.0;
     let found = predicted(&points);
-    for (distance, estimate) in [(Distance::Triangle, &found.flat), (Distance::Curved, &found.curved)] {
-        let truth = truth(points.clone(), distance, found.spacing_mm);
+    for (distance, estimate) in [(DistanceModel::Triangle, &found.flat), (DistanceModel::Curved, &found.curved)] {
+        let truth = true_error_nm(points.clone(), distance, found.spacing_mm);
         let inside = [estimate.inside.pv_mm, estimate.inside.rms_mm].map(|mm| 1e6 * mm);
         for (predicted, truth) in inside.into_iter().zip(truth) {
             assert!(
@@ -60,7 +60,7 @@ fn assert_agrees(points: Vec<Point>) {
                 "{distance:?}: {predicted} against {truth} nm"
             );
         }
-        assert_eq!(estimate.reliability, Trust::Extrapolated, "{distance:?}");
+        assert_eq!(estimate.reliability, Reliability::Extrapolated, "{distance:?}");
     }
 }
 
@@ -81,23 +81,23 @@ fn rounding_is_told_from_coarseness() {
     let mut points = free_form(451, 251);
     points.iter_mut().for_each(|p| p.z = (p.z * 1e5).round() / 1e5);
     let found = predicted(&points);
-    assert_eq!(found.curved.reliability, Trust::Rounding);
+    assert_eq!(found.curved.reliability, Reliability::Rounding);
     assert!((3e-6..3e-5).contains(&found.curved.inside.pv_mm), "{:?}", found.curved.inside);
     assert_eq!(found.curved.spacing_for(1e-7), None);
-    assert_eq!(found.flat.reliability, Trust::Extrapolated);
+    assert_eq!(found.flat.reliability, Reliability::Extrapolated);
     let ripple = |p: &Point| Point::new(p.x, p.y, p.z + 0.05 * (2.0 * p.x).sin() * (2.1 * p.y).cos());
     let rippled: Vec<Point> = free_form(128, 156).iter().map(ripple).collect();
-    assert_eq!(predicted(&rippled).curved.reliability, Trust::TooCoarse);
+    assert_eq!(predicted(&rippled).curved.reliability, Reliability::TooCoarse);
 }
 
 #[test]
 fn a_spacing_for_a_wanted_figure_gives_it() {
     let found = predicted(&free_form(181, 101));
-    for (estimate, distance) in [(&found.flat, Distance::Triangle), (&found.curved, Distance::Curved)] {
+    for (estimate, distance) in [(&found.flat, DistanceModel::Triangle), (&found.curved, DistanceModel::Curved)] {
         let wanted_mm = estimate.inside.pv_mm / 10.0;
         let spacing_mm = estimate.spacing_for(wanted_mm).unwrap();
         let nodes = |size: f64| (size / spacing_mm).ceil() as usize + 1;
-        let [pv_nm, _] = truth(free_form(nodes(102.0), nodes(62.0)), distance, spacing_mm);
+        let [pv_nm, _] = true_error_nm(free_form(nodes(102.0), nodes(62.0)), distance, spacing_mm);
         assert!((0.3..3.0).contains(&(pv_nm / (1e6 * wanted_mm))), "{distance:?}: {pv_nm} nm for {wanted_mm} mm");
     }
 }
@@ -107,7 +107,7 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
     let points: Vec<Point> = free_form(61, 41).iter().map(|p| Point::new(p.x, p.y, 0.1 * p.x)).collect();
     let found = predicted(&points);
     for estimate in [&found.flat, &found.curved] {
-        assert_eq!(estimate.reliability, Trust::Extrapolated);
+        assert_eq!(estimate.reliability, Reliability::Extrapolated);
         let spacing_mm = estimate.spacing_for(1e-6).unwrap();
         assert!((spacing_mm / found.spacing_mm - 6.0).abs() < 1e-6, "{spacing_mm}");
     }
@@ -115,7 +115,7 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
 
 #[test]
 fn what_makes_no_surface_is_refused() {
-    let of = |points: &[Point]| accuracy(Samples::Points { points, projection: Projection::Auto }).unwrap_err();
+    let of = |points: &[Point]| estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap_err();
     assert!(matches!(of(&[]), SurfaceError::TooFewPoints { .. }));
     assert!(matches!(of(&free_form(9, 9)), SurfaceError::TooFewPoints { .. }));
     let line: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k), 0.0, 0.0)).collect();

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use rand::rngs::StdRng;
 use regrind_core::geometry::{Point, Pose};
-use regrind_core::surface::{Nominal, Projection};
+use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::Vec3;
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};
@@ -32,7 +32,7 @@ pub fn pose(placement: &Placement) -> Pose {
 /// The free form as a gridded nominal surface.
 pub fn free_form(columns: usize, rows: usize) -> Nominal {
     let grid = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
-    Nominal::from_points(points(&grid), Projection::Auto).unwrap()
+    Nominal::from_points(points(&grid), PlaneProjection::Auto).unwrap()
 }
 
 /// Probe centres over a rectangle of a shape, in the model frame: columns x rows, given by its two corners.

@@ -9,7 +9,7 @@ use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::Point;
 use regrind_core::model::{Form, ModelInputs};
 use regrind_core::registration::{Options, PointStatus, Registration, register};
-use regrind_core::surface::{Nominal, Projection};
+use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -22,7 +22,7 @@ fn nominal() -> &'static Nominal {
     static NOMINAL: OnceLock<Nominal> = OnceLock::new();
     NOMINAL.get_or_init(|| {
         let grid = FreeForm::default().grid(102.0, 62.0, 205, 125);
-        Nominal::from_points(points(&grid), Projection::Auto).unwrap()
+        Nominal::from_points(points(&grid), PlaneProjection::Auto).unwrap()
     })
 }
 
@@ -42,7 +42,7 @@ fn touched([columns, rows]: [usize; 2], noise_mm: f64, planted_mm: impl Fn(f64, 
     points(&all)
 }
 
-fn found(measured: &[Point]) -> Registration {
+fn registered(measured: &[Point]) -> Registration {
     register(nominal(), measured, &Options::new(RADIUS_MM)).unwrap()
 }
 
@@ -67,7 +67,7 @@ fn bump(middle: [f64; 2], width_mm: f64, height_mm: f64) -> impl Fn(f64, f64) ->
 
 /// Every touch of a defect counts, and the peak to valley is the defect's.
 fn counts_whole(name: &str, height_mm: f64, planted: &dyn Fn(f64, f64) -> f64) {
-    let found = found(&touched(COUNTS, NOISE_MM, planted));
+    let found = registered(&touched(COUNTS, NOISE_MM, planted));
     let pv_mm = found.quality.pv_mm;
     println!("{name}, {} um: PV {:.2} um, left out {:?}", 1e3 * height_mm, 1e3 * pv_mm, left_out(&found));
     assert!(left_out(&found).is_empty(), "{name}, {height_mm} mm: left out {:?}", left_out(&found));
@@ -91,7 +91,7 @@ fn what_two_neighbouring_touches_found_is_in_the_figures_at_any_height() {
 /// With a measurement that has no noise, six times the scatter is nothing: the flanks of a bump are beyond it too.
 #[test]
 fn a_clean_map_keeps_its_only_bump() {
-    let found = found(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
+    let found = registered(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
     assert!(left_out(&found).is_empty(), "{:?}", left_out(&found));
     assert!(found.quality.pv_mm > 0.9e-3, "{}", found.quality.pv_mm);
 }
@@ -102,7 +102,7 @@ fn a_touch_that_found_what_no_neighbour_did_is_left_out_at_any_height() {
         for at in [[0, 0], [30, 0], [59, 29], [17, 11]] {
             let k = at[1] * COUNTS[0] + at[0];
             let place = [0, 1].map(|c| HALF_MM[c] * (2.0 * at[c] as f64 / (COUNTS[c] - 1) as f64 - 1.0));
-            let found = found(&touched(COUNTS, NOISE_MM, within(place, [0.1, 0.1], height_mm)));
+            let found = registered(&touched(COUNTS, NOISE_MM, within(place, [0.1, 0.1], height_mm)));
             assert_eq!(left_out(&found), [k], "{height_mm} mm at {at:?}");
         }
     }
@@ -112,16 +112,16 @@ fn a_touch_that_found_what_no_neighbour_did_is_left_out_at_any_height() {
 #[test]
 fn a_touch_and_its_repeat_are_no_two_neighbours() {
     let mut measured = touched(COUNTS, NOISE_MM, within([0.847, 1.034], [0.5, 0.5], 0.05));
-    let twice = found(&measured);
+    let twice = registered(&measured);
     let [k] = left_out(&twice)[..] else { panic!("{:?}", left_out(&twice)) };
     measured.push(measured[k]);
-    assert_eq!(left_out(&found(&measured)), [k, COUNTS[0] * COUNTS[1]]);
+    assert_eq!(left_out(&registered(&measured)), [k, COUNTS[0] * COUNTS[1]]);
 }
 
 #[test]
 fn neighbours_on_either_side_of_the_surface_do_not_agree() {
     let (a, b) = (within([-0.847, 1.034], [0.5, 0.5], 0.05), within([0.847, 1.034], [0.5, 0.5], -0.05));
-    let found = found(&touched(COUNTS, NOISE_MM, move |x, y| a(x, y) + b(x, y)));
+    let found = registered(&touched(COUNTS, NOISE_MM, move |x, y| a(x, y) + b(x, y)));
     assert_eq!(left_out(&found).len(), 2);
 }
 
@@ -134,7 +134,7 @@ fn the_form_is_as_high_as_what_was_touched() {
         ("corner", Box::new(within([50.0, 30.0], [12.0, 8.0], -0.05))),
         ("bump", Box::new(bump([10.0, -5.3], 12.0, 0.02))),
     ] {
-        let found = found(&touched([36, 18], NOISE_MM, planted));
+        let found = registered(&touched([36, 18], NOISE_MM, planted));
         let form = Form::estimate(&found, &ModelInputs::default()).unwrap();
         let (pv, rms) = (form.figures.pv, form.figures.rms);
         println!("{name}: PV {pv:.4?} of {:.4}, rms {rms:.4?} of {:.4}", found.quality.pv_mm, found.quality.rms_mm);
@@ -157,7 +157,7 @@ fn the_form_is_as_high_as_what_was_touched() {
 
 /// RMS and PV of what is planted, after its own best fit: of the same touches without scatter.
 fn true_figures_mm(counts: [usize; 2], planted_mm: impl Fn(f64, f64) -> f64) -> [f64; 2] {
-    let exact = found(&touched(counts, 0.0, planted_mm)).deviations;
+    let exact = registered(&touched(counts, 0.0, planted_mm)).deviations;
     let heights = DVector::from_iterator(exact.len(), exact.iter().map(|d| d.deviation_mm));
     let motions = DMatrix::from_fn(exact.len(), 6, |r, c| {
         let (normal, arm) = (exact[r].normal, exact[r].point.coords.cross(&exact[r].normal) / HALF_MM[0]);
@@ -173,7 +173,7 @@ fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_tr
     const FEW: [usize; 2] = [25, 16];
     // High at the corners alone, by the fourth power of the distance from the middle.
     let planted = |x: f64, y: f64| 0.03 * ((x.powi(4) + y.powi(4) - 6.0 * x * x * y * y) / 3400f64.powi(2));
-    let found = found(&touched(FEW, NOISE_MM, planted));
+    let found = registered(&touched(FEW, NOISE_MM, planted));
     let beside = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier && !d.in_fit).count();
     let told = Form::estimate(&found, &ModelInputs::default()).unwrap().figures;
     let [rms_mm, pv_mm] = true_figures_mm(FEW, planted);
@@ -194,7 +194,7 @@ fn waves_across_the_path_are_form_and_no_drift() {
         // Five touches a wave, and so nearly the same height from one touch of a row to the next.
         let (c, s) = (degrees.to_radians().cos() * TAU / 20.0, degrees.to_radians().sin() * TAU / 20.0);
         let planted = move |x: f64, y: f64| 6e-4 * (c * x + s * y + 0.4).cos();
-        let told = Form::estimate(&found(&touched(FEW, NOISE_MM, planted)), &ModelInputs::default()).unwrap();
+        let told = Form::estimate(&registered(&touched(FEW, NOISE_MM, planted)), &ModelInputs::default()).unwrap();
         let [rms_mm, _] = true_figures_mm(FEW, planted);
         println!(
             "{degrees}: true RMS {rms_mm:.6}, told {:.6} to {:.6}, {:?}",

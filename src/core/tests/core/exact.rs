@@ -4,7 +4,7 @@ use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_er
 use nalgebra::{Matrix6, Vector6};
 use regrind_core::geometry::{Point, Pose, Vector};
 use regrind_core::registration::{Options, PointStatus, Start, register};
-use regrind_core::surface::{Nominal, Projection};
+use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, add_outliers};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -106,10 +106,10 @@ fn a_realistic_part_agrees_with_exact_least_squares_on_every_kind_of_nominal() {
         })
         .collect();
     let kinds = [
-        ("grid", Nominal::from_points(grid.clone(), Projection::Auto)),
-        ("shuffled", Nominal::from_points(shuffled.clone(), Projection::Auto)),
-        ("triangulated", Nominal::from_triangulated_points(shuffled, Projection::Auto)),
-        ("scattered", Nominal::from_points(scattered, Projection::Auto)),
+        ("grid", Nominal::from_points(grid.clone(), PlaneProjection::Auto)),
+        ("shuffled", Nominal::from_points(shuffled.clone(), PlaneProjection::Auto)),
+        ("triangulated", Nominal::from_triangulated_points(shuffled, PlaneProjection::Auto)),
+        ("scattered", Nominal::from_points(scattered, PlaneProjection::Auto)),
         ("mesh", Nominal::from_mesh(grid, triangles)),
     ];
     for (name, nominal) in kinds {

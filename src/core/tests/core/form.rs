@@ -3,9 +3,9 @@
 use std::f64::consts::TAU;
 
 use regrind_core::form::{
-    Basis, Figures, Fit, FormError, FormOptions, Removed, TakenOut, figures, fit, fit_most, iso_10110, labelled,
+    PolynomialBasis, DeviationFigures, PolynomialFit, FormError, FormOptions, RemovedForm, RemovedParts, compute_figures, fit_polynomials, fit_determined_terms, iso_10110, label_figures,
 };
-use regrind_core::geometry::{Aperture, Sample};
+use regrind_core::geometry::{Aperture, DeviationSample};
 use regrind_core::surface::analytic::ZernikeNumbering;
 
 const CENTRE: [f64; 2] = [3.0, -2.0];
@@ -24,13 +24,13 @@ fn rectangle() -> Aperture {
 }
 
 /// Samples of a function of the place on a grid over an aperture.
-fn sampled(aperture: &Aperture, step: f64, f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
+fn sampled(aperture: &Aperture, step: f64, f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     let [low, high] = aperture.bounds();
     let count = |k: usize| ((high[k] - low[k]) / step).round() as usize + 1;
     let places = (0..count(0) * count(1))
         .map(|k| [low[0] + (k % count(0)) as f64 * step, low[1] + (k / count(0)) as f64 * step]);
     let inside = places.filter(|[x, y]| aperture.contains(*x, *y));
-    inside.map(|at_mm| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) }).collect()
+    inside.map(|at_mm| DeviationSample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) }).collect()
 }
 
 /// rho and theta about the middle of the disc.
@@ -49,9 +49,9 @@ fn planted(x: f64, y: f64) -> f64 {
     3e-4 * astigmatism - 1e-4 * coma + 2e-4 * spherical + 5e-5 * trefoil
 }
 
-fn coefficient(fit: &Fit, term: &str) -> f64 {
-    let k = (0..fit.coefficients_mm.len()).find(|k| fit.basis.term_name(*k) == term);
-    fit.coefficients_mm[k.unwrap_or_else(|| panic!("no {term}"))]
+fn coefficient(fit: &PolynomialFit, term: &str) -> f64 {
+    let k = (0..fit_polynomials.coefficients_mm.len()).find(|k| fit_polynomials.basis.term_name(*k) == term);
+    fit_polynomials.coefficients_mm[k.unwrap_or_else(|| panic!("no {term}"))]
 }
 
 fn is_about(found: f64, expected: f64, within: f64) -> bool {
@@ -62,7 +62,7 @@ fn is_about(found: f64, expected: f64, within: f64) -> bool {
 fn planted_zernike_terms_come_back_on_disc_and_ring() {
     for aperture in [circle(), ring()] {
         let samples = sampled(&aperture, 1.0, planted);
-        let fitted = fit(&Basis::for_aperture(&aperture), 36, &samples).unwrap();
+        let fitted = fit_polynomials(&PolynomialBasis::for_aperture(&aperture), 36, &samples).unwrap();
         for (term, expected) in [
             ("Z5 (2, 2)", 3e-4),
             ("Z8 (3, -1)", -1e-4),
@@ -75,9 +75,9 @@ fn planted_zernike_terms_come_back_on_disc_and_ring() {
         }
         assert!(fitted.residual_rms_mm < 1e-15 && fitted.points == samples.len());
         // The same surface has other indices in other numberings.
-        let Basis::Zernike { centre_mm, radius_mm, .. } = fitted.basis else { panic!() };
+        let PolynomialBasis::Zernike { centre_mm, radius_mm, .. } = fitted.basis else { panic!() };
         for (numbering, term) in [(ZernikeNumbering::Noll, "Z11 (4, 0)"), (ZernikeNumbering::Ansi, "Z12 (4, 0)")] {
-            let other = fit(&Basis::Zernike { numbering, centre_mm, radius_mm }, 21, &samples).unwrap();
+            let other = fit_polynomials(&PolynomialBasis::Zernike { numbering, centre_mm, radius_mm }, 21, &samples).unwrap();
             assert!(is_about(coefficient(&other, term), 2e-4, 1e-13), "{numbering:?}");
         }
     }
@@ -92,7 +92,7 @@ fn planted_legendre_terms_come_back_on_the_rectangle() {
         let [u, v] = [(x + 4.0) / 30.0, (y - 10.0) / 18.0];
         1e-3 * p2(u) * 3f64.sqrt() * v - 4e-4 * p3(v) + 2e-5
     };
-    let fitted = fit(&Basis::for_aperture(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
+    let fitted = fit_polynomials(&PolynomialBasis::for_aperture(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
     for (term, expected) in [("L2(x) L1(y)", 1e-3), ("L0(x) L3(y)", -4e-4), ("L0(x) L0(y)", 2e-5), ("L7(x) L0(y)", 0.0)]
     {
         assert!(is_about(coefficient(&fitted, term), expected, 1e-14), "{term}: {}", coefficient(&fitted, term));
@@ -104,8 +104,8 @@ fn orthogonal_terms_share_out_the_mean_square_and_do_not_change_with_their_numbe
     let rough = |x: f64, y: f64| 1e-4 * ((0.7 * x).sin() + (0.4 * x * y).cos()) + planted(x, y);
     for aperture in [circle(), ring(), rectangle()] {
         let samples = sampled(&aperture, 1.0, rough);
-        let basis = Basis::for_aperture(&aperture);
-        let (few, many) = (fit(&basis, 15, &samples).unwrap(), fit(&basis, 36, &samples).unwrap());
+        let basis = PolynomialBasis::for_aperture(&aperture);
+        let (few, many) = (fit_polynomials(&basis, 15, &samples).unwrap(), fit_polynomials(&basis, 36, &samples).unwrap());
         for (a, b) in few.orthogonal_mm.iter().zip(&many.orthogonal_mm) {
             assert!(is_about(*a, *b, 1e-15), "{a} {b}");
         }
@@ -115,20 +115,20 @@ fn orthogonal_terms_share_out_the_mean_square_and_do_not_change_with_their_numbe
     }
 }
 
-fn of(samples: &[Sample], aperture: Aperture) -> Figures {
-    figures(samples, &FormOptions { aperture: Some(aperture), ..FormOptions::default() }).unwrap()
+fn figures_over(samples: &[DeviationSample], aperture: Aperture) -> DeviationFigures {
+    compute_figures(samples, &FormOptions { aperture: Some(aperture), ..FormOptions::default() }).unwrap()
 }
 
 #[test]
 fn one_spike_makes_the_pv_and_not_the_pvr() {
     for (aperture, basis) in [(circle(), "Zernike (Fringe)"), (rectangle(), "Legendre")] {
         let smooth = sampled(&aperture, 0.5, |x, y| 1e-3 * (x / 30.0).sin() + 5e-4 * (y / 20.0).cos());
-        let clean = of(&smooth, aperture.clone());
+        let clean = figures_over(&smooth, aperture.clone());
         assert!(is_about(clean.pvr.value_mm, clean.pv_mm, 1e-3 * clean.pv_mm), "{:?}", clean.pvr);
         let mut spiked = smooth.clone();
         let middle = spiked.len() / 2;
         spiked[middle].deviation_mm = 1e-2;
-        let found = of(&spiked, aperture);
+        let found = figures_over(&spiked, aperture);
         assert_eq!((found.pvr.basis, found.pvr.terms), (basis, 36));
         assert!(found.pv_mm > 5.0 * clean.pv_mm && found.pvr.value_mm < 2.0 * clean.pvr.value_mm, "{:?}", found.pvr);
         assert!(is_about(found.pv_998_mm, clean.pv_998_mm, 1e-2 * clean.pv_mm), "{} {}", found.pv_998_mm, clean.pv_998_mm);
@@ -143,12 +143,12 @@ fn one_spike_makes_the_pv_and_not_the_pvr() {
 
 #[test]
 fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
-    let zero = of(&sampled(&circle(), 1.0, |_, _| 0.0), circle());
+    let zero = figures_over(&sampled(&circle(), 1.0, |_, _| 0.0), circle());
     assert_eq!([zero.pv_mm, zero.pvr.value_mm, zero.pv_998_mm, zero.rms_mm, zero.mean_mm], [0.0; 5]);
     assert_eq!(zero.iso_10110.notation, "3/0(0/0) RMSt<0; RMSi<0; RMSa<0; lambda=632.8");
-    let one = of(&sampled(&circle(), 1.0, planted), circle());
+    let one = figures_over(&sampled(&circle(), 1.0, planted), circle());
     for scale in [1e-9, 1e9] {
-        let other = of(&sampled(&circle(), 1.0, |x, y| scale * planted(x, y)), circle());
+        let other = figures_over(&sampled(&circle(), 1.0, |x, y| scale * planted(x, y)), circle());
         let pairs = [
             (one.pv_mm, other.pv_mm),
             (one.pvr.value_mm, other.pvr.value_mm),
@@ -162,7 +162,7 @@ fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
     // The order of the points says nothing.
     let mut turned = sampled(&circle(), 1.0, planted);
     turned.reverse();
-    let turned = of(&turned, circle());
+    let turned = figures_over(&turned, circle());
     assert!(is_about(turned.pvr.value_mm, one.pvr.value_mm, 1e-15) && is_about(turned.rms_mm, one.rms_mm, 1e-16));
 }
 
@@ -170,10 +170,10 @@ fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
 fn what_is_removed_is_gone_and_recorded() {
     let form = |x: f64, y: f64| 1.0 + 0.2 * x - 0.1 * y + 1e-2 * (x * x + y * y) + 1e-3 * x * y;
     let samples = sampled(&rectangle(), 1.0, form);
-    let of = |removed: Vec<Removed>| {
-        figures(&samples, &FormOptions { removed, aperture: Some(rectangle()), ..FormOptions::default() }).unwrap()
+    let of = |removed: Vec<RemovedForm>| {
+        compute_figures(&samples, &FormOptions { removed, aperture: Some(rectangle()), ..FormOptions::default() }).unwrap()
     };
-    use Removed::{Astigmatism, Piston, Power, Tilt};
+    use RemovedForm::{Astigmatism, Piston, Power, Tilt};
     let found = of(vec![Power, Tilt, Piston, Tilt]);
     assert_eq!(found.removed, [Piston, Tilt, Power]);
     // What stays of x y about the middle (-4, 10) is astigmatism alone.
@@ -183,8 +183,8 @@ fn what_is_removed_is_gone_and_recorded() {
         found.pv_mm
     );
     assert!(of(vec![Piston, Tilt, Power, Astigmatism]).pv_mm < 1e-11);
-    let taken_out = TakenOut { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
-    let rows = labelled(&found, &taken_out);
+    let taken_out = RemovedParts { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
+    let rows = label_figures(&found, &taken_out);
     assert!(rows.iter().all(|row| !row.removed.is_empty() && !row.direction.is_empty() && !row.cut_off.is_empty()));
     let pv = rows.iter().find(|row| row.name == "PV of the points").unwrap();
     assert_eq!((pv.unit, pv.removed.as_str()), ("um", "rigid motion but x (registration), piston, tilt, power"));
@@ -222,53 +222,53 @@ fn iso_10110_takes_known_forms_apart() {
 #[test]
 fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
     let samples = sampled(&circle(), 1.0, planted);
-    let basis = Basis::for_aperture(&circle());
+    let basis = PolynomialBasis::for_aperture(&circle());
     for (points, terms) in [(4, 1), (15, 1), (16, 4), (100, 25), (143, 25), (144, 36)] {
-        let spread: Vec<Sample> = (0..points).map(|k| samples[k * 997 % samples.len()]).collect();
-        assert_eq!(fit_most(&basis, 36, &spread).unwrap().coefficients_mm.len(), terms, "{points}");
-        assert_eq!(of(&spread, circle()).pvr.terms, terms);
+        let spread: Vec<DeviationSample> = (0..points).map(|k| samples[k * 997 % samples.len()]).collect();
+        assert_eq!(fit_determined_terms(&basis, 36, &spread).unwrap().coefficients_mm.len(), terms, "{points}");
+        assert_eq!(figures_over(&spread, circle()).pvr.terms, terms);
     }
     let three = &samples[..3];
-    let told = figures(three, &FormOptions::default()).unwrap_err();
+    let told = compute_figures(three, &FormOptions::default()).unwrap_err();
     assert_eq!(told, FormError::TooFewPoints { points: 3, min_points: 4 });
     assert!(told.to_string().contains("measure more"));
-    assert!(matches!(fit(&basis, 36, &samples[..35]), Err(FormError::TooFewPoints { points: 35, min_points: 36 })));
+    assert!(matches!(fit_polynomials(&basis, 36, &samples[..35]), Err(FormError::TooFewPoints { points: 35, min_points: 36 })));
     // Five columns tell no sixth power of x, however many points they hold.
-    let columns: Vec<Sample> = (0..2000)
+    let columns: Vec<DeviationSample> = (0..2000)
         .map(|k| [f64::from(k % 5) - 2.0, f64::from(k / 5) * 0.01])
-        .map(|at_mm| Sample { place_mm: at_mm, deviation_mm: at_mm[0].powi(3) })
+        .map(|at_mm| DeviationSample { place_mm: at_mm, deviation_mm: at_mm[0].powi(3) })
         .collect();
-    let rectangle = Basis::legendre([[-2.0, 0.0], [2.0, 4.0]]);
-    let told = fit(&rectangle, 36, &columns).unwrap_err().to_string();
+    let rectangle = PolynomialBasis::legendre([[-2.0, 0.0], [2.0, 4.0]]);
+    let told = fit_polynomials(&rectangle, 36, &columns).unwrap_err().to_string();
     assert!(told.contains("L5(x) L0(y)") && told.contains("more densely"), "{told}");
-    assert_eq!(fit_most(&rectangle, 36, &columns).unwrap().coefficients_mm.len(), 15);
+    assert_eq!(fit_determined_terms(&rectangle, 36, &columns).unwrap().coefficients_mm.len(), 15);
 }
 
 #[test]
 fn what_has_no_area_or_no_number_is_refused() {
-    let line: Vec<Sample> = (0..50).map(|k| Sample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
-    assert_eq!(figures(&line, &FormOptions::default()), Err(FormError::NoArea));
-    let slant: Vec<Sample> = (0..50).map(|k| Sample { place_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
-    assert!(matches!(figures(&slant, &FormOptions::default()), Err(FormError::Undetermined { .. })));
-    let place = vec![Sample { place_mm: [1.0, 1.0], deviation_mm: 0.0 }; 9];
-    assert_eq!(figures(&place, &FormOptions::default()), Err(FormError::NoArea));
+    let line: Vec<DeviationSample> = (0..50).map(|k| DeviationSample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
+    assert_eq!(compute_figures(&line, &FormOptions::default()), Err(FormError::NoArea));
+    let slant: Vec<DeviationSample> = (0..50).map(|k| DeviationSample { place_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
+    assert!(matches!(compute_figures(&slant, &FormOptions::default()), Err(FormError::Undetermined { .. })));
+    let place = vec![DeviationSample { place_mm: [1.0, 1.0], deviation_mm: 0.0 }; 9];
+    assert_eq!(compute_figures(&place, &FormOptions::default()), Err(FormError::NoArea));
     let mut bad = sampled(&circle(), 2.0, planted);
     bad[7].deviation_mm = f64::NAN;
-    assert_eq!(figures(&bad, &FormOptions::default()), Err(FormError::NotFinite { index: 7 }));
+    assert_eq!(compute_figures(&bad, &FormOptions::default()), Err(FormError::NotFinite { index: 7 }));
     let mut far = sampled(&circle(), 2.0, planted);
     far[5].place_mm = [500.0, 0.0];
     let options = FormOptions { aperture: Some(circle()), ..FormOptions::default() };
-    assert!(matches!(figures(&far, &options), Err(FormError::FarOut { index: 5, .. })));
+    assert!(matches!(compute_figures(&far, &options), Err(FormError::FarOut { index: 5, .. })));
 }
 
 #[test]
 fn coverage_is_the_share_of_the_aperture_with_points() {
-    let full = of(&sampled(&circle(), 0.5, planted), circle());
+    let full = figures_over(&sampled(&circle(), 0.5, planted), circle());
     assert!(full.coverage.share > 0.99, "{:?}", full.coverage);
-    let half: Vec<Sample> = sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.place_mm[0] > CENTRE[0]).collect();
-    let half = of(&half, circle());
+    let half: Vec<DeviationSample> = sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.place_mm[0] > CENTRE[0]).collect();
+    let half = figures_over(&half, circle());
     assert!(is_about(half.coverage.share, 0.5, 0.06), "{:?}", half.coverage);
     // Without an aperture there is nothing beyond the points.
-    let free = figures(&sampled(&ring(), 0.5, |x, _| (x * TAU / 9.0).sin()), &FormOptions::default()).unwrap();
+    let free = compute_figures(&sampled(&ring(), 0.5, |x, _| (x * TAU / 9.0).sin()), &FormOptions::default()).unwrap();
     assert!(is_about(free.coverage.share, 0.785 * (1.0 - 0.16), 0.05), "{:?}", free.coverage);
 }

@@ -2,16 +2,16 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind_core::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, Seen};
+use regrind_core::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, PassObservation};
 use regrind_core::geometry::Grid;
 
 const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
-const SCATTER_MM: f64 = 1e-3;
+const NOISE_MM: f64 = 1e-3;
 const SEED: u64 = 20_260;
 const WORLDS: u64 = 40;
 
 /// Waves of 6 to 40 mm in all directions with phases drawn.
-fn drawn(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
+fn random_waves(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
     let waves: Vec<[f64; 3]> = (0..40)
         .map(|_| {
             let turn = random.random_range(0.0..std::f64::consts::TAU);
@@ -34,14 +34,14 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
         let (mut left, mut told) = ([0.0; 6], 0.0);
         for world in 0..WORLDS {
             let mut random = StdRng::seed_from_u64(SEED + world);
-            let form = drawn(&mut random, 0.02);
+            let form = random_waves(&mut random, 0.02);
             let mut known = LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
             let mut correction = Correction::zero(GRID, 0.0);
             for left in &mut left {
-                let scatter = drawn(&mut random, SCATTER_MM);
+                let scatter = random_waves(&mut random, NOISE_MM);
                 let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
                 let error = ErrorMap::exact(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
-                known = known.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+                known = known.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
                 correction = correction.compensating(&known, None);
                 let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
                 *left += rms(&rest).powi(2) / WORLDS as f64;
@@ -49,9 +49,9 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
             told += known.repeatability_mm().expect("six passes tell it") / WORLDS as f64;
         }
         for (k, left) in (1..).zip(left) {
-            let found = left.sqrt() / (SCATTER_MM / f64::from(k).sqrt());
+            let found = left.sqrt() / (NOISE_MM / f64::from(k).sqrt());
             assert!((found - 1.0).abs() < 0.1, "{rule:?}: {k} passes leave {found} of N / sqrt(k), seed {SEED}");
         }
-        assert!((told / SCATTER_MM - 1.0).abs() < 0.1, "{rule:?}: {told}, seed {SEED}");
+        assert!((told / NOISE_MM - 1.0).abs() < 0.1, "{rule:?}: {told}, seed {SEED}");
     }
 }

@@ -6,37 +6,37 @@ use crate::common::normal;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{
-    ErrorMap, MapError, MapOptions, Order, Roughness, Smoothing, error_map, filter_grid, told_map,
+    ErrorMap, MapError, MapOptions, FilterOrder, SplineSmoothness, Smoothing, error_map, filter_grid, map_from_model,
 };
-use regrind_core::geometry::{Grid, GridError, Sample};
+use regrind_core::geometry::{Grid, GridError, DeviationSample};
 
 /// Readings at the nodes of a grid about the origin, of a function of the place.
-fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
+fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     let at = |k: usize, n: usize, step: f64| (k as f64 - 0.5 * (n - 1) as f64) * step;
     let place = |k: usize| [at(k % columns, columns, step_mm[0]), at(k / columns, rows, step_mm[1])];
-    let reading = |at_mm: [f64; 2]| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| DeviationSample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..columns * rows).map(place).map(reading).collect()
 }
 
 /// The measurement of the trials: 60 x 30 points over 102 x 62 mm.
-fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
+fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     sampled(60, 30, [102.0 / 59.0, 62.0 / 29.0], f)
 }
 
 /// Readings strewn evenly over a rectangle about the origin.
-fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
+fn scattered(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
-    let reading = |at_mm: [f64; 2]| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| DeviationSample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..count).map(|_| place()).map(reading).collect()
 }
 
-fn with_noise(readings: &[Sample], sigma_mm: f64, seed: u64) -> Vec<Sample> {
+fn with_noise(readings: &[DeviationSample], sigma_mm: f64, seed: u64) -> Vec<DeviationSample> {
     let mut rng = StdRng::seed_from_u64(seed);
-    readings.iter().map(|r| Sample { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
+    readings.iter().map(|r| DeviationSample { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
 }
 
-fn made(readings: &[Sample], options: &MapOptions) -> ErrorMap {
+fn fitted_map(readings: &[DeviationSample], options: &MapOptions) -> ErrorMap {
     error_map(readings, options).unwrap()
 }
 
@@ -50,7 +50,7 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Share of a wave that a map let pass, by least squares over valid nodes far enough from edges and holes.
-fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
+fn transmission(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
     let nodes = (0..map.grid.len()).filter(|&k| map.valid[k] && counts(map.grid.place_mm(k)));
     let (top, bottom) = nodes.fold((0.0, 0.0), |(top, bottom), k| {
         let w = wave(map.grid.place_mm(k));
@@ -61,7 +61,7 @@ fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 
 }
 
 /// The direct sum over all readings at every node, as the filter is defined: first order.
-fn direct(readings: &[Sample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
+fn direct(readings: &[DeviationSample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
     let width2 = (2f64.ln() / PI) * cutoff_mm * cutoff_mm;
     (0..grid.len())
         .map(|k| {
@@ -80,7 +80,7 @@ fn direct(readings: &[Sample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
 
 const HOLE_MM: f64 = 11.0;
 
-fn waves(order: Order) {
+fn waves(order: FilterOrder) {
     let cutoff = 5.0;
     for (name, direction) in [("x", [1.0, 0.0]), ("y", [0.0, 1.0]), ("diagonal", [0.5f64.sqrt(), 0.5f64.sqrt()])] {
         for (ratio, phase) in [(1.0, 0.3), (2.0, 1.1), (0.6, 0.0)] {
@@ -91,8 +91,8 @@ fn waves(order: Order) {
             };
             let mut readings = sampled(161, 121, [90.0 / 160.0, 70.0 / 120.0], |x, y| 1e-3 * wave([x, y]));
             readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) > HOLE_MM);
-            let map = made(&readings, &MapOptions { order, ..plain(cutoff, 1.0) });
-            let share = 1e3 * passed(&map, wave, inside);
+            let map = fitted_map(&readings, &MapOptions { order, ..plain(cutoff, 1.0) });
+            let share = 1e3 * transmission(&map, wave, inside);
             let wanted = order.transmission(ratio);
             assert!((share - wanted).abs() < 0.005, "{name}, {ratio} cut-offs, {order:?}: {share} instead of {wanted}");
         }
@@ -101,20 +101,20 @@ fn waves(order: Order) {
 
 #[test]
 fn half_of_a_wave_passes_at_the_cutoff() {
-    assert!((Order::Plane.transmission(1.0) - 0.5).abs() < 1e-12);
-    assert!((Order::Quadric.transmission(1.0) - 0.5).abs() < 1e-9);
-    waves(Order::Constant);
-    waves(Order::Plane);
-    waves(Order::Quadric);
+    assert!((FilterOrder::Plane.transmission(1.0) - 0.5).abs() < 1e-12);
+    assert!((FilterOrder::Quadric.transmission(1.0) - 0.5).abs() < 1e-9);
+    waves(FilterOrder::Constant);
+    waves(FilterOrder::Plane);
+    waves(FilterOrder::Quadric);
 }
 
 #[test]
 fn strewn_readings_pass_half_of_a_wave_too() {
     for (spacing, cutoff) in [(1.0, 5.0), (0.5, 5.0), (1.0, 20.0)] {
         let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (0.8 * x + 0.6 * y)).sin();
-        let readings = strewn(30_000, [90.0, 70.0], 3, |x, y| wave([x, y]));
-        let map = made(&readings, &plain(cutoff, spacing));
-        let share = passed(&map, wave, |[x, y]| x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff);
+        let readings = scattered(30_000, [90.0, 70.0], 3, |x, y| wave([x, y]));
+        let map = fitted_map(&readings, &plain(cutoff, spacing));
+        let share = transmission(&map, wave, |[x, y]| x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff);
         // Chance thins the readings out here and there, which is worth half a percent by itself.
         assert!((share - 0.5).abs() < 0.01, "{spacing} {cutoff}: {share}");
     }
@@ -124,8 +124,8 @@ fn strewn_readings_pass_half_of_a_wave_too() {
 #[test]
 fn the_sums_along_the_axes_are_those_of_the_definition() {
     for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
-        let readings = with_noise(&strewn(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
-        let map = made(&readings, &plain(cutoff, spacing));
+        let readings = with_noise(&scattered(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
+        let map = fitted_map(&readings, &plain(cutoff, spacing));
         let exact = direct(&readings, &map.grid, cutoff);
         let most = (0..map.grid.len())
             .filter(|&k| map.valid[k])
@@ -138,13 +138,13 @@ fn the_sums_along_the_axes_are_those_of_the_definition() {
 
 #[test]
 fn what_the_order_lets_pass_passes_to_the_edges() {
-    let hole = |r: &Sample| (r.place_mm[0] - 5.0).hypot(r.place_mm[1]) > 8.0;
+    let hole = |r: &DeviationSample| (r.place_mm[0] - 5.0).hypot(r.place_mm[1]) > 8.0;
     let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
     let quadric = |x: f64, y: f64| plane(x, y) + 1e-5 * x * x - 3e-6 * x * y + 2e-5 * y * y;
-    let check = |order: Order, smoothing: Smoothing, f: &dyn Fn(f64, f64) -> f64, most: f64| {
-        for mut readings in [sampled(71, 51, [0.8, 0.9], f), strewn(4000, [56.0, 45.0], 5, f)] {
+    let check = |order: FilterOrder, smoothing: Smoothing, f: &dyn Fn(f64, f64) -> f64, most: f64| {
+        for mut readings in [sampled(71, 51, [0.8, 0.9], f), scattered(4000, [56.0, 45.0], 5, f)] {
             readings.retain(hole);
-            let map = made(&readings, &MapOptions { order, smoothing, ..MapOptions::new(6.0, 1.0) });
+            let map = fitted_map(&readings, &MapOptions { order, smoothing, ..MapOptions::new(6.0, 1.0) });
             assert!(map.outliers.is_empty());
             for [x, y, e] in map.samples_mm() {
                 assert!((e - f(x, y)).abs() < most, "{order:?} {smoothing:?} {x} {y}: {e} {}", f(x, y));
@@ -153,23 +153,23 @@ fn what_the_order_lets_pass_passes_to_the_edges() {
     };
     let constant = |_: f64, _: f64| 7e-3;
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
-        check(Order::Constant, smoothing, &constant, 1e-15);
-        check(Order::Plane, smoothing, &plane, 1e-13);
+        check(FilterOrder::Constant, smoothing, &constant, 1e-15);
+        check(FilterOrder::Plane, smoothing, &plane, 1e-13);
     }
-    check(Order::Quadric, Smoothing::Gaussian, &quadric, 1e-13);
-    check(Order::Quadric, Smoothing::RobustGaussian, &quadric, 1e-13);
+    check(FilterOrder::Quadric, Smoothing::Gaussian, &quadric, 1e-13);
+    check(FilterOrder::Quadric, Smoothing::RobustGaussian, &quadric, 1e-13);
 }
 
 #[test]
 fn the_filter_does_not_care_where_the_part_lies() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
-        let here = with_noise(&strewn(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
-        let there: Vec<Sample> =
-            here.iter().map(|r| Sample { place_mm: [r.place_mm[0] + 1234.5, r.place_mm[1] - 777.25], ..*r }).collect();
+        let here = with_noise(&scattered(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
+        let there: Vec<DeviationSample> =
+            here.iter().map(|r| DeviationSample { place_mm: [r.place_mm[0] + 1234.5, r.place_mm[1] - 777.25], ..*r }).collect();
         let mut turned = here.clone();
         turned.reverse();
-        let (map, moved, back) = (made(&here, &options), made(&there, &options), made(&turned, &options));
+        let (map, moved, back) = (fitted_map(&here, &options), fitted_map(&there, &options), fitted_map(&turned, &options));
         let apart = |a: &ErrorMap, b: &ErrorMap| {
             a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
@@ -182,7 +182,7 @@ fn the_filter_does_not_care_where_the_part_lies() {
 fn good_points_are_not_taken_for_outliers() {
     let mut lost = 0;
     for seed in 0..50 {
-        lost += made(&with_noise(&trial(|_, _| 0.0), 3e-4, seed), &MapOptions::new(5.0, 1.0)).outliers.len();
+        lost += fitted_map(&with_noise(&trial(|_, _| 0.0), 3e-4, seed), &MapOptions::new(5.0, 1.0)).outliers.len();
     }
     assert!(lost <= 9, "{lost} of 90,000 points");
 }
@@ -193,7 +193,7 @@ fn form(x: f64, y: f64) -> f64 {
 }
 
 /// Puts a spike of 20 standard deviations on one point in a hundred, none beside another; returns which.
-fn spiked(readings: &mut [Sample], height_mm: f64, seed: u64) -> Vec<usize> {
+fn spiked(readings: &mut [DeviationSample], height_mm: f64, seed: u64) -> Vec<usize> {
     const APART_MM: f64 = 4.0;
     let mut rng = StdRng::seed_from_u64(seed);
     let mut spikes: Vec<usize> = Vec::new();
@@ -214,11 +214,11 @@ fn spiked(readings: &mut [Sample], height_mm: f64, seed: u64) -> Vec<usize> {
 fn spikes_are_found_and_change_nothing() {
     const NOISE_MM: f64 = 3e-4;
     for seed in 0..5 {
-        for clean in [trial(form), strewn(6000, [102.0, 62.0], seed, form)] {
+        for clean in [trial(form), scattered(6000, [102.0, 62.0], seed, form)] {
             let clean = with_noise(&clean, NOISE_MM, seed + 100);
             let mut readings = clean.clone();
             let spikes = spiked(&mut readings, 20.0 * NOISE_MM, seed);
-            let map = made(&readings, &MapOptions::new(5.0, 1.0));
+            let map = fitted_map(&readings, &MapOptions::new(5.0, 1.0));
             let missed = spikes.iter().filter(|k| !map.outliers.contains(k)).count();
             assert!(missed * 20 <= spikes.len(), "seed {seed}: {missed} of {} missed", spikes.len());
             let wrong = map.outliers.iter().filter(|k| !spikes.contains(k)).count();
@@ -235,7 +235,7 @@ fn the_robust_form_takes_no_notice_of_spikes() {
     spiked(&mut readings, 50.0 * NOISE_MM, 2);
     let apart = |smoothing: Smoothing| {
         let options = MapOptions { smoothing, ..plain(8.0, 1.0) };
-        let (with, without) = (made(&readings, &options), made(&clean, &options));
+        let (with, without) = (fitted_map(&readings, &options), fitted_map(&clean, &options));
         rms(with.values_mm.iter().zip(&without.values_mm).map(|(a, b)| a - b))
     };
     let (plain_form, robust_form) = (apart(Smoothing::Gaussian), apart(Smoothing::RobustGaussian));
@@ -252,7 +252,7 @@ fn the_robust_form_passes_less_than_half_of_a_wave_that_stands_alone() {
     for phase in [0.0, 0.7, 1.9] {
         let wave = |[x, _]: [f64; 2]| 1e-3 * (TAU * x / CUTOFF_MM + phase).cos();
         let readings = sampled(103, 63, [1.0, 1.0], |x, y| wave([x, y]));
-        let of = |smoothing| passed(&made(&readings, &MapOptions { smoothing, ..plain(CUTOFF_MM, 1.0) }), wave, inside);
+        let of = |smoothing| transmission(&fitted_map(&readings, &MapOptions { smoothing, ..plain(CUTOFF_MM, 1.0) }), wave, inside);
         let [plain, robust] = [Smoothing::Gaussian, Smoothing::RobustGaussian].map(of);
         println!("Gaussian {plain:.4}, robust {robust:.4}");
         assert!((plain - 0.5).abs() < 0.003 && (0.465..0.495).contains(&robust), "{plain} {robust}");
@@ -263,7 +263,7 @@ fn the_robust_form_passes_less_than_half_of_a_wave_that_stands_alone() {
 fn a_feature_of_the_part_is_kept() {
     // A mound 8 mm wide and thirty times the noise, on a quiet surface.
     let mound = |x: f64, y: f64| 9e-3 * (-((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 8.0).exp();
-    let map = made(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
+    let map = fitted_map(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
     assert!(map.outliers.len() <= 1, "{:?}", map.outliers);
     assert!(map.at([10.0, -5.0]) > 5e-3);
 }
@@ -281,7 +281,7 @@ fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
         let chipped = |depths_mm: &[(usize, f64)]| {
             let mut readings = quiet.clone();
             depths_mm.iter().for_each(|&(k, depth_mm)| readings[k].deviation_mm -= depth_mm);
-            made(&readings, &MapOptions::new(cutoff_mm, 1.0))
+            fitted_map(&readings, &MapOptions::new(cutoff_mm, 1.0))
         };
         // A flat bottom, and a round one.
         for shallow_mm in [depth_mm, 0.5 * depth_mm] {
@@ -301,13 +301,13 @@ fn a_place_that_is_touched_again_does_not_agree_with_itself() {
     let beside = [[0.0, 0.0], [0.3, -0.2], [-0.1, 0.4]];
     let touched = sampled(22, 24, [260.0, 260.0], wave);
     let thrice =
-        touched.iter().flat_map(|r| beside.map(|[x, y]| Sample { place_mm: [r.place_mm[0] + x, r.place_mm[1] + y], ..*r }));
+        touched.iter().flat_map(|r| beside.map(|[x, y]| DeviationSample { place_mm: [r.place_mm[0] + x, r.place_mm[1] + y], ..*r }));
     let mut readings = with_noise(&thrice.collect::<Vec<_>>(), 0.02, 3);
     let options = MapOptions::new(1200.0, 100.0);
-    let before = made(&readings, &options);
+    let before = fitted_map(&readings, &options);
     let raised = 3 * (12 * 22 + 11);
     readings[raised..raised + 3].iter_mut().for_each(|r| r.deviation_mm -= 0.6);
-    let map = made(&readings, &options);
+    let map = fitted_map(&readings, &options);
     assert_eq!(map.outliers, [raised, raised + 1, raised + 2]);
     let at_mm = readings[raised].place_mm;
     assert!((map.at(at_mm) - before.at(at_mm)).abs() < 0.02, "{} {}", map.at(at_mm), before.at(at_mm));
@@ -318,19 +318,19 @@ fn the_top_of_a_low_bump_is_kept() {
     // Ten times the noise: the surface that readings are judged by leans to it.
     for seed in 0..20 {
         let bump = |x: f64, y: f64| 3e-3 * (1.0 - ((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 16.0).max(0.0).powi(2);
-        let map = made(&with_noise(&trial(bump), 3e-4, seed), &MapOptions::new(5.0, 1.0));
+        let map = fitted_map(&with_noise(&trial(bump), 3e-4, seed), &MapOptions::new(5.0, 1.0));
         assert!(map.at([10.0, -5.0]) > 1.5e-3, "{seed}: {}", map.at([10.0, -5.0]));
     }
 }
 
 /// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
-fn scatter_over_stated(readings: &[Sample], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
-    let clean = made(readings, options);
+fn observed_over_stated_sigma(readings: &[DeviationSample], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
+    let clean = fitted_map(readings, options);
     let mut squares = vec![0.0; clean.grid.len()];
     let mut point = 0.0;
     let mut stated = vec![0.0; clean.grid.len()];
     for seed in 0..draws {
-        let map = made(&with_noise(readings, noise_mm, 1000 + seed), options);
+        let map = fitted_map(&with_noise(readings, noise_mm, 1000 + seed), options);
         squares.iter_mut().enumerate().for_each(|(k, s)| *s += (map.values_mm[k] - clean.values_mm[k]).powi(2));
         stated.iter_mut().zip(&map.sigma_mm).for_each(|(s, sigma)| *s += sigma / draws as f64);
         point += map.point_sigma_mm / draws as f64;
@@ -343,19 +343,19 @@ fn scatter_over_stated(readings: &[Sample], options: &MapOptions, noise_mm: f64,
 
 #[test]
 fn the_stated_uncertainty_is_the_scatter() {
-    let quadric = MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) };
+    let quadric = MapOptions { order: FilterOrder::Quadric, ..plain(9.0, 2.0) };
     let spline = |cutoff_mm| MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
     let cases = [
         ("filter", trial(form), plain(5.0, 2.0), 0.15),
-        ("quadric filter", strewn(1500, [40.0, 30.0], 4, form), quadric, 0.15),
+        ("quadric filter", scattered(1500, [40.0, 30.0], 4, form), quadric, 0.15),
         ("spline", trial(form), spline(20.0), 0.1),
-        ("spline on a few", strewn(700, [40.0, 30.0], 4, form), spline(8.0), 0.1),
+        ("spline on a few", scattered(700, [40.0, 30.0], 4, form), spline(8.0), 0.1),
     ];
     // Each is a Monte Carlo study of its own.
     std::thread::scope(|scope| {
         for (name, readings, options, of_a_point) in &cases {
             scope.spawn(move || {
-                let (ratio, outside, point) = scatter_over_stated(readings, options, 3e-4, 200);
+                let (ratio, outside, point) = observed_over_stated_sigma(readings, options, 3e-4, 200);
                 println!("{name}: scatter over stated {ratio}, outside {outside}, point {point}");
                 assert!((ratio - 1.0).abs() < 0.1, "{name}: scatter over stated {ratio}");
                 assert!(outside < 0.02, "{name}: {outside} of the nodes are off by more than 20 %");
@@ -371,18 +371,18 @@ fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
     for direction in [[1.0, 0.0], [0.0, 1.0], [0.5f64.sqrt(), 0.5f64.sqrt()]] {
         let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (direction[0] * x + direction[1] * y) + 0.4).cos();
         let options = MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff, 1.0) };
-        let map = made(&sampled(121, 91, [0.5, 0.5], |x, y| wave([x, y])), &options);
-        let share = passed(&map, wave, |[x, y]| x.abs() < 30.0 - cutoff && y.abs() < 22.5 - cutoff);
+        let map = fitted_map(&sampled(121, 91, [0.5, 0.5], |x, y| wave([x, y])), &options);
+        let share = transmission(&map, wave, |[x, y]| x.abs() < 30.0 - cutoff && y.abs() < 22.5 - cutoff);
         assert!((share - 0.5).abs() < 0.005, "{direction:?}: {share}");
     }
     // A planted truth under noise: cross-validation comes closer to it than the noise by far.
-    let readings = with_noise(&strewn(2500, [60.0, 40.0], 4, form), 1e-3, 3);
+    let readings = with_noise(&scattered(2500, [60.0, 40.0], 4, form), 1e-3, 3);
     let options = |roughness| MapOptions { smoothing: Smoothing::Spline, spline_smoothness: roughness, ..plain(5.0, 1.0) };
     let off = |roughness| {
-        let map = made(&readings, &options(roughness));
+        let map = fitted_map(&readings, &options(roughness));
         rms(map.samples_mm().into_iter().map(|[x, y, e]| e - form(x, y)))
     };
-    let (by_cutoff, validated) = (off(Roughness::Cutoff), off(Roughness::CrossValidation));
+    let (by_cutoff, validated) = (off(SplineSmoothness::Cutoff), off(SplineSmoothness::CrossValidation));
     println!("spline off by {by_cutoff}, cross-validated {validated}");
     assert!(by_cutoff < 5e-4 && validated < 2e-4, "{by_cutoff} {validated}");
 }
@@ -393,7 +393,7 @@ fn outside_what_was_measured_the_map_levels_off() {
     let mut readings = sampled(81, 81, [1.0, 1.0], |x, _| 1e-4 * x);
     readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) < 40.0);
     let level_off_mm = 12.5;
-    let map = made(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
+    let map = fitted_map(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
     let corner = map.grid.len() - 1;
     assert!(!map.valid[corner] && map.valid[map.grid.len() / 2]);
     // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm away.
@@ -419,22 +419,22 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
         .zip(&valid)
         .map(|([x, y], v)| if *v { form(x, y) + 3e-4 * normal(&mut rng) } else { f64::INFINITY })
         .collect();
-    let plain_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, false).unwrap();
-    let readings: Vec<Sample> = (0..grid.len())
+    let plain_form = filter_grid(&grid, &values, &valid, 5.0, FilterOrder::Plane, false).unwrap();
+    let readings: Vec<DeviationSample> = (0..grid.len())
         .filter(|&k| valid[k])
-        .map(|k| Sample { place_mm: grid.place_mm(k), deviation_mm: values[k] })
+        .map(|k| DeviationSample { place_mm: grid.place_mm(k), deviation_mm: values[k] })
         .collect();
     let exact = direct(&readings, &grid, 5.0);
     let nodes = || (0..grid.len()).filter(|&k| plain_form.valid[k]);
     assert!(nodes().count() > grid.len() * 8 / 10);
     let most = nodes().map(|k| (plain_form.values[k] - exact[k]).abs()).fold(0.0, f64::max);
     assert!(most < 1e-8, "{most}");
-    let robust_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, true).unwrap();
+    let robust_form = filter_grid(&grid, &values, &valid, 5.0, FilterOrder::Plane, true).unwrap();
     assert!(robust_form.rounds > 1);
     assert!(rms(nodes().map(|k| robust_form.values[k] - exact[k])) < 1e-4);
-    assert!(matches!(filter_grid(&grid, &values[1..], &valid, 5.0, Order::Plane, true), Err(MapError::Shape { .. })));
+    assert!(matches!(filter_grid(&grid, &values[1..], &valid, 5.0, FilterOrder::Plane, true), Err(MapError::Shape { .. })));
     assert!(matches!(
-        filter_grid(&grid, &values, &vec![true; grid.len()], 5.0, Order::Plane, true),
+        filter_grid(&grid, &values, &vec![true; grid.len()], 5.0, FilterOrder::Plane, true),
         Err(MapError::NotFinite { .. })
     ));
 }
@@ -447,12 +447,12 @@ fn what_makes_no_map_is_said() {
     assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..options };
-        let line: Vec<Sample> = (0..100).map(|k| Sample { place_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
+        let line: Vec<DeviationSample> = (0..100).map(|k| DeviationSample { place_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let slanted: Vec<Sample> =
-            (0..100).map(|k| Sample { place_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
+        let slanted: Vec<DeviationSample> =
+            (0..100).map(|k| DeviationSample { place_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&slanted, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let one_place = vec![Sample { place_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
+        let one_place = vec![DeviationSample { place_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
         assert!(error_map(&one_place, &options).is_err(), "{smoothing:?}");
     }
     let mut broken = some.clone();
@@ -479,11 +479,11 @@ fn the_size_of_the_values_does_not_matter() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..plain(6.0, 1.0) };
         let unit = with_noise(&trial(form), 3e-4, 6);
-        let map = made(&unit, &options);
+        let map = fitted_map(&unit, &options);
         for factor in [1e-6, 1e6, 0.0] {
-            let scaled: Vec<Sample> =
-                unit.iter().map(|r| Sample { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
-            let other = made(&scaled, &options);
+            let scaled: Vec<DeviationSample> =
+                unit.iter().map(|r| DeviationSample { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
+            let other = fitted_map(&scaled, &options);
             let apart = other.values_mm.iter().zip(&map.values_mm).map(|(o, m)| (o - factor * m).abs());
             assert!(apart.fold(0.0, f64::max) <= 1e-14 * factor, "{smoothing:?} {factor}");
         }
@@ -493,33 +493,33 @@ fn the_size_of_the_values_does_not_matter() {
 #[test]
 fn a_short_cutoff_is_advised_against() {
     let readings = with_noise(&trial(form), 3e-4, 6);
-    assert!(made(&readings, &MapOptions::new(5.0, 1.0)).advice.is_empty());
-    let short = made(&readings, &MapOptions::new(3.5, 1.0));
+    assert!(fitted_map(&readings, &MapOptions::new(5.0, 1.0)).advice.is_empty());
+    let short = fitted_map(&readings, &MapOptions::new(3.5, 1.0));
     assert!(short.advice[0].contains("choose a longer cut-off or measure more densely"), "{:?}", short.advice);
     let wide = MapOptions { contact_width_mm: 4.0, ..MapOptions::new(5.0, 1.0) };
-    assert!(made(&readings, &wide).advice[0].contains("smaller wheel"));
+    assert!(fitted_map(&readings, &wide).advice[0].contains("smaller wheel"));
 }
 
 #[test]
 fn what_a_model_tells_is_laid_out_with_how_well_each_place_is_known() {
     let form = |x: f64, y: f64| 1e-3 * (0.05 * x).sin() + 2e-5 * y;
     let sigma = |x: f64, _: f64| 3e-4 + 4e-6 * x;
-    let told: Vec<(Sample, f64)> =
+    let told: Vec<(DeviationSample, f64)> =
         trial(form).into_iter().map(|sample| (sample, sigma(sample.place_mm[0], sample.place_mm[1]))).collect();
     let options = MapOptions::new(5.0, 1.0);
-    let map = told_map(&told, &options, 2e-4).unwrap();
-    let alone = made(&trial(form), &MapOptions { outlier_limit: None, ..options });
+    let map = map_from_model(&told, &options, 2e-4).unwrap();
+    let alone = fitted_map(&trial(form), &MapOptions { outlier_limit: None, ..options });
     assert_eq!((map.values_mm, map.point_sigma_mm), (alone.values_mm, 2e-4));
     for (k, found) in map.sigma_mm.iter().enumerate().filter(|(k, _)| map.valid[*k]) {
         let [x, y] = map.grid.place_mm(k);
         assert!((found - sigma(x, y)).abs() < 1e-6, "{found} at {x}, {y}");
     }
     // Known everywhere but at one place: never better than anywhere, never worse than there.
-    let spike: Vec<(Sample, f64)> =
+    let spike: Vec<(DeviationSample, f64)> =
         told.iter().enumerate().map(|(k, (sample, _))| (*sample, if k == 900 { 1e-3 } else { 1e-4 })).collect();
-    let map = told_map(&spike, &options, 2e-4).unwrap();
+    let map = map_from_model(&spike, &options, 2e-4).unwrap();
     assert!(map.sigma_mm.iter().all(|sigma| (1e-4..=1e-3).contains(sigma)));
     assert!(map.sigma_mm.iter().any(|sigma| *sigma > 1.2e-4));
-    let empty = told_map(&[], &options, 2e-4);
+    let empty = map_from_model(&[], &options, 2e-4);
     assert!(empty.is_err());
 }

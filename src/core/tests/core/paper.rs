@@ -3,7 +3,7 @@
 use crate::common::{RADIUS_MM, free_form, placed, points};
 use regrind_core::geometry::{Point, Pose};
 use regrind_core::registration::{Method, Options, ProbeSide, Start, register};
-use regrind_core::surface::{Distance, Nominal};
+use regrind_core::surface::{DistanceModel, Nominal};
 use regrind_sim::Vec3;
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -47,7 +47,7 @@ fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
     for (shift_mm, degrees) in cases {
         let placement = Placement::new(shift_mm, degrees);
         let measured = points(&placed(&placement, &exact));
-        for distance in [Distance::Curved, Distance::Triangle] {
+        for distance in [DistanceModel::Curved, DistanceModel::Triangle] {
             let case = format!("{shift_mm:?} mm, {degrees:?} degrees, {distance:?}");
             let found = register(&nominal, &measured, &Options { distance_model: distance, ..as_in_the_paper() }).expect(&case);
             let pv_nm = 1e6 * found.quality.pv_mm;

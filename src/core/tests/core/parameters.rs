@@ -4,23 +4,23 @@ use crate::common::normal;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use regrind_core::compensation::{
-    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, Set, WheelTerm, parameters,
+    SurfacePoint, EstimatedParameter, ParameterError, ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, WheelTerm, estimate_parameters,
 };
 use regrind_core::geometry::{Point, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape, Sphere};
 
 const WHEEL_MM: f64 = 12.5;
-const DATUM: [bool; 6] = [false, false, true, true, true, true];
+const FREE_MOTIONS: [bool; 6] = [false, false, true, true, true, true];
 /// How well it holds: to next to nothing.
 const EXACT: Option<[f64; 2]> = Some([1e-9, 1e-9]);
 
 /// Contacts on a shape, 60 x 40 over 100 x 60 mm, off by a function of the contact and its progress along y.
-fn on(shape: &dyn Shape, off: impl Fn(&Contact, f64) -> f64) -> Vec<Contact> {
+fn contacts_on(shape: &dyn Shape, off: impl Fn(&SurfacePoint, f64) -> f64) -> Vec<SurfacePoint> {
     (0..60 * 40)
         .map(|k| {
             let (x, y) = (100.0 * ((k % 60) as f64 / 59.0 - 0.5), 60.0 * ((k / 60) as f64 / 39.0 - 0.5));
-            let mut contact = Contact {
+            let mut contact = SurfacePoint {
                 point: Point::from(shape.point(x, y)),
                 normal: Vector::from(shape.normal(x, y)),
                 deviation_mm: 0.0,
@@ -31,46 +31,46 @@ fn on(shape: &dyn Shape, off: impl Fn(&Contact, f64) -> f64) -> Vec<Contact> {
         .collect()
 }
 
-fn find(contacts: &[Contact], free_motions: [bool; 6]) -> Parameters {
-    parameters(contacts, None, &ParameterOptions { free_motions, locked_sigmas: EXACT, ..ParameterOptions::new(WHEEL_MM) })
+fn estimates(contacts: &[SurfacePoint], free_motions: [bool; 6]) -> ParameterEstimation {
+    estimate_parameters(contacts, None, &ParameterOptions { free_motions, locked_sigmas: EXACT, ..ParameterOptions::new(WHEEL_MM) })
         .unwrap()
 }
 
-fn of(found: &Parameters, kind: ParameterKind) -> &Parameter {
+fn estimate_of(found: &ParameterEstimation, kind: ParameterKind) -> &EstimatedParameter {
     found.estimates.iter().find(|p| p.kind == kind).unwrap()
 }
 
 /// What the simulated grinder does with a wheel larger by dr, off by ex and ey.
-fn planted(contact: &Contact, dr: f64, ex: f64, ey: f64) -> f64 {
+fn planted(contact: &SurfacePoint, dr: f64, ex: f64, ey: f64) -> f64 {
     let n = contact.normal;
     -dr * (1.0 / n.z - 1.0) - ex * n.x - ey * n.y
 }
 
 /// A touch of scatter, without which there is no field to be told.
-fn whisper() -> impl Fn() -> f64 {
+fn tiny_noise() -> impl Fn() -> f64 {
     let noise = std::cell::RefCell::new(StdRng::seed_from_u64(1));
     move || 1e-6 * normal(&mut noise.borrow_mut())
 }
 
 #[test]
 fn what_is_planted_is_found_without_form() {
-    let scatter = whisper();
-    let contacts = on(&FreeForm::default(), |c, _| {
+    let scatter = tiny_noise();
+    let contacts = contacts_on(&FreeForm::default(), |c, _| {
         // The datum leaves the height free.
         let moved = -0.02 * c.normal.z;
         planted(c, 0.09, 0.012, -0.009) + moved + scatter()
     });
-    let found = find(&contacts, DATUM);
+    let found = estimates(&contacts, FREE_MOTIONS);
     for (kind, value) in
         [(ParameterKind::WheelRadius, 0.09), (ParameterKind::SettingX, 0.012), (ParameterKind::SettingY, -0.009)]
     {
-        let parameter = of(&found, kind);
+        let parameter = estimate_of(&found, kind);
         println!("{}: own share {}", parameter.message, parameter.own_share);
         assert!((parameter.value - value).abs() < 3.0 * parameter.sigma && parameter.is_offered, "{}", parameter.message);
         assert!(parameter.sigma < 1e-4 && parameter.compensated == 0.0 && !parameter.exceeds_tolerance, "{}", parameter.message);
     }
     assert!(found.residual_rms_mm < 1e-5 && found.rms_mm > 1e-3);
-    let radius = &of(&found, ParameterKind::WheelRadius).message;
+    let radius = &estimate_of(&found, ParameterKind::WheelRadius).message;
     assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by "), "{radius}");
     assert!(radius.contains("set compensation.parameters.wheel_radius_um to its tolerance"), "{radius}");
 }
@@ -79,7 +79,7 @@ fn what_is_planted_is_found_without_form() {
 fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back() {
     // A bowl of 100 mm radius, where the normal leans by 30 degrees: 1/nz - 1 = 0.1547; so 0.1 mm leave 15.47 um.
     let lean = 30f64.to_radians();
-    let steep = Contact {
+    let steep = SurfacePoint {
         point: Point::new(50.0, 0.0, 0.0),
         normal: Vector::new(-lean.sin(), 0.0, lean.cos()),
         deviation_mm: 0.0,
@@ -89,21 +89,21 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
         ..ParameterOptions::new(WHEEL_MM)
     };
     let values = std::array::from_fn(|k| if k == 0 { 0.1 } else { 0.0 });
-    let set = Set::from_values(values, 2, [&[steep], &[steep]], &options).unwrap();
+    let set = ParameterCorrections::from_values(values, 2, [&[steep], &[steep]], &options).unwrap();
     assert!((set.displaced_mm[0] - 0.1 * (2.0 / 3f64.sqrt() - 1.0)).abs() < 1e-15 && set.setting_mm[0] == 0.0);
-    assert_eq!(Set::from_values([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
+    assert_eq!(ParameterCorrections::from_values([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
     // On a free form it is told beside a form of 0.3 um, and all but its uncertainty is taken, 0.1 (1 + s^2 / 0.1^2)^-1.
     let form = FormError::with_rms(&mut regrind_sim::rng(3), 14.0, 3e-4);
-    let contacts = on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));
-    let found = parameters(&contacts, None, &options).unwrap();
-    let radius = of(&found, ParameterKind::WheelRadius);
+    let contacts = contacts_on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));
+    let found = estimate_parameters(&contacts, None, &options).unwrap();
+    let radius = estimate_of(&found, ParameterKind::WheelRadius);
     println!("{}", radius.message);
     let by_hand = radius.value / (1.0 + (radius.sigma / 0.1).powi(2));
     assert!(radius.is_offered && (radius.compensated - by_hand).abs() < 1e-12 && !radius.exceeds_tolerance, "{}", radius.message);
     assert!((radius.value - 0.1).abs() < 3.0 * radius.sigma, "{}", radius.message);
     // Of a recipe that knows its wheel to 10 um a person is asked.
     let sure = ParameterOptions { tolerances: options.tolerances.map(|of| of.map(|_| 0.01)), ..options };
-    let radius = of(&parameters(&contacts, None, &sure).unwrap(), ParameterKind::WheelRadius).clone();
+    let radius = estimate_of(&estimate_parameters(&contacts, None, &sure).unwrap(), ParameterKind::WheelRadius).clone();
     assert!(radius.compensated > 0.0 && radius.compensated < 0.1 && radius.exceeds_tolerance, "{}", radius.message);
     // What is left once it is gone is the form.
     assert!(found.residual_rms_mm < 3.5e-4 && found.rms_mm > 8.0 * found.residual_rms_mm, "{found:?}");
@@ -118,8 +118,8 @@ fn of_nothing_nothing_is_taken() {
     let mut taken = 0;
     for seed in 0..20 {
         let form = FormError::with_rms(&mut regrind_sim::rng(seed), 14.0, 4e-4);
-        let contacts = on(&FreeForm::default(), |c, _| form.height(c.point.x, c.point.y));
-        let found = parameters(&contacts, None, &options).unwrap();
+        let contacts = contacts_on(&FreeForm::default(), |c, _| form.height(c.point.x, c.point.y));
+        let found = estimate_parameters(&contacts, None, &options).unwrap();
         taken += found.estimates.iter().filter(|p| p.compensated != 0.0).count();
     }
     // One of twenty is by chance beyond its expanded uncertainty.
@@ -129,11 +129,11 @@ fn of_nothing_nothing_is_taken() {
 
 #[test]
 fn a_datum_tells_no_better_than_it_holds() {
-    let scatter = whisper();
-    let contacts = on(&FreeForm::default(), |c, _| planted(c, 0.0, 0.012, 0.0) + scatter());
+    let scatter = tiny_noise();
+    let contacts = contacts_on(&FreeForm::default(), |c, _| planted(c, 0.0, 0.012, 0.0) + scatter());
     let told = |datum| {
-        let options = ParameterOptions { free_motions: DATUM, locked_sigmas: datum, ..ParameterOptions::new(WHEEL_MM) };
-        of(&parameters(&contacts, None, &options).unwrap(), ParameterKind::SettingX).clone()
+        let options = ParameterOptions { free_motions: FREE_MOTIONS, locked_sigmas: datum, ..ParameterOptions::new(WHEEL_MM) };
+        estimate_of(&estimate_parameters(&contacts, None, &options).unwrap(), ParameterKind::SettingX).clone()
     };
     let unknown = told(None);
     assert!(!unknown.is_offered && unknown.message.contains("registration.lock_uncertainty_um"), "{}", unknown.message);
@@ -154,12 +154,12 @@ fn coverage(
         let mut rng = regrind_sim::rng(seed);
         let form = FormError::with_rms(&mut rng, length_mm, 1e-3 * form_um);
         let noise = std::cell::RefCell::new(StdRng::seed_from_u64(seed));
-        let contacts = on(&FreeForm::default(), |c, _| {
+        let contacts = contacts_on(&FreeForm::default(), |c, _| {
             planted(c, 0.09, 0.012, -0.009)
                 + form.height(c.point.x, c.point.y)
                 + 1e-3 * noise_um * normal(&mut noise.borrow_mut())
         });
-        let found = find(&contacts, free);
+        let found = estimates(&contacts, free);
         for (sum, kind) in sums.iter_mut().zip(kinds) {
             let truth = match kind {
                 ParameterKind::WheelRadius => 0.09,
@@ -167,7 +167,7 @@ fn coverage(
                 ParameterKind::SettingY => -0.009,
                 _ => 0.0,
             };
-            let parameter = of(&found, *kind);
+            let parameter = estimate_of(&found, *kind);
             let z = (parameter.value - truth) / parameter.sigma;
             sum.0 += z * z / WORLDS as f64;
             sum.1 += usize::from(z.abs() > 3.0);
@@ -181,7 +181,7 @@ fn coverage(
 #[ignore = "worlds are drawn, for .ci/long"]
 fn values_are_within_what_is_stated_of_them() {
     use ParameterKind::{SettingX, SettingY, WheelRadius};
-    for (free, world) in [(DATUM, [0.9, 18.0, 0.3]), (DATUM, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])] {
+    for (free, world) in [(FREE_MOTIONS, [0.9, 18.0, 0.3]), (FREE_MOTIONS, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])] {
         let kinds: &[ParameterKind] = if free[0] { &[WheelRadius] } else { &[WheelRadius, SettingX, SettingY] };
         for (kind, (z, far, sigma)) in kinds.iter().zip(coverage(free, kinds, world)) {
             println!("{world:?} {kind:?}: off by {z:.2} sigma (rms), {far} beyond three, sigma {:.3} um", 1e3 * sigma);
@@ -194,59 +194,59 @@ fn values_are_within_what_is_stated_of_them() {
 #[test]
 fn what_looks_alike_is_said() {
     let noise = std::cell::RefCell::new(StdRng::seed_from_u64(1));
-    let scatter = |_: &Contact, _: f64| 1e-4 * normal(&mut noise.borrow_mut());
+    let scatter = |_: &SurfacePoint, _: f64| 1e-4 * normal(&mut noise.borrow_mut());
     // A setting error of a round wheel is a shift of the part.
-    let free = find(&on(&FreeForm::default(), scatter), [true; 6]);
-    let setting = of(&free, ParameterKind::SettingX);
+    let free = estimates(&contacts_on(&FreeForm::default(), scatter), [true; 6]);
+    let setting = estimate_of(&free, ParameterKind::SettingX);
     assert_eq!(setting.inseparable_from, ["a shift of the part along x"], "{}", setting.message);
     assert!(!setting.is_offered && setting.value == 0.0);
     // On a sphere a shift is also a tilt.
-    let sphere = find(&on(&Sphere { radius_mm: 120.0 }, scatter), DATUM);
+    let sphere = estimates(&contacts_on(&Sphere { radius_mm: 120.0 }, scatter), FREE_MOTIONS);
     for kind in [ParameterKind::SettingX, ParameterKind::SettingY] {
-        let setting = of(&sphere, kind);
+        let setting = estimate_of(&sphere, kind);
         assert!(
             !setting.is_offered && setting.inseparable_from.iter().any(|a| a.starts_with("a tilt of the part about")),
             "{}",
             setting.message
         );
     }
-    let plane = find(&on(&FreeForm { scale: 0.0 }, scatter), [true; 6]);
-    let radius = of(&plane, ParameterKind::WheelRadius);
+    let plane = estimates(&contacts_on(&FreeForm { scale: 0.0 }, scatter), [true; 6]);
+    let radius = estimate_of(&plane, ParameterKind::WheelRadius);
     assert!(radius.message.contains("no effect on a level surface"), "{}", radius.message);
-    let wear = of(&plane, ParameterKind::Wear);
+    let wear = estimate_of(&plane, ParameterKind::Wear);
     assert!(wear.inseparable_from.iter().any(|a| a.contains("tilt of the part about x")), "{}", wear.message);
     assert!(plane.estimates.iter().all(|p| !p.is_offered && !p.inseparable_from.is_empty()));
     assert_eq!(plane.residual_rms_mm, plane.rms_mm);
     // A plane that leans: 1/nz - 1 is a constant there, which is a shift along z.
     let tilted = Vector::new(0.3, 0.0, 1.0).normalize();
-    let leaning: Vec<Contact> = on(&FreeForm { scale: 0.0 }, scatter)
+    let leaning: Vec<SurfacePoint> = contacts_on(&FreeForm { scale: 0.0 }, scatter)
         .into_iter()
-        .map(|c| Contact { normal: tilted, point: Point::new(c.point.x, c.point.y, -0.3 * c.point.x), ..c })
+        .map(|c| SurfacePoint { normal: tilted, point: Point::new(c.point.x, c.point.y, -0.3 * c.point.x), ..c })
         .collect();
-    let radius = of(&find(&leaning, [true; 6]), ParameterKind::WheelRadius).clone();
+    let radius = estimate_of(&estimates(&leaning, [true; 6]), ParameterKind::WheelRadius).clone();
     assert!(!radius.is_offered && radius.inseparable_from.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
 }
 
 /// Progress along a path that winds to and fro.
-fn winding(contact: &Contact) -> f64 {
+fn winding(contact: &SurfacePoint) -> f64 {
     0.5 + 0.5 * (0.15 * contact.point.x).sin()
 }
 
 #[test]
 fn the_other_term_of_the_wheel_and_a_given_progress_are_followed() {
-    let scatter = whisper();
-    let contacts = on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
+    let scatter = tiny_noise();
+    let contacts = contacts_on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
     let progress: Vec<f64> = contacts.iter().map(winding).collect();
     let options = ParameterOptions { wheel_term: WheelTerm::AlongNormal, ..ParameterOptions::new(WHEEL_MM) };
-    let found = parameters(&contacts, Some(&progress), &options).unwrap();
-    assert!((of(&found, ParameterKind::WheelRadius).value - 0.05).abs() < 1e-4);
+    let found = estimate_parameters(&contacts, Some(&progress), &options).unwrap();
+    assert!((estimate_of(&found, ParameterKind::WheelRadius).value - 0.05).abs() < 1e-4);
 }
 
 #[test]
 fn what_cannot_be_separated_is_refused() {
-    let contacts = on(&FreeForm::default(), |_, _| 1e-3);
+    let contacts = contacts_on(&FreeForm::default(), |_, _| 1e-3);
     let options = ParameterOptions::new(WHEEL_MM);
-    let error = |contacts: &[Contact]| parameters(contacts, None, &options).unwrap_err();
+    let error = |contacts: &[SurfacePoint]| estimate_parameters(contacts, None, &options).unwrap_err();
     assert_eq!(error(&contacts[..5]), ParameterError::TooFew { points: 5 });
     assert_eq!(error(&[]), ParameterError::TooFew { points: 0 });
     let mut broken = contacts.clone();
@@ -255,18 +255,18 @@ fn what_cannot_be_separated_is_refused() {
     let mut hanging = contacts.clone();
     hanging[3].normal.z = -1.0;
     assert_eq!(error(&hanging), ParameterError::Normal { index: 3, nz: -1.0 });
-    assert!(matches!(parameters(&contacts, Some(&[0.5]), &options), Err(ParameterError::Progress { found: 1, .. })));
+    assert!(matches!(estimate_parameters(&contacts, Some(&[0.5]), &options), Err(ParameterError::Progress { found: 1, .. })));
     let flat = ParameterOptions::new(0.0);
-    assert!(matches!(parameters(&contacts, None, &flat), Err(ParameterError::WheelRadius { .. })));
+    assert!(matches!(estimate_parameters(&contacts, None, &flat), Err(ParameterError::WheelRadius { .. })));
     let broken = ParameterOptions { tolerances: [Some(-1.0), None, None, None, None, None, None], ..options };
-    assert!(matches!(parameters(&contacts, None, &broken), Err(ParameterError::Stated { .. })));
+    assert!(matches!(estimate_parameters(&contacts, None, &broken), Err(ParameterError::Stated { .. })));
     // All at one place, on a line: figures or a reason, no panic.
     for shape in [vec![contacts[7]; 40], contacts[..60].to_vec()] {
-        if let Ok(found) = parameters(&shape, None, &options) {
+        if let Ok(found) = estimate_parameters(&shape, None, &options) {
             assert!(found.estimates.iter().all(|p| p.value.is_finite() && p.sigma.is_finite()));
         }
     }
-    let still: Vec<Contact> = contacts.iter().map(|c| Contact { deviation_mm: 0.0, ..*c }).collect();
-    let found = parameters(&still, None, &options).unwrap();
+    let still: Vec<SurfacePoint> = contacts.iter().map(|c| SurfacePoint { deviation_mm: 0.0, ..*c }).collect();
+    let found = estimate_parameters(&still, None, &options).unwrap();
     assert!(found.estimates.iter().all(|p| !p.is_offered && p.compensated == 0.0) && found.residual_rms_mm == 0.0);
 }

@@ -7,7 +7,7 @@ use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;
 
 /// Registers random poses of a patch without a start and returns the seeds, with their errors, that missed by more than a limit.
-fn astray(
+fn missed_poses(
     corners: [[f64; 2]; 2],
     counts: [usize; 2],
     seeds: std::ops::Range<u64>,
@@ -35,12 +35,12 @@ fn astray(
 
 #[test]
 fn any_pose_of_the_whole_part() {
-    let astray = astray([[-50.5, -30.5], [50.5, 30.5]], [57, 35], 0..100, 5e-4);
+    let astray = missed_poses([[-50.5, -30.5], [50.5, 30.5]], [57, 35], 0..100, 5e-4);
     assert!(astray.is_empty(), "{astray:?}");
 }
 
 #[test]
 fn any_pose_of_a_third_of_the_part() {
-    let astray = astray([[-15.0, -30.5], [18.5, 30.5]], [33, 60], 100..200, 4e-3);
+    let astray = missed_poses([[-15.0, -30.5], [18.5, 30.5]], [33, 60], 100..200, 4e-3);
     assert!(astray.is_empty(), "{astray:?}");
 }

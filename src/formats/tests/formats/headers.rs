@@ -82,7 +82,7 @@ const INCHES: [&str; 8] = ["inch", "in", "INCH", "inches", "Zoll", "pouces", "\"
 const MICROMETRES: [&str; 4] = ["um", "µm", "micron", "\u{3bc}m"];
 
 /// A table, what was measured in it, and whether everything about it is plain: three measured columns, named, in mm.
-struct Drawn {
+struct GeneratedTable {
     text: Vec<u8>,
     measured: Vec<Point>,
     is_plain: bool,
@@ -104,7 +104,7 @@ fn name(draw: &mut Draw, axis: &str, group: &str) -> String {
     }
 }
 
-fn drawn(seed: u64) -> Drawn {
+fn drawn(seed: u64) -> GeneratedTable {
     let mut draw = Draw(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x5bd1_e995);
     // What stands in the table: each a column with its name and five values.
     let groups = draw.below(10);
@@ -189,7 +189,7 @@ fn drawn(seed: u64) -> Drawn {
     if has_nominal && !has_measured {
         measured.clear();
     }
-    Drawn { text, measured, is_plain }
+    GeneratedTable { text, measured, is_plain }
 }
 
 #[test]

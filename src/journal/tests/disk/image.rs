@@ -6,7 +6,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::drawn::Drawn;
+use crate::seeded_numbers::SeededNumbers;
 
 /// A disk writes these whole or not at all.
 const SECTOR: u64 = 512;
@@ -26,7 +26,7 @@ impl Outcome {
     /// All there are.
     pub const ALL: [Self; 3] = [Self::Lost, Self::Kept, Self::Torn];
 
-    fn keeps(self, drawn: &mut Drawn) -> bool {
+    fn keeps(self, drawn: &mut SeededNumbers) -> bool {
         match self {
             Self::Lost => false,
             Self::Kept => true,
@@ -44,7 +44,7 @@ enum Change {
 
 impl Change {
     /// Brings to the bytes of a file what becomes of this change.
-    fn settle(&self, file: &mut Vec<u8>, outcome: Outcome, drawn: &mut Drawn) {
+    fn settle(&self, file: &mut Vec<u8>, outcome: Outcome, drawn: &mut SeededNumbers) {
         match self {
             Self::Truncate(length) if outcome.keeps(drawn) => file.resize(*length as usize, 0),
             Self::Truncate(_) => {}
@@ -62,7 +62,7 @@ impl Change {
 }
 
 /// A sector that was lost beyond the end of the file leaves a hole, if one behind it was kept, or whatever the disk held there before.
-fn settle_sector(file: &mut Vec<u8>, at: usize, bytes: &[u8], outcome: Outcome, drawn: &mut Drawn) {
+fn settle_sector(file: &mut Vec<u8>, at: usize, bytes: &[u8], outcome: Outcome, drawn: &mut SeededNumbers) {
     let keeps = outcome.keeps(drawn);
     let is_stale = !keeps && outcome == Outcome::Torn && at >= file.len() && drawn.below(4) == 0;
     if !keeps && !is_stale {
@@ -86,13 +86,13 @@ struct Content {
 }
 
 impl Content {
-    fn settled(&self, outcome: Outcome, drawn: &mut Drawn) -> Vec<u8> {
+    fn settled(&self, outcome: Outcome, drawn: &mut SeededNumbers) -> Vec<u8> {
         let mut bytes = Vec::clone(&self.lasting);
         self.changes.iter().for_each(|change| change.settle(&mut bytes, outcome, drawn));
         bytes
     }
 
-    fn settle(&mut self, outcome: Outcome, drawn: &mut Drawn) {
+    fn settle(&mut self, outcome: Outcome, drawn: &mut SeededNumbers) {
         if !self.changes.is_empty() {
             self.lasting = Arc::new(self.settled(outcome, drawn));
             self.changes.clear();
@@ -160,11 +160,11 @@ impl Image {
     }
 
     pub(crate) fn synced(&mut self, file: usize) {
-        self.files[file].settle(Outcome::Kept, &mut Drawn::new(0));
+        self.files[file].settle(Outcome::Kept, &mut SeededNumbers::new(0));
     }
 
     /// A sync failed, and the system takes what it could not bring to the disk for brought there: nothing will bring it any more.
-    pub(crate) fn forgotten(&mut self, file: usize, drawn: &mut Drawn) {
+    pub(crate) fn forgotten(&mut self, file: usize, drawn: &mut SeededNumbers) {
         self.files[file].settle(Outcome::Torn, drawn);
     }
 
@@ -175,7 +175,7 @@ impl Image {
     }
 
     /// Returns the files that are found afterwards.
-    fn settled(&self, outcome: Outcome, drawn: &mut Drawn) -> BTreeMap<PathBuf, Vec<u8>> {
+    fn settled(&self, outcome: Outcome, drawn: &mut SeededNumbers) -> BTreeMap<PathBuf, Vec<u8>> {
         let most = self.naming.len() as u64;
         let kept = match outcome {
             Outcome::Lost => 0,
@@ -210,7 +210,7 @@ impl Cut {
     ///
     /// # Errors
     /// A folder that cannot be written.
-    pub fn restore(&self, folder: &Path, outcome: Outcome, drawn: &mut Drawn) -> io::Result<()> {
+    pub fn restore(&self, folder: &Path, outcome: Outcome, drawn: &mut SeededNumbers) -> io::Result<()> {
         fs::create_dir_all(folder)?;
         for (path, bytes) in self.others.iter() {
             let path = folder.join(path);

@@ -16,7 +16,7 @@
 //!
 //! It stands in for a disk of Unix; elsewhere there are the drawn numbers alone.
 
-mod drawn;
+mod seeded_numbers;
 #[cfg(unix)]
 mod image;
 #[cfg(unix)]
@@ -24,7 +24,7 @@ mod plan;
 #[cfg(unix)]
 mod vfs;
 
-pub use drawn::Drawn;
+pub use seeded_numbers::SeededNumbers;
 #[cfg(unix)]
 pub use image::{Cut, Outcome};
 #[cfg(unix)]

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
-use crate::drawn::Drawn;
+use crate::seeded_numbers::SeededNumbers;
 use crate::image::{Cut, Image};
 use crate::vfs;
 
@@ -54,7 +54,7 @@ impl Operation {
     ];
 
     /// The faults that it can have, each with a share of chance where it needs one; a stall left out.
-    pub fn faults(self, drawn: &mut Drawn) -> Vec<Fault> {
+    pub fn faults(self, drawn: &mut SeededNumbers) -> Vec<Fault> {
         let chance = drawn.below(1 << 32);
         match self {
             Self::Write => vec![Fault::Error, Fault::Full, Fault::Torn(chance), Fault::Late],

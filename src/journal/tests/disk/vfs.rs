@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 use rusqlite::ffi::{self, sqlite3, sqlite3_file, sqlite3_io_methods, sqlite3_vfs};
 
-use crate::drawn::Drawn;
+use crate::seeded_numbers::SeededNumbers;
 use crate::plan::{Fault, Operation, Shared, Verdict, disk_of};
 
 /// The system's own files.
@@ -144,7 +144,7 @@ impl Watched {
                 });
             }
             Some(Fault::Forget(chance)) => {
-                self.disk.change(|image| image.forgotten(file, &mut Drawn::new(chance)));
+                self.disk.change(|image| image.forgotten(file, &mut SeededNumbers::new(chance)));
             }
             Some(_) => {}
         }

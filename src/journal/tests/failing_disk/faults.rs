@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use regrind_disk::{Disk, Drawn, Fault, Operation};
+use regrind_disk::{Disk, SeededNumbers, Fault, Operation};
 use regrind_journal::{AuditKey, Journal, verify};
 
 use crate::life::{CHECKPOINT_PAGES, Home, Life, draws, header, mode, short};
@@ -17,7 +17,7 @@ struct Place {
 }
 
 /// Every fault at every operation of a life; where only a sample is wanted, as many of each kind.
-fn places(key: &AuditKey, drawn: &mut Drawn) -> Vec<Place> {
+fn places(key: &AuditKey, drawn: &mut SeededNumbers) -> Vec<Place> {
     let home = Home::new();
     let folder = home.folder("run");
     let disk = Disk::under(&folder, CHECKPOINT_PAGES);
@@ -45,7 +45,7 @@ fn places(key: &AuditKey, drawn: &mut Drawn) -> Vec<Place> {
 
 #[test]
 fn wherever_the_disk_fails_once_or_for_a_while_what_is_acknowledged_stands_once() {
-    let (mut drawn, key) = (Drawn::new(21), AuditKey::new());
+    let (mut drawn, key) = (SeededNumbers::new(21), AuditKey::new());
     let places = places(&key, &mut drawn);
     let (mut struck, mut refused, mut unbegun) = (0, 0, 0);
     for (number, place) in places.iter().enumerate() {
@@ -75,7 +75,7 @@ fn wherever_the_disk_fails_once_or_for_a_while_what_is_acknowledged_stands_once(
 #[test]
 fn a_run_that_is_begun_on_a_disk_that_fails_is_written_through_its_log() {
     // Without one a commit would be taken back by a power cut, for the file that does so is only deleted then.
-    let (home, mut drawn) = (Home::new(), Drawn::new(22));
+    let (home, mut drawn) = (Home::new(), SeededNumbers::new(22));
     for operation in Operation::ALL {
         for after in 0.. {
             let folder = home.empty("run");

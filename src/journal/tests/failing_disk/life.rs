@@ -86,7 +86,7 @@ pub fn long() -> Vec<Step> {
 
 /// What the journal has acknowledged: one record.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Told {
+pub struct AcknowledgedRecord {
     pub kind: Kind,
     pub mono_ns: u64,
     pub command_id: Option<u32>,
@@ -94,8 +94,8 @@ pub struct Told {
     pub payload: Value,
 }
 
-impl Told {
-    pub fn of(record: &Record) -> Self {
+impl AcknowledgedRecord {
+    pub fn from_record(record: &Record) -> Self {
         let value = record.value();
         let payload = match record.kind {
             Kind::Artefact => value["name"].clone(),
@@ -114,7 +114,7 @@ pub struct Life<'d> {
     /// What is tried, for whoever reads of a failure.
     at: String,
     /// Every record that was acknowledged, in order.
-    pub told: Vec<Told>,
+    pub acknowledged: Vec<AcknowledgedRecord>,
     /// What the journal said no for.
     pub errors: Vec<JournalError>,
     /// The last command.
@@ -132,7 +132,7 @@ impl<'d> Life<'d> {
             folder: folder.to_owned(),
             key: key.clone(),
             at: at.to_owned(),
-            told: Vec::new(),
+            acknowledged: Vec::new(),
             errors: Vec::new(),
             id: None,
         };
@@ -146,12 +146,12 @@ impl<'d> Life<'d> {
         };
         disk.mark(1);
         for (number, step) in (1..).zip(steps) {
-            journal = life.take(journal, number, *step);
+            journal = life.perform(journal, number, *step);
         }
         (life, true)
     }
 
-    fn take(&mut self, mut journal: Journal, number: u64, step: Step) -> Journal {
+    fn perform(&mut self, mut journal: Journal, number: u64, step: Step) -> Journal {
         let entry = |kind, payload: Value| Entry::new(kind, number, 1, payload);
         let (told, id) = match step {
             Step::Reopen => {
@@ -163,33 +163,33 @@ impl<'d> Life<'d> {
             Step::Note(letters) => {
                 let payload = json!({ "words": words(number, letters) });
                 self.until_written(|| journal.append(entry(Kind::Note, payload.clone())));
-                (Told { kind: Kind::Note, mono_ns: number, command_id: None, payload }, self.id)
+                (AcknowledgedRecord { kind: Kind::Note, mono_ns: number, command_id: None, payload }, self.id)
             }
             Step::Intend => {
                 let payload = json!({ "command": "register" });
                 let id = self.until_written(|| journal.intend(entry(Kind::Intent, payload.clone())));
                 assert!(Some(id) > self.id, "{}: command {id} after {:?}", self.at, self.id);
-                (Told { kind: Kind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
+                (AcknowledgedRecord { kind: Kind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
             }
             Step::Outcome => {
                 let (payload, command_id) = (json!({ "event": "registered" }), self.id);
                 let entry = Entry { command_id, ..entry(Kind::Outcome, payload.clone()) };
                 self.until_written(|| journal.append(entry.clone()));
-                (Told { kind: Kind::Outcome, mono_ns: number, command_id, payload }, self.id)
+                (AcknowledgedRecord { kind: Kind::Outcome, mono_ns: number, command_id, payload }, self.id)
             }
             Step::Store(letters) => {
                 let (name, bytes) = (format!("cycle-1/{number}.csv"), words(number, letters));
                 self.until_written(|| journal.store(&name, bytes.as_bytes(), number, 1));
-                (Told { kind: Kind::Artefact, mono_ns: number, command_id: None, payload: json!(name) }, self.id)
+                (AcknowledgedRecord { kind: Kind::Artefact, mono_ns: number, command_id: None, payload: json!(name) }, self.id)
             }
             Step::End => {
                 self.until_written(|| journal.end(number, 1, json!("accepted")));
-                (Told { kind: Kind::End, mono_ns: number, command_id: None, payload: json!("accepted") }, self.id)
+                (AcknowledgedRecord { kind: Kind::End, mono_ns: number, command_id: None, payload: json!("accepted") }, self.id)
             }
         };
-        self.told.push(told);
+        self.acknowledged.push(told);
         self.id = id;
-        self.disk.mark(1 + self.told.len() as u64);
+        self.disk.mark(1 + self.acknowledged.len() as u64);
         journal
     }
 
@@ -237,7 +237,7 @@ impl<'d> Life<'d> {
     pub fn is_whole(&self) {
         let verified = verified(&self.folder, &self.at);
         assert!(verified.closed && !verified.lacks_last_seal(), "{}: {verified:?}", self.at);
-        assert_eq!(told_in(&self.folder), self.told, "{}", self.at);
+        assert_eq!(read_acknowledged(&self.folder), self.acknowledged, "{}", self.at);
     }
 }
 
@@ -262,9 +262,9 @@ pub fn records(folder: &Path) -> Vec<Record> {
 }
 
 /// What stands in a journal, without what it writes by itself.
-pub fn told_in(folder: &Path) -> Vec<Told> {
+pub fn read_acknowledged(folder: &Path) -> Vec<AcknowledgedRecord> {
     let own = [Kind::Begin, Kind::Reopen, Kind::Seal];
-    records(folder).iter().filter(|record| !own.contains(&record.kind)).map(Told::of).collect()
+    records(folder).iter().filter(|record| !own.contains(&record.kind)).map(AcknowledgedRecord::from_record).collect()
 }
 
 /// The run can be gone on with: no number is used twice, and it comes to its end.

@@ -2,24 +2,24 @@
 
 use std::path::Path;
 
-use regrind_disk::{Cut, Disk, Drawn, Fault, Operation, Outcome};
+use regrind_disk::{Cut, Disk, SeededNumbers, Fault, Operation, Outcome};
 use regrind_journal::{AuditKey, Entry, Journal, JournalError, Kind, Reader, verify};
 use rusqlite::Connection;
 use serde_json::json;
 
 use crate::life::{
-    CHECKPOINT_PAGES, Home, Life, Told, draws, header, is_gone_on_with, long, records, short, told_in, verified,
+    CHECKPOINT_PAGES, Home, Life, AcknowledgedRecord, draws, header, is_gone_on_with, long, records, short, read_acknowledged, verified,
 };
 
 /// What was acknowledged before a cut is there afterwards, and of what was under way all or nothing. Returns whether there is a run to go on with.
-fn is_sound(folder: &Path, cut: &Cut, told: &[Told], at: &str) -> bool {
+fn is_sound(folder: &Path, cut: &Cut, told: &[AcknowledgedRecord], at: &str) -> bool {
     if cut.mark == 0 {
         // Nobody was told that there is a run. What can be believed nevertheless has begun.
         return verify(folder).is_ok_and(|verified| verified.records > 0);
     }
     let acknowledged = cut.mark as usize - 1;
     let verified = verified(folder, at);
-    let found = told_in(folder);
+    let found = read_acknowledged(folder);
     assert!(found.len() >= acknowledged, "{at}: {acknowledged} were acknowledged and {} are there", found.len());
     assert!(found.len() <= acknowledged + 1, "{at}: {} are there, and {acknowledged} were acknowledged", found.len());
     assert_eq!(found[..], told[..found.len()], "{at}");
@@ -34,7 +34,7 @@ fn note(k: u64) -> Entry {
 }
 
 /// The outcomes that are tried of one cut.
-fn outcomes(drawn: &mut Drawn) -> Vec<Outcome> {
+fn outcomes(drawn: &mut SeededNumbers) -> Vec<Outcome> {
     match draws() {
         Some(draws) => Outcome::ALL.into_iter().chain((1..draws).map(|_| Outcome::Torn)).collect(),
         None => vec![drawn.one(&[Outcome::Lost, Outcome::Kept, Outcome::Torn, Outcome::Torn])],
@@ -42,9 +42,9 @@ fn outcomes(drawn: &mut Drawn) -> Vec<Outcome> {
 }
 
 /// Tries one cut: restores what is left, looks through it and goes on.
-fn is_survived(home: &Home, cut: &Cut, told: &[Told], key: Option<&AuditKey>, outcome: Outcome, at: &str, seed: u64) {
+fn is_survived(home: &Home, cut: &Cut, told: &[AcknowledgedRecord], key: Option<&AuditKey>, outcome: Outcome, at: &str, seed: u64) {
     let after = home.empty("after");
-    cut.restore(&after, outcome, &mut Drawn::new(seed)).unwrap();
+    cut.restore(&after, outcome, &mut SeededNumbers::new(seed)).unwrap();
     if is_sound(&after, cut, told, at) {
         is_gone_on_with(&after, key, at);
     }
@@ -52,7 +52,7 @@ fn is_survived(home: &Home, cut: &Cut, told: &[Told], key: Option<&AuditKey>, ou
 
 #[test]
 fn whenever_the_power_goes_what_was_acknowledged_is_there_and_the_run_is_gone_on_with() {
-    let mut drawn = Drawn::new(11);
+    let mut drawn = SeededNumbers::new(11);
     // Of a long life, whose cuts are alike, the share that is tried is smaller.
     for (key, steps, share) in
         [(Some(AuditKey::new()), short(), 1), (None, short(), 1), (Some(AuditKey::new()), long(), 20)]
@@ -71,7 +71,7 @@ fn whenever_the_power_goes_what_was_acknowledged_is_there_and_the_run_is_gone_on
             for outcome in outcomes(&mut drawn) {
                 let seed = drawn.below(u64::MAX);
                 let at = format!("cut {number}, {}, mark {}, {outcome:?}, seed {seed}", cut.during, cut.mark);
-                is_survived(&home, cut, &life.told, key.as_ref(), outcome, &at, seed);
+                is_survived(&home, cut, &life.acknowledged, key.as_ref(), outcome, &at, seed);
             }
         }
         println!("{} cuts, every {step}, signed: {}", cuts.len(), key.is_some());
@@ -80,7 +80,7 @@ fn whenever_the_power_goes_what_was_acknowledged_is_there_and_the_run_is_gone_on
 
 #[test]
 fn the_power_may_go_again_while_a_run_is_taken_up() {
-    let (mut drawn, key) = (Drawn::new(12), AuditKey::new());
+    let (mut drawn, key) = (SeededNumbers::new(12), AuditKey::new());
     let home = Home::new();
     let folder = home.folder("run");
     let disk = Disk::remembering(&folder, CHECKPOINT_PAGES);
@@ -92,8 +92,8 @@ fn the_power_may_go_again_while_a_run_is_taken_up() {
         let (outcome, seed) = (drawn.one(&Outcome::ALL), drawn.below(u64::MAX));
         let at = format!("{}, mark {}, {outcome:?}, seed {seed}", cut.during, cut.mark);
         let again = home.empty("again");
-        cut.restore(&again, outcome, &mut Drawn::new(seed)).unwrap();
-        if !is_sound(&again, cut, &life.told, &at) {
+        cut.restore(&again, outcome, &mut SeededNumbers::new(seed)).unwrap();
+        if !is_sound(&again, cut, &life.acknowledged, &at) {
             continue;
         }
         tried += 1;
@@ -101,7 +101,7 @@ fn the_power_may_go_again_while_a_run_is_taken_up() {
         // As found: looking at it has changed the files.
         let again = home.empty("again");
         let disk = Disk::remembering(&again, CHECKPOINT_PAGES);
-        cut.restore(&again, outcome, &mut Drawn::new(seed)).unwrap();
+        cut.restore(&again, outcome, &mut SeededNumbers::new(seed)).unwrap();
         drop(Journal::open_with(&again, Some(key.clone())).unwrap());
         let second = disk.cuts();
         drop(disk);
@@ -109,7 +109,7 @@ fn the_power_may_go_again_while_a_run_is_taken_up() {
             let (outcome, seed) = (drawn.one(&Outcome::ALL), drawn.below(u64::MAX));
             let at = format!("{at}; cut {number}, {}, {outcome:?}, seed {seed}", again.during);
             let after = home.empty("after");
-            again.restore(&after, outcome, &mut Drawn::new(seed)).unwrap();
+            again.restore(&after, outcome, &mut SeededNumbers::new(seed)).unwrap();
             verified(&after, &at);
             let found = records(&after);
             assert_eq!(found[..before.len()], before, "{at}");
@@ -120,7 +120,7 @@ fn the_power_may_go_again_while_a_run_is_taken_up() {
 
 #[test]
 fn the_power_may_go_on_a_disk_that_has_failed_before() {
-    let (mut drawn, key) = (Drawn::new(13), AuditKey::new());
+    let (mut drawn, key) = (SeededNumbers::new(13), AuditKey::new());
     let (mut cut, mut tried) = (0, 0);
     for number in 0..draws().map_or(8, |draws| 100 * draws) {
         let home = Home::new();
@@ -145,7 +145,7 @@ fn the_power_may_go_on_a_disk_that_has_failed_before() {
             let (outcome, seed) = (drawn.one(&Outcome::ALL), drawn.below(u64::MAX));
             let during = &cuts[at].during;
             let words = format!("{life_at}, cut {at}, {during}, mark {}, {outcome:?}, seed {seed}", cuts[at].mark);
-            is_survived(&home, &cuts[at], &life.told, key, outcome, &words, seed);
+            is_survived(&home, &cuts[at], &life.acknowledged, key, outcome, &words, seed);
             cut += 1;
         }
     }
@@ -164,7 +164,7 @@ fn what_only_the_system_shows_after_a_sync_that_failed_is_written_anew_before_a_
     for (after, times) in (0..8).flat_map(|after| [(after, 1), (after, 2), (after, 3)]) {
         let folder = home.empty("run");
         let disk = Disk::remembering(&folder, CHECKPOINT_PAGES);
-        left.restore(&folder, Outcome::Kept, &mut Drawn::new(0)).unwrap();
+        left.restore(&folder, Outcome::Kept, &mut SeededNumbers::new(0)).unwrap();
         // The log is given up by the system, and not forgotten by its memory.
         disk.spoil(Operation::Sync, after, times, Fault::Forget(after + times));
         let mut journal = (0..5).find_map(|_| {
@@ -178,9 +178,9 @@ fn what_only_the_system_shows_after_a_sync_that_failed_is_written_anew_before_a_
         for outcome in Outcome::ALL {
             let at = format!("{after}, {times} times, {outcome:?}");
             let after = home.empty("after");
-            disk.cuts().last().unwrap().restore(&after, outcome, &mut Drawn::new(1)).unwrap();
+            disk.cuts().last().unwrap().restore(&after, outcome, &mut SeededNumbers::new(1)).unwrap();
             verified(&after, &at);
-            let found: Vec<_> = told_in(&after).iter().map(|told| told.mono_ns).collect();
+            let found: Vec<_> = read_acknowledged(&after).iter().map(|told| told.mono_ns).collect();
             assert_eq!(found, [1, 2], "{at}");
             is_gone_on_with(&after, None, &at);
         }
@@ -208,11 +208,11 @@ fn a_record_that_was_never_committed_is_not_read_where_it_cannot_be_taken_back()
     // The database is brought to the disk, and the journal is still there.
     let cut = cuts.iter().rev().find(|cut| cut.during.contains("deletion")).unwrap();
     let after = home.empty("after");
-    cut.restore(&after, Outcome::Lost, &mut Drawn::new(0)).unwrap();
+    cut.restore(&after, Outcome::Lost, &mut SeededNumbers::new(0)).unwrap();
     assert!(after.join("journal.sqlite-journal").exists());
     let refused = Reader::open(&after).map(|_| ());
     assert!(matches!(refused, Err(JournalError::Foreign { .. })), "{refused:?}");
     drop(Journal::open(&after).unwrap());
     is_gone_on_with(&after, None, "taken back by a writer");
-    assert!(told_in(&after).iter().all(|told| told.mono_ns != 5), "it was never committed");
+    assert!(read_acknowledged(&after).iter().all(|told| told.mono_ns != 5), "it was never committed");
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use regrind_disk::{Disk, Drawn, Fault, Operation};
+use regrind_disk::{Disk, SeededNumbers, Fault, Operation};
 use regrind_journal::{AuditKey, JournalError, Reader, Record, Verified, verify};
 
 use crate::life::{CHECKPOINT_PAGES, Home, Life, draws, records, short};
@@ -17,7 +17,7 @@ fn folders(home: &Home) -> Vec<std::path::PathBuf> {
     let middle = home.folder("middle");
     // The newest before its second reopening.
     let cut = cuts.iter().rev().find(|cut| cut.mark == 25).unwrap();
-    cut.restore(&middle, regrind_disk::Outcome::Kept, &mut Drawn::new(0)).unwrap();
+    cut.restore(&middle, regrind_disk::Outcome::Kept, &mut SeededNumbers::new(0)).unwrap();
     vec![folder, middle]
 }
 
@@ -83,7 +83,7 @@ fn a_disk_that_fails_under_a_reader_is_told_and_never_taken_for_a_sound_or_a_bro
 fn what_a_disk_reads_wrong_and_calls_right_is_found_or_changes_nothing_that_is_read() {
     let home = Home::new();
     let folder = &folders(&home)[0];
-    let (truth, mut drawn) = (verify(folder).unwrap(), Drawn::new(31));
+    let (truth, mut drawn) = (verify(folder).unwrap(), SeededNumbers::new(31));
     let mut found = 0;
     for _ in 0..draws().unwrap_or(3) {
         let (zeros, flipped) = (Fault::Zeros(drawn.below(1 << 40)), Fault::Flipped(drawn.below(1 << 40)));

@@ -8,7 +8,7 @@ use regrind_disk::{Disk, Operation};
 use regrind_journal::{AuditKey, Entry, Journal, Kind, verify};
 use serde_json::json;
 
-use crate::life::{Home, header, told_in, verified, words};
+use crate::life::{Home, header, read_acknowledged, verified, words};
 
 fn note(k: u64) -> Entry {
     Entry::new(Kind::Note, k, 1, json!({ "words": words(k, 200) }))
@@ -18,7 +18,7 @@ fn note(k: u64) -> Entry {
 fn is_read(folder: &Path, records: RangeInclusive<usize>) {
     let found = verified(folder, "read while the disk stands still");
     assert!(found.under_way && !found.closed);
-    let found = told_in(folder).len();
+    let found = read_acknowledged(folder).len();
     assert!(records.contains(&found), "{found}");
 }
 

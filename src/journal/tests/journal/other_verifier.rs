@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use regrind_disk::Drawn;
+use regrind_disk::SeededNumbers;
 use regrind_journal::{AuditKey, Entry, Journal, JournalError, Kind, Reader, verify};
 use serde_json::{Value, json};
 
@@ -26,7 +26,7 @@ fn python() -> String {
 }
 
 /// What it says of each run, in order.
-fn told(arguments: &[&str], runs: &[PathBuf]) -> Vec<Value> {
+fn run_verifier(arguments: &[&str], runs: &[PathBuf]) -> Vec<Value> {
     let mut command = Command::new(python());
     command.arg(script("docs/verify_journal.py")).arg("--json").args(arguments).args(runs);
     let done = command.output().unwrap();
@@ -83,7 +83,7 @@ fn both_verifiers_say_the_same_of_sound_journals_and_of_their_exports() {
     drop(Journal::create_with(&again, header(), Some(AuditKey::new())).unwrap());
     Journal::open_with(&again, Some(AuditKey::new())).unwrap().close(1, 1, json!("stopped")).unwrap();
     let runs = [plain, long, driven, left, again, home.path().join("nothing")];
-    let told_all = told(&[], &runs);
+    let told_all = run_verifier(&[], &runs);
     assert!(!runs[3].join("journal.sqlite-shm").exists(), "evidence is not written to");
     runs.iter().zip(&told_all).for_each(|(run, told)| assert_same(run, told));
     for (run, of_folder) in runs.iter().zip(&told_all).take(5) {
@@ -91,16 +91,16 @@ fn both_verifiers_say_the_same_of_sound_journals_and_of_their_exports() {
         let export = home.path().join("record.jsonl");
         fs::write(&export, &lines).unwrap();
         let anchor = run.join("journal.anchor");
-        let of_export = told(&["--anchor", anchor.to_str().unwrap()], std::slice::from_ref(&export)).remove(0);
+        let of_export = run_verifier(&["--anchor", anchor.to_str().unwrap()], std::slice::from_ref(&export)).remove(0);
         for member in ["sound", "records", "head", "anchored", "closed", "keys", "seals", "signed", "artefacts"] {
             assert_eq!(of_export[member], of_folder[member], "{member}");
         }
         fs::write(&export, lines.replacen("\"mono_ns\":", "\"mono_ns\":1", 1)).unwrap();
-        assert_eq!(told(&[], &[export])[0]["record"], 1);
+        assert_eq!(run_verifier(&[], &[export])[0]["record"], 1);
     }
     let key = told_all[1]["keys"][0].as_str().unwrap();
-    assert_eq!(told(&["--key", key], &runs[1..2])[0]["sound"], true);
-    let by_nobody = told(&["--key", &"0".repeat(64)], &runs[1..2]).remove(0);
+    assert_eq!(run_verifier(&["--key", key], &runs[1..2])[0]["sound"], true);
+    let by_nobody = run_verifier(&["--key", &"0".repeat(64)], &runs[1..2]).remove(0);
     assert_eq!((&by_nobody["sound"], &by_nobody["record"]), (&json!(false), &Value::Null));
 }
 
@@ -109,7 +109,7 @@ fn both_verifiers_say_the_same_of_sound_journals_and_of_their_exports() {
 fn both_verifiers_find_a_seeded_tampering_at_the_same_record() {
     let records = if tries(0) > 0 { 10_000 } else { 1_000 };
     let (home, whole) = long_and_whole(records);
-    let mut drawn = Drawn::new(1);
+    let mut drawn = SeededNumbers::new(1);
     let numbers: Vec<u64> = (0..tries(60)).collect();
     for batch in numbers.chunks(30) {
         let places: Vec<(PathBuf, Tampering)> = batch
@@ -121,7 +121,7 @@ fn both_verifiers_find_a_seeded_tampering_at_the_same_record() {
             tamper(changed, &tampering.sql);
         }
         let runs: Vec<PathBuf> = places.iter().map(|(changed, _)| changed.clone()).collect();
-        for ((changed, tampering), told) in places.iter().zip(told(&[], &runs)) {
+        for ((changed, tampering), told) in places.iter().zip(run_verifier(&[], &runs)) {
             let found = told["record"].as_u64().or_else(|| Some(told["records"].as_u64()? + 1));
             assert_eq!(found, Some(tampering.first_bad), "{}: {told}", tampering.sql);
             assert_eq!(found, place(&verify(changed)));
@@ -177,7 +177,7 @@ fn both_verifiers_find_files_anchors_and_forgeries() {
         runs.push(signed);
         homes.push(home);
     }
-    runs.iter().zip(told(&[], &runs)).for_each(|(run, told)| assert_same(run, &told));
+    runs.iter().zip(run_verifier(&[], &runs)).for_each(|(run, told)| assert_same(run, &told));
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
 use regrind_journal::{
-    Against, Anchor, AuditKey, Entry, Journal, JournalError, Kind, PublicKey, Reader, Record, SEALED_EVERY, Verified,
+    ExternalEvidence, Anchor, AuditKey, Entry, Journal, JournalError, Kind, PublicKey, Reader, Record, SEALED_EVERY, Verified,
     canonical_json, sha256_hex, verify, verify_against,
 };
 use rusqlite::Connection;
@@ -43,7 +43,7 @@ fn anchor(folder: &Path) -> Anchor {
 }
 
 fn with_key(folder: &Path, key: PublicKey) -> Result<Verified, JournalError> {
-    verify_against(folder, &Against { anchor: None, keys: vec![key] })
+    verify_against(folder, &ExternalEvidence { anchor: None, keys: vec![key] })
 }
 
 /// Why nothing proves who wrote a record that is whole.
@@ -106,7 +106,7 @@ fn a_key_that_was_kept_elsewhere_tells_a_run_that_another_key_or_none_has_signed
     let other = AuditKey::new().public();
     assert!(no_author(with_key(&folder, other)).starts_with("record 1 names the key"));
     let keys = vec![other, key.public()];
-    verify_against(&folder, &Against { anchor: None, keys }).unwrap();
+    verify_against(&folder, &ExternalEvidence { anchor: None, keys }).unwrap();
     let (_home, folder, _) = closed();
     assert_eq!(no_author(with_key(&folder, other)), "the run is not signed");
 }
@@ -203,7 +203,7 @@ fn a_run_that_is_gone_on_with_is_sealed_with_the_key_that_it_names_then() {
     assert_eq!(verified.keys, [first.public(), second.public()]);
     assert_eq!((verified.signed + 1, verified.lacks_last_seal()), (verified.records, false));
     assert!(no_author(with_key(&folder, first.public())).starts_with("record 3 names the key"));
-    let both = Against { anchor: None, keys: vec![first.public(), second.public()] };
+    let both = ExternalEvidence { anchor: None, keys: vec![first.public(), second.public()] };
     assert!(no_author(verify_against(&folder, &both)).contains("without a key"));
     let (_home, folder, key) = {
         let (home, key) = (home, AuditKey::new());
@@ -319,7 +319,7 @@ fn an_anchor_that_cannot_be_written_keeps_no_record_and_follows_later() {
 fn an_anchor_of_another_run_or_with_another_signature_is_refused() {
     let (_home, folder, _) = signed();
     let (_other_home, other, _) = signed();
-    let against = |anchor| verify_against(&folder, &Against { anchor: Some(anchor), keys: Vec::new() });
+    let against = |anchor| verify_against(&folder, &ExternalEvidence { anchor: Some(anchor), keys: Vec::new() });
     against(anchor(&folder)).unwrap();
     let found = against(Anchor { head: anchor(&folder).head, ..anchor(&other) });
     assert_eq!(place(&found), Some(605), "{found:?}");

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use regrind_disk::Drawn;
+use regrind_disk::SeededNumbers;
 use regrind_journal::{JournalError, Reader, Verified, verify};
 use rusqlite::Connection;
 use rusqlite::types::Value;
@@ -21,7 +21,7 @@ const TEXTS: [&str; 10] =
 
 impl Tampering {
     /// Draws one of a journal of so many records that came to its end.
-    pub fn drawn(drawn: &mut Drawn, records: u64) -> Self {
+    pub fn drawn(drawn: &mut SeededNumbers, records: u64) -> Self {
         let at = 1 + drawn.below(records);
         match drawn.below(5) {
             0 => Self::change(drawn, at, records),
@@ -41,7 +41,7 @@ impl Tampering {
         }
     }
 
-    fn change(drawn: &mut Drawn, at: u64, records: u64) -> Self {
+    fn change(drawn: &mut SeededNumbers, at: u64, records: u64) -> Self {
         let sql = match drawn.below(14) {
             0 => format!("UPDATE record SET seq = {} WHERE seq = {at}", records + 1 + drawn.below(1 << 40)),
             1 => format!("UPDATE record SET mono_ns = mono_ns + {} WHERE seq = {at}", 1 + drawn.below(1 << 40)),
@@ -63,7 +63,7 @@ impl Tampering {
     }
 
     /// A record more, a copy of another one under a number of its own; those behind it count on.
-    fn insertion(drawn: &mut Drawn, at: u64, records: u64) -> Self {
+    fn insertion(drawn: &mut SeededNumbers, at: u64, records: u64) -> Self {
         let copied = 1 + drawn.below(records);
         let copied = if copied >= at { copied + 1 } else { copied };
         let others = "utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload";
@@ -124,7 +124,7 @@ pub fn tries(few: u64) -> u64 {
 fn seeded_changes_deletions_insertions_reorderings_and_cuts_are_found_where_they_are() {
     const RECORDS: u64 = 10_000;
     let (home, whole) = long_and_whole(RECORDS);
-    let mut drawn = Drawn::new(1);
+    let mut drawn = SeededNumbers::new(1);
     let changed = home.path().join("changed");
     for number in 0..tries(100) {
         let Tampering { sql, first_bad } = Tampering::drawn(&mut drawn, RECORDS);
@@ -141,7 +141,7 @@ fn seeded_changes_deletions_insertions_reorderings_and_cuts_are_found_where_they
 fn single_bits_of_the_recorded_fields_are_found_where_they_are_in_the_file() {
     let (home, whole) = long_and_whole(100);
     let columns = ["seq", "mono_ns", "cycle", "command_id"].into_iter().chain(TEXTS);
-    let mut drawn = Drawn::new(2);
+    let mut drawn = SeededNumbers::new(2);
     let changed = home.path().join("changed");
     for column in columns.flat_map(|column| [column; 8]) {
         let at = 1 + drawn.below(100);
@@ -227,7 +227,7 @@ fn a_flipped_byte_of_the_file_is_found_or_changes_nothing_that_is_read() {
     let bytes = fs::read(whole.join("journal.sqlite")).unwrap();
     let changed = home.path().join("changed");
     copied(&whole, &changed);
-    let mut drawn = Drawn::new(3);
+    let mut drawn = SeededNumbers::new(3);
     let anywhere = (0..tries(100) * 15).map(|_| (drawn.below(bytes.len() as u64) as usize, 1 + drawn.below(255) as u8));
     let header = (0..100).flat_map(|at| [(at, 1), (at, 0x80), (at, 0xff)]);
     let mut found = 0;

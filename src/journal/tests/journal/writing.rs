@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind_journal::{Against, AuditKey, Entry, Journal, JournalError, Kind, Reader, verify, verify_against};
+use regrind_journal::{ExternalEvidence, AuditKey, Entry, Journal, JournalError, Kind, Reader, verify, verify_against};
 use rusqlite::Connection;
 use serde_json::json;
 
@@ -29,7 +29,7 @@ fn a_cut_tail_is_found_by_an_anchor_kept_elsewhere_and_a_changed_file_by_its_has
     tamper(&folder, "DELETE FROM record WHERE seq > 8");
     assert!(!verify(&folder).unwrap().closed);
     assert!(matches!(
-        verify_against(&folder, &Against { anchor: Some(anchor), keys: Vec::new() }),
+        verify_against(&folder, &ExternalEvidence { anchor: Some(anchor), keys: Vec::new() }),
         Err(JournalError::Broken { seq: 9, .. })
     ));
     let (_home, folder, _) = closed();

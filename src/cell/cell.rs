@@ -1,0 +1,219 @@
+//! State that the cell keeps between two events.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::alarm::{Alarm, AlarmId};
+use super::command::Command;
+use super::event::{Condition, Figures};
+use super::plan::CellPlan;
+use super::state::{Device, JobStep, Phase, State};
+
+/// Cause of a suspension.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum SuspensionCause {
+    Link(Device),
+    Condition(Device, Condition),
+}
+
+/// State of one machine as far as the cell knows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct MachineStatus {
+    /// Boot id of the connection. `None` before the first one and after a restart of this program.
+    pub(super) boot_id: Option<u32>,
+    /// True if it was ever connected in this run, so that an abort must reach it.
+    pub(super) was_connected: bool,
+    /// True if it is connected and idle, or busy with the job of this run.
+    pub(super) ready: bool,
+    /// True if a fresh status has shown it clear of the part, and it has not been started since.
+    pub(super) clear: bool,
+    /// True if a person has confirmed it clear of the part, and it has not been started since.
+    pub(super) clear_confirmed: bool,
+    /// True if it cannot report this, and a person is being asked.
+    pub(super) clear_requested: bool,
+    /// True if it has ended its safe sequence.
+    pub(super) abort_confirmed: bool,
+    /// True if it is in manual mode.
+    pub(super) manual: bool,
+    /// True if it moves without an order, was ordered to hold, and has not yet confirmed that it stands still.
+    pub(super) moves_unordered: bool,
+}
+
+/// Series of failures of a machine without progress in between.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct FailureSeries {
+    pub(super) failures: u32,
+    /// Time of the first and of the last failure.
+    pub(super) first: Duration,
+    pub(super) last: Duration,
+    /// True if the series was reported to a person.
+    pub(super) reported: bool,
+}
+
+/// Cell in the middle of a run. Large parts are shared by its copies, of which [`super::table()`] makes millions.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    pub(super) plan: Arc<CellPlan>,
+    pub(super) state: State,
+    pub(super) cycle: u32,
+    /// Number of passes that the grinder has begun.
+    pub(super) pass_count: u32,
+    /// True if the pass record of this cycle is implausible.
+    pub(super) pass_record_doubted: bool,
+    /// True for each machine that was seen at the job last requested from it. A later answer of the machine does not
+    /// reset it.
+    pub(super) job_observed: [bool; 2],
+    pub(super) machines: [MachineStatus; 2],
+    pub(super) suspension_causes: BTreeSet<SuspensionCause>,
+    pub(super) active_alarms: BTreeMap<AlarmId, Arc<Alarm>>,
+    /// Figures of this cycle, and of the last one that was judged.
+    pub(super) figures: Option<Arc<Figures>>,
+    pub(super) previous: Option<Arc<Figures>>,
+    /// Cycle that came nearest to acceptance, and its figures.
+    pub(super) best_cycle: Option<(u32, Arc<Figures>)>,
+    /// Number of consecutive cycles that were worse than the one before.
+    pub(super) diverging_cycles: u32,
+    /// Reason of the ending, when the state that leads to it is over; and whether the ending is `NotAccepted`.
+    pub(super) ending_reason: String,
+    pub(super) not_accepted: bool,
+    /// True if a person ordered the ending.
+    pub(super) end_ordered: bool,
+    pub(super) abort_repeated: bool,
+    /// Machine that is being stopped, while the cell is being stopped.
+    pub(super) stopping_machine: Option<Device>,
+    /// True for each machine that was asked to give its result back and refused.
+    pub(super) acknowledge_refused: [bool; 2],
+    /// Time of the event that is being handled, and time of the next deadline.
+    pub(super) now: Duration,
+    pub(super) deadline: Option<Duration>,
+    /// Time by which a machine that was ordered to hold must stand still.
+    pub(super) hold_deadline: Option<Duration>,
+    /// Time of the last sign of progress of the running job, the longest interval between two signs, and whether a
+    /// person was notified that no sign comes.
+    pub(super) last_progress: Option<Duration>,
+    pub(super) max_progress_interval: Duration,
+    pub(super) stall_notified: bool,
+    /// Furthest place that the cell has reached: the cycle, and the place in it.
+    pub(super) furthest_position: (u32, u8),
+    /// Failure series of each machine.
+    pub(super) failure_series: [FailureSeries; 2],
+    pub(super) commands: Vec<Command>,
+}
+
+impl Cell {
+    /// Returns a cell that waits for `Event::Start`.
+    pub fn new(plan: CellPlan) -> Self {
+        Self {
+            plan: Arc::new(plan),
+            state: State::Idle,
+            cycle: 0,
+            pass_count: 0,
+            pass_record_doubted: false,
+            job_observed: [false; 2],
+            machines: [MachineStatus::default(); 2],
+            suspension_causes: BTreeSet::new(),
+            active_alarms: BTreeMap::new(),
+            figures: None,
+            previous: None,
+            best_cycle: None,
+            diverging_cycles: 0,
+            ending_reason: String::new(),
+            not_accepted: false,
+            end_ordered: false,
+            abort_repeated: false,
+            stopping_machine: None,
+            acknowledge_refused: [false; 2],
+            now: Duration::ZERO,
+            deadline: None,
+            hold_deadline: None,
+            last_progress: None,
+            max_progress_interval: Duration::ZERO,
+            stall_notified: false,
+            furthest_position: (0, 0),
+            failure_series: [FailureSeries::default(); 2],
+            commands: Vec::new(),
+        }
+    }
+
+    /// Returns the state.
+    pub fn state(&self) -> State {
+        self.state
+    }
+
+    /// Returns the state in words for people. If the state implies a standstill, adds each machine that has not
+    /// confirmed it.
+    pub fn in_words(&self) -> String {
+        match (self.state, &self.unconfirmed()[..]) {
+            (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it is at rest", self.state),
+            (State::Aborted, [_, _]) => format!("{}: neither machine has confirmed that it is at rest", self.state),
+            (state, _) => state.to_string(),
+        }
+    }
+
+    /// Returns the machines that have not confirmed their standstill, in a state that implies it.
+    pub fn unconfirmed(&self) -> Vec<Device> {
+        match self.state {
+            State::Aborted => self.unconfirmed_aborts(),
+            state => state.unconfirmed().into_iter().collect(),
+        }
+    }
+
+    pub(super) fn unconfirmed_aborts(&self) -> Vec<Device> {
+        let known = |device: Device| self.machines[device as usize];
+        Device::BOTH.into_iter().filter(|device| known(*device).was_connected && !known(*device).abort_confirmed).collect()
+    }
+
+    /// Returns the number of the cycle; 0 before the first one.
+    pub fn cycle(&self) -> u32 {
+        self.cycle
+    }
+
+    /// Returns the plan.
+    pub fn plan(&self) -> &CellPlan {
+        &self.plan
+    }
+
+    /// Returns the figures of the last measurement that was registered.
+    pub fn figures(&self) -> Option<&Figures> {
+        self.figures.as_deref().or(self.previous.as_deref())
+    }
+
+    /// Returns true if a command that has waited must still be executed. A command that causes motion is wanted only in
+    /// the state that issued it. On the way to an end, only commands that lead there are wanted.
+    pub fn still_requires(&self, command: &Command) -> bool {
+        let at = |device, step| self.state.phase() == Some(Phase::from_job(device, step));
+        match (self.state, command) {
+            (State::Aborting, Command::Connect { .. } | Command::AbortMachine { .. } | Command::VerifyClear { .. }) => {
+                true
+            }
+            (State::Stopping, Command::StopMachine { .. } | Command::Acknowledge { .. }) => true,
+            (State::Completing, Command::VerifyClear { .. }) => true,
+            (state, _) if state.is_end() => matches!(command, Command::Announce(_)),
+            (State::Aborting | State::Stopping | State::Completing, _) => matches!(command, Command::Announce(_)),
+            (State::Execute(_), Command::StartMachine { device, cycle }) => {
+                at(*device, JobStep::Start) && *cycle == self.cycle
+            }
+            (State::Unholding(_) | State::Unsuspending(_), Command::ResumeMachine { device }) => {
+                at(*device, JobStep::Run)
+            }
+            (_, Command::StartMachine { .. } | Command::ResumeMachine { .. }) => false,
+            _ => true,
+        }
+    }
+
+    /// Returns the active alarms.
+    pub fn alarms(&self) -> impl Iterator<Item = &Alarm> + '_ {
+        self.active_alarms.values().map(AsRef::as_ref)
+    }
+
+    /// Returns the machine for which a person is being asked whether it is clear of the part.
+    pub fn clear_confirmation_device(&self) -> Option<Device> {
+        self.state.phase().filter(|phase| self.is_asking_whether_clear(*phase)).and_then(super::transitions::device_awaited_clear)
+    }
+
+    /// Returns the time at which `Event::Deadline` is due, as time since the run began.
+    pub fn next_deadline(&self) -> Option<Duration> {
+        self.deadline
+    }
+}

@@ -1,0 +1,181 @@
+//! Figure as it is recorded: its credible interval after a measurement, and the probability that it is within a limit.
+
+use serde::{Deserialize, Serialize};
+
+/// Credible interval of a figure after a measurement, as it is recorded.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecordedInterval {
+    /// Median.
+    #[serde(with = "super::number")]
+    pub median_mm: f64,
+    /// Quantile at 2.5 %. It is 0 if only an upper bound of the figure is known.
+    #[serde(with = "super::number")]
+    pub low_mm: f64,
+    /// Quantile at 97.5 %.
+    #[serde(with = "super::number")]
+    pub high_mm: f64,
+    /// Quantiles at [`Interval::PROBABILITIES`]. `None` if the figure is treated as normal, and in records of earlier
+    /// versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub quantiles_mm: Option<[f64; RecordedInterval::COUNT]>,
+}
+
+impl RecordedInterval {
+    /// Number of quantiles of a figure.
+    pub const COUNT: usize = 15;
+    /// Probabilities of the quantiles: dense where limits are usual, and no further out than a thousand samples can
+    /// show.
+    pub const PROBABILITIES: [f64; Self::COUNT] =
+        [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
+    /// Standard normal deviates of the same probabilities. Between two of them the figure is interpolated as normal.
+    const DEVIATES: [f64; Self::COUNT] = [
+        -3.090_232_306_167_813_5,
+        -2.575_829_303_548_901,
+        -2.326_347_874_040_840_8,
+        -1.959_963_984_540_054_2,
+        -1.644_853_626_951_472_7,
+        -1.281_551_565_544_600_5,
+        -0.674_489_750_196_081_7,
+        0.0,
+        0.674_489_750_196_081_7,
+        1.281_551_565_544_600_5,
+        1.644_853_626_951_472_7,
+        1.959_963_984_540_054_2,
+        2.326_347_874_040_840_8,
+        2.575_829_303_548_901,
+        3.090_232_306_167_813_5,
+    ];
+
+    /// Returns the interval of a normal figure with the same uncertainty on both sides.
+    pub fn from_expanded(median_mm: f64, expanded_mm: f64) -> Self {
+        Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm, quantiles_mm: None }
+    }
+
+    /// Returns the expanded uncertainty: half of the width.
+    pub fn expanded_mm(&self) -> f64 {
+        0.5 * (self.high_mm - self.low_mm)
+    }
+
+    /// Returns the probability that the figure is not above a limit. The result is clamped to 0.001 to 0.999, because
+    /// nothing is known beyond these quantiles.
+    pub fn probability_within(&self, limit_mm: f64) -> f64 {
+        let quantiles = self.quantiles();
+        let (Some(below), last) = (quantiles.iter().rposition(|q| *q <= limit_mm), Self::COUNT - 1) else {
+            return Self::PROBABILITIES[0];
+        };
+        if below == last {
+            return Self::PROBABILITIES[last];
+        }
+        let share = (limit_mm - quantiles[below]) / (quantiles[below + 1] - quantiles[below]);
+        if share == 0.0 {
+            return Self::PROBABILITIES[below];
+        }
+        normal_probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
+    }
+
+    /// Returns the quantile of the figure at a probability.
+    pub fn quantile_mm(&self, probability: f64) -> f64 {
+        // `p` and `1 - (1 - p)` differ in their last digits.
+        const SAME: f64 = 1e-9;
+        if probability.is_nan() {
+            return f64::NAN;
+        }
+        let (quantiles, last) = (self.quantiles(), Self::COUNT - 1);
+        let next = Self::PROBABILITIES.iter().position(|p| *p >= probability - SAME).unwrap_or(last);
+        if next == 0 || Self::PROBABILITIES[next] <= probability + SAME {
+            return quantiles[next];
+        }
+        let deviate = normal_deviate(probability);
+        let share = (deviate - Self::DEVIATES[next - 1]) / (Self::DEVIATES[next] - Self::DEVIATES[next - 1]);
+        quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
+    }
+
+    /// Returns the recorded quantiles. If there are none, returns those of a normal figure with these ends: each half
+    /// width (k = 2) counts as 1.96 standard uncertainties.
+    fn quantiles(&self) -> [f64; Self::COUNT] {
+        let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
+        let of_normal = |k: usize| {
+            let share = Self::DEVIATES[k] / Self::DEVIATES[11];
+            match k {
+                3 => low_mm,
+                7 => median_mm,
+                11 => high_mm,
+                0..7 => median_mm + share * (median_mm - low_mm),
+                _ => median_mm + share * (high_mm - median_mm),
+            }
+        };
+        quantiles_mm.unwrap_or_else(|| std::array::from_fn(of_normal))
+    }
+
+    pub(super) fn is_valid(&self) -> bool {
+        let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
+        let ascend = |all: &[f64]| all.iter().all(|v| v.is_finite()) && all.is_sorted();
+        ascend(&[low_mm, median_mm, high_mm]) && median_mm >= 0.0 && quantiles_mm.is_none_or(|all| ascend(&all))
+    }
+}
+
+/// Returns the standard normal distribution function at a deviate (Abramowitz and Stegun 26.2.17, accurate to 1e-7).
+fn normal_probability(deviate: f64) -> f64 {
+    const FACTORS: [f64; 5] = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
+    let t = 1.0 / (1.0 + 0.231_641_9 * deviate.abs());
+    let series = FACTORS.iter().rev().fold(0.0, |sum, factor| t * (factor + sum));
+    let above = series * (-0.5 * deviate * deviate).exp() / std::f64::consts::TAU.sqrt();
+    if deviate < 0.0 { above } else { 1.0 - above }
+}
+
+/// Returns the standard normal quantile of a probability from 0.001 to 0.999, by bisection.
+fn normal_deviate(probability: f64) -> f64 {
+    let (mut low, mut high) = (-4.0, 4.0);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if normal_probability(middle) < probability { low = middle } else { high = middle }
+    }
+    0.5 * (low + high)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deviates_are_those_of_their_probabilities() {
+        for (p, z) in RecordedInterval::PROBABILITIES.iter().zip(RecordedInterval::DEVIATES) {
+            assert!((normal_probability(z) - p).abs() < 1e-7, "{z} {p}");
+            assert!((normal_deviate(*p) - z).abs() < 1e-4, "{z} {p}");
+        }
+    }
+
+    #[test]
+    fn a_normal_figure_is_within_its_limit_as_the_table_says() {
+        // u = 1, so the expanded uncertainty is 1.96.
+        let of = RecordedInterval::from_expanded(10.0, 1.959_963_984_540_054_2);
+        for (limit, probability) in [(10.0, 0.5), (11.0, 0.841_344_7), (12.0, 0.977_249_9), (8.5, 0.066_807_2)] {
+            assert!((of.probability_within(limit) - probability).abs() < 1e-6, "{limit}");
+        }
+        assert_eq!((of.probability_within(30.0), of.probability_within(-30.0)), (0.999, 0.001), "nobody knows more");
+        assert!((of.quantile_mm(0.841_344_7) - 11.0).abs() < 1e-5);
+        // The ends of the interval are exact, to the last digit.
+        assert_eq!([of.quantile_mm(1.0 - 0.975), of.quantile_mm(0.975)], [of.low_mm, of.high_mm]);
+        assert_eq!([of.probability_within(of.high_mm), of.probability_within(of.low_mm)], [0.975, 0.025]);
+    }
+
+    #[test]
+    fn a_figure_without_uncertainty_is_within_or_it_is_not() {
+        let of = RecordedInterval::from_expanded(5.0, 0.0);
+        assert_eq!([4.9, 5.0, 5.1].map(|limit| of.probability_within(limit)), [0.001, 0.999, 0.999]);
+        assert_eq!(of.quantile_mm(0.6), 5.0);
+    }
+
+    #[test]
+    fn what_is_on_record_decides_where_it_is_there() {
+        // Only an upper bound is known: all quantiles below the median are 0.
+        let quantiles: [f64; RecordedInterval::COUNT] = std::array::from_fn(|k| if k < 7 { 0.0 } else { k as f64 });
+        let of = RecordedInterval { quantiles_mm: Some(quantiles), median_mm: 7.0, low_mm: 0.0, high_mm: 11.0 };
+        assert!(of.is_valid());
+        assert_eq!([8.0, 11.0, 12.0, 14.0].map(|limit| of.probability_within(limit)), [0.75, 0.975, 0.99, 0.999]);
+        assert!((0.9..0.95).contains(&of.probability_within(9.5)));
+        assert!(of.quantile_mm(1.0 - 0.995) == 0.0 && of.quantile_mm(0.93) > 9.0);
+        let broken = RecordedInterval { quantiles_mm: Some(quantiles.map(|q| -q)), ..of };
+        assert!(!broken.is_valid());
+    }
+}

@@ -1,0 +1,346 @@
+//! Transition table: the reaction to an event in a state.
+
+use std::time::Duration;
+
+use super::transitions::{awaits_answer, device_awaiting_acknowledge, device_awaited_clear, reason_clause, reconciling_device, restart_phase, running_device};
+use super::alarm::AlarmId;
+use super::command::Command;
+use super::event::{MachineRequest, Event, JobResult};
+use super::cell::{SuspensionCause, Cell};
+use super::state::{Device, JobStep, Phase, State};
+
+use Phase::{Compensate, Grind, Load, Measure, Register};
+use State::{
+    Aborting, Completing, Execute, Held, Holding, Idle, Starting, Stopping, Suspended, Suspending, Unholding,
+    Unsuspending,
+};
+
+impl Cell {
+    /// Handles an event and returns the commands to execute, in this order. After an end state there are none.
+    ///
+    /// If the event does not fit, the answer is [`Command::Refuse`], and the state does not change.
+    pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
+        if let Err(why) = self.apply_event(now, &event) {
+            let (event, state) = (Box::new(event), self.state);
+            let why = why.unwrap_or_else(|| format!("{} does not fit the state {state}", event.in_words()));
+            self.commands.push(Command::Refuse { event, state, why });
+        }
+        std::mem::take(&mut self.commands)
+    }
+
+    /// Handles an event and leaves the commands in `commands`.
+    ///
+    /// # Errors
+    /// The reason of a refusal, or `None` if the event does not fit the state at all. In the second case nothing has
+    /// changed; only the display to a person needs words.
+    pub(super) fn apply_event(&mut self, now: Duration, event: &Event) -> Result<(), Option<String>> {
+        if self.state.is_end() {
+            return Ok(());
+        }
+        self.now = now;
+        let asked = self.state.phase().and_then(Phase::job);
+        let answered = self.foreign_reason(event).map_or_else(|| self.transition(event), |why| Err(Some(why)));
+        if let (Some((device, JobStep::Start | JobStep::Run | JobStep::Reconcile)), Ok(())) = (asked, &answered) {
+            self.job_observed[device as usize] |= shows_job(event, device);
+        }
+        if self.state.is_end() {
+            self.deadline = None;
+        }
+        self.update_furthest_position();
+        answered
+    }
+
+    /// Returns why an event cannot belong to the present work of the cell, in any state.
+    fn foreign_reason(&self, event: &Event) -> Option<String> {
+        // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
+        // machine then still has the job of the cycle before.
+        if matches!((self.state, event), (Stopping, Event::Ended { device, .. }) if self.stopping_machine == Some(*device)) {
+            return None;
+        }
+        let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);
+        cycle.map(|cycle| format!("it belongs to cycle {cycle}, the current cycle is {}", self.cycle))
+    }
+
+    /// Applies the transition table. Abort and fault come first, then orders, then interruptions, then the sequence of
+    /// a run, then time.
+    fn transition(&mut self, event: &Event) -> Result<(), Option<String>> {
+        match (self.state, event) {
+            // The safe sequence.
+            (Aborting, Event::Abort { .. } | Event::Fault { .. }) => {}
+            (_, Event::Abort { actor, reason }) => self.abort(&format!("{actor} ordered the abort{}", reason_clause(reason))),
+            (_, Event::Fault { device, code, message }) => {
+                let case = format!("{device}, fault {code}, {message}");
+                self.raise(AlarmId::MachineFault, &case);
+                self.abort(&case);
+            }
+            (Aborting, Event::AbortConfirmed { device }) => self.on_abort_confirmed(*device),
+            (Aborting, Event::Cleared { device }) if self.machine(*device).abort_confirmed => self.on_final_clearance(*device, true, ""),
+            (Aborting, Event::Obstructed { device, message }) if self.machine(*device).abort_confirmed => {
+                self.on_final_clearance(*device, false, message);
+            }
+            (Aborting, Event::ClearUnknown { device }) if self.machine(*device).abort_confirmed => {
+                self.on_final_clearance(*device, self.machine(*device).clear_confirmed, "no signal shows whether it is clear");
+            }
+            (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
+                let lost = matches!(event, Event::LinkLost { .. });
+                self.set_link_lost(*device, lost);
+                if !lost && !self.machine(*device).abort_confirmed {
+                    self.push(Command::AbortMachine { device: *device });
+                }
+            }
+            (Aborting, Event::Restarted { .. }) => self.restart_abort(),
+            (Aborting, Event::Deadline) => self.on_deadline(),
+            // A machine may still report what was in progress when the abort came. It has no effect.
+            (Aborting, event) if !event.is_order() => {}
+
+            // Orders.
+            (Idle, Event::Start { .. }) => self.start_run(),
+            (_, Event::Stop { actor, reason }) if !matches!(self.state, Stopping | Completing | Aborting) => {
+                self.end_ordered = true;
+                self.stop(&format!("{actor} stopped the run{}", reason_clause(reason)), false);
+            }
+            (Starting, Event::Hold { .. }) => self.enter_state(Held(Load)),
+            (Execute(phase) | Unholding(phase) | Unsuspending(phase), Event::Hold { .. }) => self.hold(phase),
+            (Suspending(phase), Event::Hold { .. }) => self.enter_state(Holding(phase)),
+            (Suspended(phase), Event::Hold { .. }) => self.hold_suspended(phase),
+            (Holding(_) | Held(_), Event::Hold { .. }) => {}
+            (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
+            (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: device @ Device::Grinder, .. })
+            // If the result is lost, with the machine's memory or a file, the part is also measured once more.
+            | (
+                Held(Measure(JobStep::Reconcile | JobStep::Collect)),
+                Event::DeclaredOver { device: device @ Device::Cmm, .. },
+            ) => self.on_declared_over(*device),
+            // The machine does not discard its result: the next preparation shows whether the result is gone.
+            (Held(phase), Event::DeclaredOver { device, .. }) if device_awaiting_acknowledge(phase) == Some(*device) => {
+                let was_asked = self.acknowledge_refused[*device as usize] || phase == Phase::from_job(*device, JobStep::Acknowledge);
+                if was_asked { self.on_result_given_up(phase) } else { self.on_declared_over(*device) }
+            }
+            (Execute(Load), Event::LoadConfirmed { .. }) => self.start_first_cycle(),
+            (state, Event::ClearConfirmed { device, .. })
+                if state.phase().is_some() && running_device(state) != Some(*device) =>
+            {
+                self.on_clear_confirmed(*device);
+            }
+            (Idle, Event::Restarted { .. }) => {}
+            (Stopping, Event::Restarted { .. }) => {
+                self.ending_reason = "the program was restarted while the run was being stopped".to_owned();
+                self.restart_abort();
+            }
+            (_, Event::Restarted { actor }) => self.on_restarted(&actor.to_string()),
+
+            // Failures of the record, and conditions outside.
+            (_, Event::RecordFailed { why }) => self.on_record_failed(why),
+            (Execute(phase), Event::LinkLost { device, why }) => self.on_link_lost(phase, *device, why, Suspended),
+            (
+                Unholding(phase) | Unsuspending(phase) | Suspending(phase) | Suspended(phase),
+                Event::LinkLost { device, why },
+            ) => {
+                self.on_link_lost(phase, *device, why, Suspended);
+            }
+            (Holding(phase) | Held(phase), Event::LinkLost { device, why }) => {
+                self.on_link_lost(phase, *device, why, Held)
+            }
+            (_, Event::LinkLost { device, why }) => {
+                self.set_link_lost(*device, true);
+                self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+            }
+            (_, Event::StationFailed { device, why }) => self.on_station_failed(*device, why),
+            (_, Event::LinkBack { device, boot_id }) => self.on_link_back(*device, *boot_id),
+            (Execute(phase), Event::ConditionLost { device, condition, message }) => {
+                self.on_condition_lost(*device, *condition, message);
+                if phase.moving_device().is_some() {
+                    self.suspend(phase);
+                }
+            }
+            (_, Event::ConditionLost { device, condition, message }) => {
+                self.on_condition_lost(*device, *condition, message)
+            }
+            (_, Event::ConditionBack { device, condition }) => {
+                self.remove_cause(SuspensionCause::Condition(*device, *condition), AlarmId::ConditionLost)
+            }
+
+            (Starting, Event::NotOnRecord { .. }) => self.enter_state(Held(Load)),
+            (
+                Execute(phase) | Holding(phase) | Suspending(phase) | Unholding(phase) | Unsuspending(phase),
+                Event::NotOnRecord { .. },
+            ) => self.on_not_recorded(phase),
+            // The result stays at the machine, which gets the acknowledgement in the next run.
+            (Stopping, Event::NotOnRecord { command }) if command.starts_with("acknowledge") => self.finish_stopped(),
+            (_, Event::NotOnRecord { .. }) => {}
+            (_, Event::ControlLost { why }) => self.raise(AlarmId::ControlLost, why),
+            (_, Event::ControlBack) => self.withdraw(AlarmId::ControlLost),
+
+            (_, Event::NotAutomatic { device, message }) => self.on_manual_mode(*device, message),
+            (_, Event::AutomaticAgain { device }) => self.on_automatic_mode(*device),
+
+            // Connecting.
+            (Starting, Event::Connected { device, boot_id, found, .. }) => self.on_connected(*device, *boot_id, found),
+            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, found, .. }) => {
+                self.on_reconnected(phase, *device, *boot_id, found);
+            }
+            (Starting | Held(_) | Holding(_), Event::NotConnected { device, why }) => self.on_not_connected(*device, why),
+            (Starting, Event::Refused { device, what: MachineRequest::Clear, why }) => {
+                self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
+                self.stop(&format!("the {device} could not be cleared: {why}"), false);
+            }
+
+            // Job of a machine, in its steps. `advance` continues, or stays at the border of the phase if the cell is
+            // being held.
+            (Execute(p) | Holding(p), Event::PassLoaded { .. }) if p == Grind(JobStep::Send) => {
+                self.advance(Grind(JobStep::Clear))
+            }
+            (Execute(p) | Holding(p), Event::PlanLoaded { .. }) if p == Measure(JobStep::Send) => {
+                self.advance(Measure(JobStep::Clear));
+            }
+            (Execute(p) | Holding(p), Event::Cleared { device }) if device_awaited_clear(p) == Some(*device) => {
+                self.on_cleared(p, *device);
+            }
+            (Execute(p) | Holding(p), Event::ClearUnknown { device }) if device_awaited_clear(p) == Some(*device) => {
+                self.on_clear_unknown(p, *device);
+            }
+            (Execute(p) | Holding(p), Event::Obstructed { device, message }) if device_awaited_clear(p) == Some(*device) => {
+                self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
+                self.enter_state(Held(restart_phase(p)));
+            }
+            (Execute(p) | Holding(p), Event::Prepared { device, .. })
+                if p.job() == Some((*device, JobStep::Prepare)) =>
+            {
+                self.advance(Phase::from_job(*device, JobStep::Start));
+            }
+            (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, JobStep::Start)) => {
+                self.enter_running(Phase::from_job(*device, JobStep::Run));
+            }
+            (Holding(p) | Suspending(p), Event::Started { device, .. })
+                if p.job() == Some((*device, JobStep::Start)) =>
+            {
+                self.enter_state(self.state_with_phase(Phase::from_job(*device, JobStep::Run)));
+                self.push(Command::HoldMachine { device: *device });
+            }
+            // A late answer to a request that the cell already clarifies: the job was taken.
+            (state, Event::Started { device, .. }) if reconciling_device(state) == Some(*device) => {}
+            (Execute(p) | Holding(p) | Suspending(p), Event::StartUnknown { device, .. })
+                if p.job() == Some((*device, JobStep::Start)) =>
+            {
+                self.reconcile(*device);
+            }
+            (state, Event::JobVanished { device, why }) if state.phase() == Some(Phase::from_job(*device, JobStep::Run)) => {
+                self.on_job_vanished(*device, why);
+            }
+            // The cell already asks the machine, or knows the end of the job.
+            (_, Event::JobVanished { .. }) => {}
+            (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, JobStep::Run)) => {
+                self.on_progressed(*device)
+            }
+            (
+                Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
+                Event::Progressed { device, .. },
+            ) if p.moving_device() == Some(*device) => {}
+            (Held(p) | Suspended(p), Event::Progressed { device, .. }) => self.on_motion_while_held(p, *device),
+            (
+                Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
+                Event::Progressed { device, .. },
+            ) => self.on_unordered_motion(p, *device),
+            (_, Event::MachineHeld { device }) => self.on_machine_held(*device)?,
+            (_, Event::MachineResumed { device }) => self.on_machine_resumed(*device)?,
+            (Stopping, Event::Ended { device, result, .. }) if *result != JobResult::Aborted => {
+                self.push(Command::Acknowledge { device: *device });
+            }
+            (state, Event::Ended { device, result, .. }) if running_device(state) == Some(*device) => {
+                self.on_ended(*device, *result)
+            }
+            (state, Event::RecordDoubted { why, .. }) if running_device(state) == Some(Device::Grinder) => {
+                self.pass_record_doubted = true;
+                self.raise(AlarmId::PassRecord, why);
+            }
+            (Stopping, Event::RecordDoubted { why, .. }) => self.raise(AlarmId::PassRecord, why),
+            (state, Event::Reconciled { device, outcome, .. }) if reconciling_device(state) == Some(*device) => {
+                self.on_reconciled(*device, outcome);
+            }
+            (Execute(p) | Holding(p), Event::Collected { targets, found, gate, .. })
+                if p == Measure(JobStep::Collect) =>
+            {
+                self.on_collected(*targets, *found, gate);
+            }
+            (Execute(p) | Holding(p), Event::Qualified { radius_error_mm, .. }) if p == Measure(JobStep::Qualify) => {
+                self.on_qualified(*radius_error_mm);
+            }
+            (Execute(p) | Holding(p), Event::Acknowledged { device }) if device_awaiting_acknowledge(p) == Some(*device) => {
+                self.on_acknowledged(p);
+            }
+            (Stopping, Event::Acknowledged { .. }) => self.finish_stopped(),
+            (Execute(p) | Holding(p), Event::Refused { device, what, why }) if awaits_answer(p, *device, *what) => {
+                self.on_refused(p, *device, *what, why);
+            }
+            (
+                Holding(_) | Suspending(_) | Held(_) | Suspended(_),
+                Event::Refused { device, what: MachineRequest::Hold, why },
+            ) => {
+                self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {why}"));
+                self.abort(&format!("the {device} refused to hold: {why}"));
+            }
+            (Unholding(p) | Unsuspending(p), Event::Refused { device, what: MachineRequest::Resume, why })
+                if p.moving_device() == Some(*device) =>
+            {
+                self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {why}"));
+                self.enter_state(Held(p));
+            }
+            (Stopping, Event::Refused { device, what: MachineRequest::Stop | MachineRequest::Acknowledge | MachineRequest::Discard, why }) => {
+                self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {why}"));
+                self.abort(&format!("the {device} refused to stop: {why}"));
+            }
+            (Execute(p), Event::Obstructed { device, message }) if p.moving_device() == Some(device.other()) => {
+                self.machine_mut(*device).clear = false;
+                self.raise(AlarmId::NotClear, &format!("{device}, {message}, while the {} moves", device.other()));
+                self.hold(p);
+            }
+            (Completing, Event::Obstructed { device, message }) => self.on_final_clearance(*device, false, message),
+            (_, Event::Obstructed { device, .. }) => self.machine_mut(*device).clear = false,
+            // Nothing is started any more: the person who takes the part out can see whether the machine is clear.
+            (Completing, Event::ClearUnknown { device }) => self.on_final_clearance(*device, true, ""),
+            (_, Event::ClearUnknown { device }) => self.machine_mut(*device).clear = false,
+
+            // Computations.
+            (Execute(Register) | Holding(Register), Event::Registered { figures, .. }) => self.on_registered(figures),
+            (Execute(Register) | Holding(Register), Event::RegistrationFailed { why, .. }) => {
+                self.reject_measurement(AlarmId::RegistrationFailed, why);
+            }
+            (
+                Execute(p @ (Register | Compensate | Measure(JobStep::Collect)))
+                | Holding(p @ (Register | Compensate | Measure(JobStep::Collect))),
+                Event::NotSaved { why, .. },
+            ) => {
+                self.raise_record_failed(why);
+                self.enter_state(Held(p));
+            }
+            (Execute(Compensate) | Holding(Compensate), Event::Compensated { summary, .. }) => {
+                self.cycle += 1;
+                if summary.asks.is_empty() {
+                    self.advance(Grind(JobStep::Send));
+                } else {
+                    self.raise(AlarmId::ParameterBeyond, &summary.asks.join("; "));
+                    self.enter_state(Held(Grind(JobStep::Send)));
+                }
+            }
+            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { why, .. }) => self.on_compensation_refused(why),
+
+            // The end, and time.
+            (Completing, Event::Cleared { device }) => self.on_final_clearance(*device, true, ""),
+            (_, Event::Deadline) => self.on_deadline(),
+            _ => return Err(None),
+        }
+        Ok(())
+    }
+}
+
+/// Returns true if an event shows a machine at the requested job, or at its end.
+fn shows_job(event: &Event, of: Device) -> bool {
+    match event {
+        Event::Started { device, .. }
+        | Event::Progressed { device, .. }
+        | Event::MachineHeld { device }
+        | Event::MachineResumed { device }
+        | Event::Ended { device, .. } => *device == of,
+        _ => false,
+    }
+}

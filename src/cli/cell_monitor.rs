@@ -1,0 +1,150 @@
+//! Status of the cell whose runs are in a folder: the active run, an interrupted run, and the result of the last run.
+//! The status is published as it is found.
+//!
+//! The current run is the one with the newest record. The time of the folder does not count, because anybody can read,
+//! copy or create a folder.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+use regrind::drive::Request;
+use regrind::journal::{DATABASE, Reader, Stamp, is_driven, stamp};
+use regrind::report::{RunResult, RunSummary, run_summary};
+use regrind_live::{EndedRun, RunStatus, CellStatus};
+
+use super::control;
+
+/// Time that a run can be starting, ending or silent before it counts as not answering.
+const GRACE: Duration = Duration::from_secs(5);
+
+/// Status of the cell, updated by repeated reading of the runs in a folder.
+pub(super) struct CellMonitor {
+    runs: PathBuf,
+    status: CellStatus,
+    /// Run that does not answer, and the time since when.
+    silent: Option<(PathBuf, Instant)>,
+    /// Time of the last record of each run, with the stamp of its files at that time. `None` for a folder that is not a
+    /// run.
+    known: HashMap<PathBuf, (Stamp, Option<Timestamp>)>,
+    /// Last current run, with the stamp of its files. While the stamp is unchanged, the run is not read again.
+    settled: Option<(PathBuf, Stamp)>,
+}
+
+impl CellMonitor {
+    pub(super) fn new(runs: &Path) -> Self {
+        Self { runs: runs.to_owned(), status: CellStatus::default(), silent: None, known: HashMap::new(), settled: None }
+    }
+
+    /// Returns the current status of the cell, or the last known status if the current one cannot be read.
+    pub(super) fn poll(&mut self) -> &CellStatus {
+        let live = control::live_runs(&self.runs).next();
+        match live {
+            Some(run) => match regrind_control::send_request(&run, &Request::Status) {
+                Ok(reply) => {
+                    self.silent = None;
+                    self.status.run_status = RunStatus::Active { run: name(&run), snapshot: Box::new(reply.status) };
+                }
+                Err(_) => self.does_not_answer(run),
+            },
+            None => self.by_the_records(),
+        }
+        &self.status
+    }
+
+    /// Updates the status on its own thread, because a record can be long and a run can fail to answer.
+    pub(super) async fn poll_in_background(mut self) -> Self {
+        let runs = self.runs.clone();
+        let looked = tokio::task::spawn_blocking(move || {
+            self.poll();
+            self
+        });
+        looked.await.unwrap_or_else(|_| Self::new(&runs))
+    }
+
+    /// Returns the last status found.
+    pub(super) fn status(&self) -> &CellStatus {
+        &self.status
+    }
+
+    /// Sets the status of the active run, which the caller received.
+    pub(super) fn set_run_status(&mut self, now: RunStatus) {
+        (self.status.run_status, self.silent) = (now, None);
+    }
+
+    fn does_not_answer(&mut self, run: PathBuf) {
+        let since = match self.silent.take() {
+            Some((silent, since)) if silent == run => since,
+            _ => Instant::now(),
+        };
+        if since.elapsed() > GRACE {
+            self.status.run_status = RunStatus::Unresponsive { run: name(&run) };
+        }
+        self.silent = Some((run, since));
+    }
+
+    /// Determines the status from the records. No run listens: a run is starting or ending, was interrupted, or is
+    /// over.
+    fn by_the_records(&mut self) {
+        let folders: Vec<PathBuf> = control::folders(&self.runs).collect();
+        self.known.retain(|run, _| folders.contains(run));
+        if folders.is_empty() {
+            (self.status, self.silent) = (CellStatus::default(), None);
+            return;
+        }
+        if let Some(begins) = folders.iter().find(|run| !run.join(DATABASE).is_file() && is_driven(run)) {
+            return self.does_not_answer(begins.clone());
+        }
+        let last = folders.iter().filter_map(|run| Some((self.last_recorded(run)?, run))).max();
+        let Some((_, run)) = last else {
+            // A folder without files is not a run. The state of an unreadable run is unknown.
+            match folders.iter().find(|run| run.join(DATABASE).is_file() && !self.known.contains_key(*run)) {
+                Some(run) if is_driven(run) => self.does_not_answer(run.clone()),
+                Some(run) => {
+                    (self.status.run_status, self.silent) = (RunStatus::ProgramGone { run: name(run), machines_within: false }, None)
+                }
+                None => (self.status.run_status, self.silent) = (RunStatus::NoRun, None),
+            }
+            return;
+        };
+        let at = stamp(run);
+        if self.settled.as_ref().is_some_and(|(settled, then)| settled == run && *then == at)
+            && !matches!(self.status.run_status, RunStatus::Active { .. } | RunStatus::Unresponsive { .. })
+        {
+            return;
+        }
+        match run_summary(run) {
+            Ok(RunSummary { ended: Some(_), result, verdict, .. }) => {
+                let accepted = result == RunResult::Accepted;
+                self.status = CellStatus { run_status: RunStatus::NoRun, last_run: Some(EndedRun { run: name(run), verdict, accepted }) };
+            }
+            Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
+            Ok(RunSummary { machines_within, .. }) => self.status.run_status = RunStatus::ProgramGone { run: name(run), machines_within },
+            // The record cannot be read at the moment.
+            Err(_) => return,
+        }
+        (self.settled, self.silent) = (Some((run.clone(), at)), None);
+    }
+
+    /// Returns the time of the last record of a run. `None` for a folder that is not a run of a part or that cannot be
+    /// read.
+    fn last_recorded(&mut self, run: &Path) -> Option<Timestamp> {
+        let at = stamp(run);
+        if let Some((_, last)) = self.known.get(run).filter(|(then, _)| *then == at) {
+            return *last;
+        }
+        // Reading does not create a journal.
+        let reader = Reader::open(run).ok()?;
+        let first = reader.records(0).next()?.ok()?;
+        let last = reader.last().ok()??.utc.parse().ok()?;
+        let last = (first.value()["content"]["recover"] != true).then_some(last);
+        self.known.insert(run.to_owned(), (at, last));
+        last
+    }
+}
+
+/// Returns the name of a run.
+pub(super) fn name(folder: &Path) -> String {
+    folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}

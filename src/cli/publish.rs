@@ -1,0 +1,324 @@
+//! `regrind tell`: publishes the status of this cell by Sparkplug B or OPC UA, in parallel with the work of the cell.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use regrind::config::PlantConfig;
+use regrind::drive::Request;
+use regrind_control::OnBehalf;
+use regrind_live::{LiveError, PublisherEvent, Node, EventSender, RunStatus, CellStatus, PublisherLock, UaServer, event_queue};
+use serde_json::json;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+
+use super::cell_monitor::{CellMonitor, name};
+use super::failure::Failure;
+use super::{Outcome, check, control, outside, plant, replicate};
+
+/// Time between two searches for a run, and between two tries for the publisher lock.
+const ROUND: Duration = Duration::from_secs(1);
+/// Time for which the result of an ended run is still published.
+const LINGERS: Duration = Duration::from_secs(3);
+/// Timeout for the closing messages.
+const FAREWELL: Duration = Duration::from_secs(5);
+/// Maximum number of refusals that are reported individually per minute.
+const ONE_BY_ONE: usize = 8;
+const MINUTE: Duration = Duration::from_secs(60);
+
+/// Publish live values of this cell to a broker (Sparkplug B) and to clients (OPC UA)
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until it is stopped, from run to
+run, also without an active run. It accepts no orders: written values and received commands are refused, reported here,
+and recorded in the active run. `regrind run --plant` starts it by itself. docs/live.md lists every value.
+
+Example:
+  regrind tell --plant plant.toml --runs /srv/runs
+
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or an entry of the plant file cannot be used.")]
+pub(super) struct Arguments {
+    /// Plant file: receivers of the values
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Print a line of JSON for each event
+    #[arg(long)]
+    json: bool,
+    /// End a little after standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    let cell = cell_of(&config)?;
+    // Other programs of this computer have priority.
+    outside::give_way();
+    super::runtime()?.block_on(async {
+        let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
+        let ended = async {
+            if arguments.while_stdin {
+                return drop(replicate::end_of_input().await);
+            }
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = endings.next() => {}
+            }
+        };
+        tokio::pin!(ended);
+        let turn = tokio::select! {
+            turn = wait_for_lock(&config, arguments) => turn?,
+            () = &mut ended => return Ok(Outcome::Accepted),
+        };
+        publish(&config, &cell, &turn, arguments, ended).await
+    })
+}
+
+/// Returns the name of the cell for publication.
+fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
+    let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
+    match &config.cell {
+        _ if config.sparkplug.is_none() && config.opcua.is_none() => {
+            missing("sparkplug", "say by [sparkplug] or [opcua] to whom the cell is told")
+        }
+        Some(cell) => Ok(cell.clone()),
+        None => missing("plant.cell", "say what this cell is called"),
+    }
+}
+
+/// Waits until no other program publishes this cell.
+async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<PublisherLock, Failure> {
+    let folder = config.path().with_extension("live");
+    let mut waits = false;
+    loop {
+        if let Some(turn) = PublisherLock::acquire(&folder)? {
+            return Ok(turn);
+        }
+        if !std::mem::replace(&mut waits, true) && !arguments.while_stdin {
+            eprintln!("tell: another program tells this cell already; this one waits until that has ended");
+        }
+        tokio::time::sleep(ROUND).await;
+    }
+}
+
+/// Publishes the cell until the end is requested.
+async fn publish(
+    config: &PlantConfig,
+    cell: &str,
+    turn: &PublisherLock,
+    arguments: &Arguments,
+    ended: impl Future<Output = ()>,
+) -> Result<Outcome, Failure> {
+    let mut look = CellMonitor::new(&arguments.runs);
+    let (to, told) = watch::channel(look.poll().clone());
+    let (notes, news) = event_queue();
+    let mut telling = begin(config, cell, turn, &told, &event_queue)?;
+    // Only the publishers keep the senders and receivers of events.
+    drop((told, event_queue));
+    let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
+    let over = tokio::select! {
+        Some(over) = telling.join_next() => Some(over),
+        never = follow(look, &arguments.runs, &to) => match never {},
+        () = async {
+            ended.await;
+            if arguments.while_stdin {
+                tokio::time::sleep(LINGERS).await;
+            }
+        } => None,
+    };
+    drop(to);
+    let farewell = async { while telling.join_next().await.is_some() {} };
+    // A receiver that does not read the closing messages detects the end by other means.
+    let _ = tokio::time::timeout(FAREWELL, farewell).await;
+    drop(telling);
+    let _ = tokio::time::timeout(FAREWELL, &mut hearing).await;
+    match over {
+        Some(over) => {
+            over.map_err(|error| Failure::Terminal(error.into()))?.map(|()| Outcome::Accepted).map_err(Failure::Live)
+        }
+        None => Ok(Outcome::Accepted),
+    }
+}
+
+/// Starts all publishers that the plant file names.
+fn begin(
+    config: &PlantConfig,
+    cell: &str,
+    turn: &PublisherLock,
+    told: &watch::Receiver<CellStatus>,
+    notes: &EventSender,
+) -> Result<JoinSet<Result<(), LiveError>>, Failure> {
+    let mut telling = JoinSet::new();
+    if let Some(settings) = &config.sparkplug {
+        telling.spawn(Node::new(settings, cell, turn, told.clone(), event_queue.clone())?.run());
+    }
+    if let Some(settings) = &config.opcua {
+        telling.spawn(UaServer::new(settings, cell, turn, told.clone(), event_queue.clone())?.run());
+    }
+    Ok(telling)
+}
+
+// ---- published status ---------------------------------------------------------------------------------------------
+
+enum Never {}
+
+/// Publishes the status of the cell, from run to run.
+async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatus>) -> Never {
+    loop {
+        if let Some(folder) = control::live_runs(runs).next() {
+            watch_run(&folder, &mut look, to).await;
+        }
+        look = look.poll_in_background().await;
+        publish_status(look.status(), to);
+        tokio::time::sleep(ROUND).await;
+    }
+}
+
+/// Publishes the status of a run until it no longer answers.
+async fn watch_run(folder: &Path, look: &mut CellMonitor, to: &watch::Sender<CellStatus>) {
+    let Ok(mut watch) = regrind_control::watch(folder).await else { return };
+    while let Ok(Some(snapshot)) = watch.next().await {
+        look.set_run_status(RunStatus::Active { run: name(folder), snapshot: Box::new(snapshot) });
+        publish_status(look.status(), to);
+    }
+}
+
+fn publish_status(now: &CellStatus, to: &watch::Sender<CellStatus>) {
+    to.send_if_modified(|told| {
+        told != now && {
+            told.clone_from(now);
+            true
+        }
+    });
+}
+
+// ---- returned events ----------------------------------------------------------------------------------------------
+
+/// Prints the events of the publishers, and records refused requests while a run is active.
+async fn hear(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: bool) {
+    let mut some = Vec::new();
+    let mut quota = Quota::new(Instant::now());
+    loop {
+        let heard = match quota.unreported {
+            0 => Ok(news.recv_many(&mut some, 256).await),
+            _ => tokio::time::timeout(MINUTE, news.recv_many(&mut some, 256)).await,
+        };
+        for news in some.drain(..) {
+            match news {
+                PublisherEvent::Connected { place } => say(json, &json!({ "tells": place }), &format!("{place} is told from now on")),
+                PublisherEvent::Retrying { place, why } => say(
+                    json,
+                    &json!({ "waits": place, "why": why }),
+                    &format!("{place} is not told for now: {why}; the cell goes on, and it is tried again"),
+                ),
+                PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => refuse(&runs, json, &by, &what).await,
+                PublisherEvent::Refused { .. } => quota.unreported += 1,
+                PublisherEvent::RefusedMore { times } => quota.unreported += u64::from(times),
+            }
+        }
+        let over = matches!(heard, Ok(0));
+        if let Some(more) = quota.summed_up(Instant::now(), over) {
+            refuse(&runs, json, "the same or others", &format!("{more} more of what cannot be done from there")).await;
+        }
+        if over {
+            return;
+        }
+    }
+}
+
+/// Limit of the reported refusals per minute: some individually, and then once the number of the others. Each report is
+/// a line in the record of a run.
+struct Quota {
+    since: Instant,
+    reported: usize,
+    has_summed_up: bool,
+    unreported: u64,
+}
+
+impl Quota {
+    fn new(now: Instant) -> Self {
+        Self { since: now, reported: 0, has_summed_up: false, unreported: 0 }
+    }
+
+    fn turn(&mut self, now: Instant) {
+        if now.duration_since(self.since) >= MINUTE {
+            *self = Self { unreported: self.unreported, ..Self::new(now) };
+        }
+    }
+
+    /// Returns true if one more refusal is reported individually.
+    fn takes(&mut self, now: Instant) -> bool {
+        self.turn(now);
+        self.reported += 1;
+        self.reported <= ONE_BY_ONE
+    }
+
+    /// Returns the number of refusals to report together now. `over` is true if no further refusals can arrive.
+    fn summed_up(&mut self, now: Instant, over: bool) -> Option<u64> {
+        self.turn(now);
+        let is_due = self.unreported > 0 && (over || !self.has_summed_up);
+        is_due.then(|| {
+            self.has_summed_up = true;
+            std::mem::take(&mut self.unreported)
+        })
+    }
+}
+
+/// Reports a refused request, here and in the record of the active run.
+async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
+    say(
+        json,
+        &json!({ "refused": what, "by": by }),
+        &format!("refused to {by}: {what}; live values are only to be looked at"),
+    );
+    let runs = runs.to_owned();
+    let remark = Request::Remark { what: format!("live values: refused: {what}") };
+    let by = OnBehalf { name: None, station: by.to_owned() };
+    // A run that does not answer delays only this report.
+    let recorded = tokio::task::spawn_blocking(move || {
+        let run = control::live_runs(&runs).next()?;
+        Some(regrind_control::send_request_on_behalf(&run, &remark, Some(by)).is_ok_and(|reply| reply.taken))
+    });
+    if recorded.await.ok().flatten() == Some(false) {
+        eprintln!("tell: the run did not take it on record");
+    }
+}
+
+fn say(json: bool, fields: &serde_json::Value, words: &str) {
+    eprintln!("tell: {words}");
+    if json {
+        // A reader that is gone is not an error.
+        let _ = super::print(&format!("{fields}\n"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flood_of_orders_is_a_few_lines_a_minute() {
+        let began = Instant::now();
+        let mut quota = Quota::new(began);
+        let (mut lines, mut counted) = (0, 0);
+        // A thousand per second for ten minutes, processed four times per second.
+        for quarter in 0..2400 {
+            let now = began + Duration::from_millis(250 * quarter);
+            for _ in 0..250 {
+                if quota.takes(now) {
+                    (lines, counted) = (lines + 1, counted + 1);
+                } else {
+                    quota.unreported += 1;
+                }
+            }
+            if let Some(more) = quota.summed_up(now, quarter == 2399) {
+                (lines, counted) = (lines + 1, counted + more);
+            }
+        }
+        assert_eq!(counted, 600_000, "each is counted");
+        assert!(lines <= 10 * (ONE_BY_ONE + 1) + 1, "{lines}");
+    }
+}

@@ -1,0 +1,210 @@
+//! `regrind ship`: replicates the records of this cell to the plant, in parallel with the work of the cell.
+
+use std::io::{self, Read};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use regrind::config::PlantConfig;
+use regrind_live::{RunStatus, CellStatus};
+use regrind_plant::{Link, PlantError, ReplicationResult, Replicator};
+use serde_json::json;
+
+use super::cell_monitor::CellMonitor;
+use super::failure::Failure;
+use super::{Outcome, outside, plant};
+
+/// Time between two rounds, and maximum wait for an unreachable plant.
+const ROUND: Duration = Duration::from_secs(1);
+const LONGEST_WAIT: Duration = Duration::from_secs(60);
+/// Time for which replication continues after the end of a run, for its remaining records.
+const LINGERS: Duration = Duration::from_secs(30);
+
+/// Replicate the records and files of finished and running runs to the plant
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The command runs until it is stopped, also while the plant cannot be reached: it sends the rest later. The plant verifies
+the chain of every record on arrival. A journal that was cut or rewritten after it was replicated is reported here and at
+the plant. No order of the cell waits for this command.
+
+Examples:
+  regrind ship --plant plant.toml
+  regrind ship --plant plant.toml --runs /srv/runs --once
+
+Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from its copy at the plant; 2 bad arguments;
+3 with --once, the plant cannot be reached.")]
+pub(super) struct Arguments {
+    /// Plant file: address and user of the database
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// End when everything has arrived
+    #[arg(long)]
+    once: bool,
+    /// Print a line of JSON for each event
+    #[arg(long)]
+    json: bool,
+    /// End a little after standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    // Other programs of this computer have priority.
+    outside::give_way();
+    let mut shipping = Shipping {
+        shipper: Replicator::new(arguments.runs.clone(), config.artefacts.clone()),
+        config,
+        link: None,
+        arguments,
+        monitor: None,
+        waits: false,
+    };
+    super::runtime()?.block_on(async {
+        if arguments.once {
+            return shipping.once().await;
+        }
+        tokio::select! {
+            ended = shipping.go_on() => ended.map(|()| Outcome::Accepted),
+            stopped = tokio::signal::ctrl_c(), if !arguments.while_stdin => {
+                stopped.map_err(Failure::Terminal)?;
+                shipping.ended()
+            }
+        }
+    })
+}
+
+struct Shipping<'a> {
+    config: PlantConfig,
+    shipper: Replicator,
+    link: Option<Link>,
+    arguments: &'a Arguments,
+    /// Last known status of the cell. `None` while it is being read.
+    monitor: Option<CellMonitor>,
+    /// True if the message about an unreachable plant was printed.
+    waits: bool,
+}
+
+impl Shipping<'_> {
+    async fn once(&mut self) -> Result<Outcome, Failure> {
+        self.round().await?;
+        self.ended()
+    }
+
+    /// Returns the outcome of the command: whether any copy differs.
+    fn ended(&self) -> Result<Outcome, Failure> {
+        Ok(if self.shipper.left_alone().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
+    }
+
+    /// Runs rounds. If requested, ends shortly after standard input is closed.
+    async fn go_on(&mut self) -> Result<(), Failure> {
+        let mut over = self.arguments.while_stdin.then(end_of_input);
+        let mut last = None;
+        let mut wait = ROUND;
+        loop {
+            let shipped = match self.round().await {
+                Ok(shipped) => {
+                    wait = ROUND;
+                    Some(shipped)
+                }
+                Err(Failure::Plant(error)) if error.may_pass() => {
+                    self.waits_for(&error)?;
+                    wait = (2 * wait).min(LONGEST_WAIT);
+                    None
+                }
+                Err(error) => return Err(error),
+            };
+            let is_empty = shipped.is_some_and(|shipped| shipped == ReplicationResult::default());
+            match last {
+                // One more round after the last one with data, because the end of a record is written last.
+                Some(until) if is_empty || Instant::now() > until => return Ok(()),
+                _ => {}
+            }
+            match &mut over {
+                Some(over) if last.is_none() => tokio::select! {
+                    () = tokio::time::sleep(wait) => {}
+                    _ = over => last = Some(Instant::now() + LINGERS),
+                },
+                _ => tokio::time::sleep(if last.is_some() { ROUND } else { wait }).await,
+            }
+        }
+    }
+
+    /// Replicates new records and the status of the cell.
+    async fn round(&mut self) -> Result<ReplicationResult, Failure> {
+        if self.link.as_ref().is_none_or(Link::is_closed) {
+            self.link = Some(plant::open(&self.config).await?);
+        }
+        let Some(link) = &self.link else { return Ok(ReplicationResult::default()) };
+        let shipped = self.shipper.round(link).await;
+        let told = match &shipped {
+            Ok(_) => {
+                let look = self.monitor.take().unwrap_or_else(|| CellMonitor::new(&self.arguments.runs)).poll_in_background().await;
+                send_status(link, self.monitor.insert(look).status()).await
+            }
+            Err(_) => Ok(()),
+        };
+        let shipped = match (shipped, told) {
+            (Ok(shipped), Ok(())) => shipped,
+            (Err(error), _) | (_, Err(error)) => {
+                self.link = None;
+                return Err(error.into());
+            }
+        };
+        self.print_round(&shipped)?;
+        Ok(shipped)
+    }
+
+    fn print_round(&mut self, shipped: &ReplicationResult) -> Result<(), Failure> {
+        self.waits = false;
+        for (run, what) in &shipped.differ {
+            let words = format!("{run}: {what}");
+            eprintln!("ship: {}", regrind::document::visible(&words));
+        }
+        if shipped.records == 0 && shipped.files == 0 {
+            return Ok(());
+        }
+        let ReplicationResult { records, files, runs, .. } = shipped;
+        if self.arguments.json {
+            return super::print(&format!("{}\n", json!({ "records": records, "files": files, "runs": runs })));
+        }
+        if self.arguments.while_stdin {
+            return Ok(());
+        }
+        super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
+    }
+
+    /// Prints once that the plant is unreachable.
+    fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
+        if !std::mem::replace(&mut self.waits, true) {
+            eprintln!("ship: {error}; the cell goes on, and its records wait for it here");
+        }
+        Ok(())
+    }
+}
+
+/// Sends the status of the cell to the plant. An unknown status is not sent: the plant then detects the silence.
+async fn send_status(link: &Link, told: &CellStatus) -> Result<(), PlantError> {
+    match &told.run_status {
+        RunStatus::Active { run, snapshot } => {
+            link.report_state(Some(run), &serde_json::to_value(snapshot).unwrap_or_default()).await
+        }
+        RunStatus::NoRun => link.report_state(None, &json!({ "state": "Idle", "words": "no run is on" })).await,
+        RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => Ok(()),
+    }
+}
+
+/// Waits until standard input is closed by all writers.
+pub(super) fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
+    let (ended, end) = tokio::sync::oneshot::channel::<()>();
+    // Own thread, which ends with the program, because a blocked read of a pipe cannot be cancelled.
+    std::thread::spawn(move || {
+        let mut some = [0; 64];
+        while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}
+        drop(ended);
+    });
+    end
+}

@@ -1,0 +1,321 @@
+//! `regrind work`: runs the parts in the plant's queue one after the other. A person at the cell confirms each.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use regrind::config::{BUILT_IN_CELL, PlantConfig};
+use regrind::drive::is_live;
+use regrind::formats::{ResultFolder, write_atomic};
+use regrind::journal::{DATABASE, Kind, Reader};
+use regrind::recipe::Recipe;
+use regrind_plant::{StartedPart, LEASE, Lease, Link, PlantError, PlantRecipe};
+
+use super::failure::Failure;
+use super::{Outcome, check, plant, recover, run as making};
+
+/// Time between two queries of the queue with `--wait`.
+const ROUND: Duration = Duration::from_secs(5);
+/// Folder of downloaded recipes, within the folder of the runs.
+const RECIPES: &str = ".recipes";
+
+/// Make the parts that are queued for this cell at the plant, one after the other
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The part with the earliest due date is leased to this cell. Its recipe is fetched by its hash and verified: two of the
+approvers in the plant file must have signed it. The person at the cell confirms the part by its serial number, typed or
+scanned; any other input gives the part back. From its start the part belongs to its run, and no other cell gets it, also
+if this cell fails. The command ends when no part is left, or when a part is not accepted.
+
+Examples:
+  regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
+  regrind work --plant cell-1.toml --part SN-0042 --once
+  regrind work --plant cell-1.toml --give-back SN-0042
+  regrind work --plant cell-1.toml --give-up SN-0042 --why \"the blank broke\"
+
+Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was given back, or was started here and is not
+over; 2 bad arguments, or a recipe that is not approved; 3 a fault or abort, or the plant cannot be reached.")]
+pub(super) struct Arguments {
+    /// Plant file: address and user of the database, and the approvers of recipes
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Cell that makes the parts; `sim` is the built-in simulated cell
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN_CELL)]
+    cell: PathBuf,
+    /// Name of the person at the cell
+    #[arg(long, value_name = "NAME", value_parser = super::name)]
+    operator: Option<String>,
+    /// Folder in which to create the folders of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Confirm the part with this serial number, if it is the next; give back any other part
+    #[arg(long, value_name = "SERIAL", value_parser = super::name)]
+    part: Option<String>,
+    /// Make at most one part
+    #[arg(long)]
+    once: bool,
+    /// Wait for further parts when none is left, until Ctrl-C
+    #[arg(long, conflicts_with = "once")]
+    wait: bool,
+    /// Give back a part that was started here without any result of its run: you have checked that nothing was ground
+    #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
+    give_back: Option<String>,
+    /// Give up a part whose run was interrupted and will not be resumed: a planner decides whether it is made again
+    #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "why", conflicts_with_all = ["part", "once", "wait", "give_back"])]
+    give_up: Option<String>,
+    /// Reason for giving it up, for the record
+    #[arg(long, value_name = "WORDS", value_parser = super::name, requires = "give_up")]
+    why: Option<String>,
+    /// Seed of other simulated parts and runs
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Print a line of JSON for each event of a run
+    #[arg(long)]
+    json: bool,
+}
+
+/// Confirmed part, before its run begins.
+#[derive(Clone, Debug)]
+pub(super) struct ConfirmedPart {
+    config: PlantConfig,
+    lease: Lease,
+}
+
+impl ConfirmedPart {
+    /// Assigns the part to a run. Nothing begins until the plant has confirmed the assignment.
+    pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
+        let name = run.file_name().unwrap_or_default().to_string_lossy();
+        let link = plant::open(&self.config).await?;
+        match self.lease.begin(&link, &name).await {
+            // It is unknown whether the plant made the assignment. The request is idempotent: a retry returns the same
+            // answer.
+            Err(error) if error.may_pass() => {
+                let link = plant::open(&self.config).await?;
+                Ok(self.lease.begin(&link, &name).await?)
+            }
+            other => Ok(other?),
+        }
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    if let Some(serial) = arguments.give_back.as_ref().or(arguments.give_up.as_ref()) {
+        return super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.why.as_deref()));
+    }
+    loop {
+        let (recipe, taken) = match super::runtime()?.block_on(next(&config, arguments))? {
+            Next::Part(recipe, taken) => (recipe, taken),
+            Next::None if arguments.wait => {
+                std::thread::sleep(ROUND);
+                continue;
+            }
+            Next::None => {
+                super::print("no part is waiting for this cell\n")?;
+                return Ok(Outcome::Accepted);
+            }
+            Next::GivenBack => return Ok(Outcome::NotInTolerance),
+        };
+        let outcome = making::run(&making::Arguments {
+            rehearsal: false,
+            recipe,
+            cell: arguments.cell.clone(),
+            part: Some(taken.lease.serial.clone()),
+            operator: arguments.operator.clone(),
+            runs: arguments.runs.clone(),
+            loaded: false,
+            seed: arguments.seed,
+            serve: None,
+            plant: Some(arguments.plant.clone()),
+            work: Some(taken),
+            truth: None,
+            json: arguments.json,
+        })?;
+        // After any other result a person must act before the next blank is ground.
+        if outcome != Outcome::Accepted || arguments.once {
+            return Ok(outcome);
+        }
+    }
+}
+
+/// Answer of the queue for the cell.
+enum Next {
+    /// Confirmed part, and the path of its recipe.
+    Part(PathBuf, Box<ConfirmedPart>),
+    /// Part that nobody at the cell confirmed.
+    GivenBack,
+    None,
+}
+
+/// Takes the next part and requests its confirmation.
+async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
+    let link = plant::open(config).await?;
+    nothing_is_open(&link, &arguments.runs).await?;
+    let Some(lease) = Lease::acquire(&link).await? else { return Ok(Next::None) };
+    let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
+        Ok(pulled) => pulled,
+        Err(error) => {
+            // Another cell can know the person who signed the recipe.
+            lease.hand_back(&link, &error.to_string()).await?;
+            return Err(error.into());
+        }
+    };
+    let path = keep(&arguments.runs, &lease.recipe_sha256, &recipe)?;
+    let read = match check::or_show(Recipe::read(&path)) {
+        Ok(read) => read,
+        Err(error) => {
+            lease.hand_back(&link, "its recipe is not as it should be for this cell's program").await?;
+            return Err(error);
+        }
+    };
+    let PlantRecipe { name, version, .. } = &recipe;
+    let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
+    let told = format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
+    super::print(&regrind::document::visible(&told))?;
+    match confirmed(&link, &lease, &read, arguments).await? {
+        true => Ok(Next::Part(path, Box::new(ConfirmedPart { config: config.clone(), lease }))),
+        false => {
+            lease.hand_back(&link, "nobody at the cell confirmed it").await?;
+            super::print("it is given back\n")?;
+            Ok(Next::GivenBack)
+        }
+    }
+}
+
+/// Returns true if a person at the cell confirms the part, or if the recipe needs no confirmation. Renews the lease
+/// while it waits.
+async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
+    if let Some(serial) = &arguments.part {
+        return Ok(*serial == lease.serial);
+    }
+    if !recipe.cycle.confirm_work {
+        return Ok(true);
+    }
+    super::print("  type or scan its serial number to begin it, anything else gives it back: ")?;
+    let mut answer = tokio::task::spawn_blocking(recover::answer);
+    loop {
+        tokio::select! {
+            typed = &mut answer => return Ok(typed.map_err(|error| Failure::Terminal(error.into()))?? == lease.serial),
+            () = tokio::time::sleep(LEASE / 3) => match lease.renew(link).await {
+                // The plant decides when the part begins. A network fault in the meantime does not decide anything.
+                Err(error) if error.may_pass() => {}
+                renewed => renewed?,
+            },
+        }
+    }
+}
+
+/// Returns an error if a part that began here has not ended. No further part is taken then.
+async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
+    for begun in StartedPart::all(link).await? {
+        let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
+        let nothing = match run_progress(&folder) {
+            // The end of the run is still on its way to the plant.
+            RunProgress::Over => continue,
+            RunProgress::UnderWay => {
+                let why = format!(
+                    "run {run} of {serial} is not over: regrind resume {}; where that is refused: regrind work --give-up {serial} --why \"...\"",
+                    folder.display()
+                );
+                return Err(Failure::OpenWork { why });
+            }
+            RunProgress::Nowhere => {
+                format!("of which there is no record in {}; look whether anything was ground: if not", runs.display())
+            }
+            RunProgress::Begun => "in which nothing was asked of a machine".to_owned(),
+        };
+        let why = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
+        return Err(Failure::OpenWork { why });
+    }
+    Ok(())
+}
+
+/// Returns a part without a run to the queue, or gives it up for the reason in `up`.
+async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
+    let link = plant::open(config).await?;
+    let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
+    let Some(begun) = begun else {
+        super::print(&format!("{serial} is not begun by this cell\n"))?;
+        return Ok(Outcome::NotInTolerance);
+    };
+    let (run, folder) = (&begun.run, runs.join(&begun.run));
+    let refused = |why: String| Err(Failure::OpenWork { why });
+    if is_live(&folder) {
+        return refused(format!("run {run} of {serial} is on; regrind stop ends it"));
+    }
+    if let Some(why) = up {
+        begun.give_up(&link, why).await?;
+        super::print(&format!("{serial} is given up; it is made again where a planner queues it\n"))?;
+        return Ok(Outcome::Accepted);
+    }
+    if matches!(run_progress(&folder), RunProgress::UnderWay | RunProgress::Over) {
+        return refused(format!(
+            "run {run} of {serial} is here: regrind resume goes on with it, regrind work --give-up ends it"
+        ));
+    }
+    begun.give_back(&link, "nothing came of its run").await?;
+    super::print(&format!("{serial} is given back to the queue\n"))?;
+    Ok(Outcome::Accepted)
+}
+
+/// Progress of a run, by its record.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum RunProgress {
+    /// Run without a record.
+    Nowhere,
+    /// Run that began, but sent nothing to a machine.
+    Begun,
+    /// Run that sent a request to a machine.
+    UnderWay,
+    /// Run with a recorded end.
+    Over,
+}
+
+/// Returns the progress of a run. An unreadable run counts as one that sent a request to a machine.
+fn run_progress(folder: &Path) -> RunProgress {
+    // To look makes no journal where there is none.
+    let Ok(reader) = Reader::open(folder) else {
+        return if folder.join(DATABASE).exists() { RunProgress::UnderWay } else { RunProgress::Nowhere };
+    };
+    let mut far = RunProgress::Nowhere;
+    for record in reader.records(0) {
+        far = match record.map(|record| record.kind) {
+            Ok(Kind::End) => return RunProgress::Over,
+            Ok(Kind::Intent | Kind::Event) | Err(_) => RunProgress::UnderWay,
+            Ok(_) if far == RunProgress::Nowhere => RunProgress::Begun,
+            Ok(_) => far,
+        };
+    }
+    far
+}
+
+/// Stores a downloaded recipe and its files in a folder named by its hash. Returns the path of the recipe.
+fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Failure> {
+    let folder = runs.join(RECIPES).join(sha256);
+    let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
+    let name: String = recipe.name.chars().map(plain).collect();
+    let path = folder.join(format!("{}.toml", name.trim_start_matches('.')));
+    write(&path, recipe.text.as_bytes())?;
+    for (name, content) in &recipe.files {
+        let inside = Path::new(name);
+        if !plant::is_below(inside) {
+            let what = format!(
+                "{} names the file {name:?}, which would lie outside of its folder; bring it anew",
+                recipe.name
+            );
+            return Err(PlantError::Recipe(what).into());
+        }
+        write(&folder.join(inside), content)?;
+    }
+    Ok(path)
+}
+
+fn write(path: &Path, content: &[u8]) -> Result<(), Failure> {
+    // A file with equal content was verified before. Any other file is overwritten.
+    if fs::read(path).is_ok_and(|there| there == content) {
+        return Ok(());
+    }
+    ResultFolder::prepare(path.parent().unwrap_or(Path::new("")))?.keep();
+    Ok(write_atomic(path, content)?)
+}

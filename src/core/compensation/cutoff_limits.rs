@@ -1,0 +1,126 @@
+//! Limits of the waves that can be corrected: distance of the points, contact width of the wheel, and the cut-off
+//! that both require.
+
+use rayon::prelude::*;
+
+use super::MapError;
+use crate::geometry::DeviationSample;
+
+/// Number of readings whose neighbours are searched for the spacing; more would not change a median.
+const PROBED: usize = 50;
+/// Share of the spacing on a square grid of as many readings; readings nearer to each other are repeats of one place.
+const SAME_PLACE: f64 = 0.02;
+
+/// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
+///
+/// `wheel_radius_mm` (R) is the radius of the section across which the width is measured, `depth_mm` (a) the depth of
+/// cut. The wheel averages within that width, so no shorter wave can be ground in.
+pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
+    let depth_mm = depth_mm.clamp(0.0, wheel_radius_mm.max(0.0));
+    2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
+}
+
+/// Checks a cut-off against twice the larger of contact width and distance of the points: a shorter wave is either
+/// not resolved by the points or cannot be ground by the wheel.
+///
+/// # Errors
+/// A cut-off below this limit, with its cause and the remedy.
+pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
+    let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
+    // 10 % is the uncertainty of an estimated spacing.
+    if cutoff_mm >= 0.9 * least_mm {
+        return Ok(());
+    }
+    Err(if contact_width_mm > point_spacing_mm {
+        MapError::CutoffBelowContact { cutoff_mm, min_mm: least_mm, contact_width_mm }
+    } else {
+        MapError::CutoffBelowSpacing { cutoff_mm, min_mm: least_mm, point_spacing_mm }
+    })
+}
+
+/// Estimates the distance between neighbouring readings in millimetres, in the direction in which it is larger.
+///
+/// Around a reading the nearest other place is searched in each of four sectors, about +x, -x, +y and -y. The median
+/// over readings is computed for x and y separately: rows that are dense along and sparse across give the distance
+/// across. Repeated readings of a place count as one place. Returns 0 if there are too few readings for an estimate.
+pub fn point_spacing_mm(readings: &[DeviationSample]) -> f64 {
+    let [x, y] = point_spacings_mm(readings);
+    x.max(y)
+}
+
+/// Returns the distance between neighbouring readings along x and along y, in millimetres.
+pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
+    let step = readings.len().div_ceil(PROBED).max(1);
+    let chosen: Vec<&DeviationSample> = readings.iter().step_by(step).collect();
+    let same_mm = SAME_PLACE * square_spacing_mm(readings);
+    let nearest: Vec<[f64; 4]> =
+        chosen.par_iter().map(|from| nearest_by_sector(from.place_mm, readings, same_mm)).collect();
+    let median = |sectors: [usize; 2]| {
+        let mut found: Vec<f64> =
+            nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite()).collect();
+        found.sort_by(f64::total_cmp);
+        found.get(found.len() / 2).copied().unwrap_or(0.0)
+    };
+    [median([0, 1]), median([2, 3])]
+}
+
+/// Returns the spacing that the same number of readings would have on a square grid over the same box.
+fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
+    let [width, depth] = [0, 1].map(|axis| {
+        let along = readings.iter().map(|r| r.place_mm[axis]);
+        along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min)
+    });
+    (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
+}
+
+/// Returns the distances of the nearest other places about +x, -x, +y and -y; infinite where none exists.
+fn nearest_by_sector([x, y]: [f64; 2], readings: &[DeviationSample], same_mm: f64) -> [f64; 4] {
+    let mut nearest2 = [f64::INFINITY; 4];
+    for r in readings {
+        let (dx, dy) = (r.place_mm[0] - x, r.place_mm[1] - y);
+        let sector = if dx.abs() >= dy.abs() { usize::from(dx < 0.0) } else { 2 + usize::from(dy < 0.0) };
+        let distance2 = dx * dx + dy * dy;
+        if distance2 > same_mm * same_mm && distance2 < nearest2[sector] {
+            nearest2[sector] = distance2;
+        }
+    }
+    nearest2.map(f64::sqrt)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: usize, rows: usize, step_mm: [f64; 2]) -> Vec<DeviationSample> {
+        let place = |k: usize| [(k % columns) as f64 * step_mm[0], (k / columns) as f64 * step_mm[1]];
+        (0..columns * rows).map(|k| DeviationSample { place_mm: place(k), deviation_mm: 0.0 }).collect()
+    }
+
+    #[test]
+    fn the_contact_of_a_wheel_is_its_chord() {
+        // 20 um deep with 12.5 mm: half the chord is sqrt(12.5^2 - 12.48^2).
+        assert!((contact_width_mm(12.5, 0.02) - 2.0 * (12.5f64.powi(2) - 12.48f64.powi(2)).sqrt()).abs() < 1e-12);
+        assert_eq!((contact_width_mm(12.5, 0.0), contact_width_mm(0.0, 1.0)), (0.0, 0.0));
+    }
+
+    #[test]
+    fn the_spacing_is_that_of_the_sparser_direction() {
+        let found = point_spacing_mm(&grid(60, 30, [102.0 / 59.0, 62.0 / 29.0]));
+        assert!((found - 62.0 / 29.0).abs() < 1e-12, "{found}");
+        assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
+        assert_eq!(point_spacing_mm(&grid(1, 1, [1.0, 1.0])), 0.0);
+        assert_eq!(point_spacing_mm(&[]), 0.0);
+        let again = |r: DeviationSample| [0.0, 0.3, 0.6].map(|beside| DeviationSample { place_mm: r.place_mm.map(|x| x + beside), ..r });
+        let thrice: Vec<DeviationSample> = grid(20, 20, [260.0, 260.0]).into_iter().flat_map(again).collect();
+        assert!((point_spacing_mm(&thrice) - 260.0).abs() < 1.0, "{}", point_spacing_mm(&thrice));
+    }
+
+    #[test]
+    fn the_cutoff_must_suit_wheel_and_points() {
+        let contact = contact_width_mm(12.5, 0.02);
+        assert!(check_cutoff(5.0, contact, 2.14).is_ok());
+        let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
+        assert_eq!(least_mm, 4.28);
+        assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
+    }
+}

@@ -1,0 +1,522 @@
+//! Repeatable error that other machines learned for a recipe, as a prior for a machine that has not ground it yet.
+//!
+//! The repeatable error on machine j is R_j = C + D_j: C is common to all machines that grind the same recipe, D_j is
+//! the machine's own. Passes on K machines give means m_j of R_j with variances v_j. Each band of wavelengths is
+//! separate. With P for the power of R, the mean over the machines of |m_j|^2 - v_j, and k for the share of P that is
+//! the machine's own,
+//!
+//! ```text
+//!  t = k P      c = (1 - k) P      w_j = 1 / (t + v_j)
+//!  C^ = c sum(w m) / (1 + c sum w)           q = t + c / (1 + c sum w)
+//! ```
+//!
+//! are the best linear prediction of the repeatable error on a machine that has not ground the recipe, and its
+//! variance (random effects: Henderson 1975, Robinson 1991). With k = 1 the prediction is 0. With k = 0 and one
+//! machine it is that machine's own mean times Wiener's share.
+//!
+//! **Machine similarity** is estimated from recipes that two machines have both ground: |m_1 - m_2|^2 - v_1 - v_2 is
+//! 2 t of that recipe. The n comparisons give a mean of k. The next machine can differ by more, so this mean is
+//! widened by 1 + 1/n. If comparisons with this machine itself give a larger k, theirs counts. If all bands of a
+//! comparison together give a larger k than one band, it counts too, since in one band a few waves can agree by
+//! chance. Without any comparison the similarity of machines is unknown, and nothing is taken over. Nor is anything
+//! taken over from machines that have more of their own than in common.
+//!
+//! **Own evidence prevails.** The prior from other machines weighs as one own pass at most, so it is never narrower.
+//! Its remaining share of a mean is stored with the mean: a machine passes on only what its own passes showed.
+//! Otherwise the finding of one machine would come back as that of all.
+
+use super::learning::{Band, VALUES_PER_INDEPENDENT_VALUE, ResampledError, LearningState, MeanError, RESPONSE_LIMITS};
+use crate::geometry::Grid;
+
+/// Minimum variance of the mean over that of N: that after one pass.
+const MIN_VARIANCE_RATIO: f64 = 1.0;
+/// Standard deviation of the response between machines, before any is known.
+const RESPONSE_SIGMA_BETWEEN_MACHINES: f64 = 0.05;
+/// Number of machines that [`RESPONSES_DIFFER`] weighs as.
+const PRIOR_MACHINES: f64 = 2.0;
+/// Maximum share of the power that is a machine's own; above it machines have next to nothing to share, and can agree
+/// by chance.
+const MAX_OWN_SHARE: f64 = 0.5;
+/// Maximum share of a mean that comes from other machines; above it the mean carries no information on its own
+/// machine.
+const MAX_BORROWED_SHARE: f64 = 0.5;
+/// Maximum repeatable error at any place, in millimetres.
+const MAX_MEAN_MM: f64 = 1.0;
+/// Maximum number of steps of a comparison.
+const MAX_STEPS: f64 = 1e9;
+/// Relative difference below which two bands begin at the same wavelength.
+const SAME: f64 = 1e-9;
+
+/// Estimate from comparisons of the share of the repeatable error that is a machine's own.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MachineSimilarity {
+    comparisons: Vec<Comparison>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Comparison {
+    /// True if the machine that is to begin is one of the two.
+    is_own: bool,
+    /// Shortest wavelength of each band, in millimetres, and the share of its power that is the machine's own; `None`
+    /// if it was not comparable.
+    shares: Vec<(f64, Option<f64>)>,
+    /// The same share for all bands together.
+    whole: f64,
+}
+
+/// Initial state of a machine that has not ground a recipe.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TransferredState {
+    /// State of the machine, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first
+    /// pass.
+    pub state: LearningState,
+    /// For each band taken over: its shortest wavelength, in millimetres, and the assumed rms share of the repeatable
+    /// error that is a machine's own.
+    pub own_shares: Vec<[f64; 2]>,
+}
+
+/// Observation of a band by one machine.
+struct BandEvidence {
+    values_mm: Vec<f64>,
+    mean_mm2: f64,
+    /// Variance of the mean.
+    variance_mm2: f64,
+    /// Variance of the non-repeatable error of a pass.
+    noise_mm2: f64,
+}
+
+impl MachineSimilarity {
+    /// Adds a person's statement: the rms share of the repeatable error that is a machine's own, in all wavelengths.
+    /// It weighs as one comparison.
+    pub fn add_statement(&mut self, rms_share: f64) {
+        let share = rms_share * rms_share;
+        self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
+    }
+
+    /// Compares the states of two machines for one recipe, in any order, and returns true if they are comparable;
+    /// `is_own` is true if one of them is the machine that is to begin.
+    pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
+        let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
+        if !has_same_bands(one, other) {
+            return false;
+        }
+        let [ones, others] = [one, other].map(|known| band_evidence(known, &grid));
+        let (mut shares, mut whole) = (Vec::new(), [0.0; 2]);
+        for ((band, a), b) in one.bands.iter().zip(ones).zip(others) {
+            let compared = a.zip(b).and_then(|(a, b)| own_and_power(&a, &b));
+            shares.push((band.from_mm, compared.map(|[own_mm2, power_mm2]| (own_mm2 / power_mm2).min(1.0))));
+            let [own_mm2, power_mm2] = compared.unwrap_or_default();
+            whole = [whole[0] + own_mm2, whole[1] + power_mm2];
+        }
+        let is_compared = shares.iter().any(|(_, share)| share.is_some());
+        if is_compared {
+            self.comparisons.push(Comparison { is_own, shares, whole: (whole[0] / whole[1]).min(1.0) });
+        }
+        is_compared
+    }
+
+    /// Returns the number of comparisons, including a statement.
+    pub fn comparisons(&self) -> usize {
+        self.comparisons.len()
+    }
+
+    /// Returns the share of the power of waves from a wavelength on that is a machine's own; `None` if no comparison
+    /// covers it.
+    pub fn own_share(&self, from_mm: f64) -> Option<f64> {
+        let all = self.expected_share(from_mm, |_| true)?;
+        Some(self.expected_share(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
+    }
+
+    fn expected_share(&self, from_mm: f64, counts: impl Fn(&Comparison) -> bool) -> Option<f64> {
+        let shares: Vec<f64> =
+            self.comparisons.iter().filter(|of| counts(of)).filter_map(|of| of.share(from_mm)).collect();
+        let n = shares.len() as f64;
+        (n > 0.0).then(|| (shares.iter().sum::<f64>() / n * (1.0 + 1.0 / n)).clamp(0.0, 1.0))
+    }
+}
+
+impl Comparison {
+    /// Returns the share in the band of this wavelength; the longest band of a smaller part contains all longer
+    /// waves.
+    fn share(&self, from_mm: f64) -> Option<f64> {
+        let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
+        share.map(|share| share.max(self.whole))
+    }
+}
+
+impl LearningState {
+    /// Returns why this state cannot seed, or be compared with, another machine's; `None` if it can.
+    ///
+    /// The state can be unfit even if [`LearningState::is_sound`] returns true.
+    pub fn transfer_obstacle(&self) -> Option<String> {
+        if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
+            return Some("a mean has no uncertainty".into());
+        }
+        let MeanError { grid, values_mm } = self.mean.as_ref()?;
+        let most_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+        if most_mm > MAX_MEAN_MM {
+            return Some(format!("a mean of {most_mm:.3e} mm, limit {MAX_MEAN_MM} mm"));
+        }
+        let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
+        let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
+        let why =
+            || format!("{columns} x {rows} nodes in {bands} bands make {steps:.0e} steps, limit {MAX_STEPS:.0e}");
+        (steps > MAX_STEPS).then(why)
+    }
+
+    /// Returns the initial state from the states of other machines for the same recipe, on the grid of the
+    /// correction, as far as machines are similar; `None` if no other state is usable. `self` is the state without
+    /// them.
+    #[must_use]
+    pub fn seeded_from(&self, others: &[&Self], alike: &MachineSimilarity, grid: Grid) -> Option<TransferredState> {
+        let others: Vec<&Self> =
+            others.iter().copied().filter(|other| other.mean.is_some() && has_same_bands(self, other)).collect();
+        if others.is_empty() {
+            return None;
+        }
+        let all: Vec<Vec<Option<BandEvidence>>> = others.iter().map(|other| band_evidence(other, &grid)).collect();
+        let mut known = self.clone();
+        let mut mean = MeanError { grid, values_mm: vec![0.0; grid.len()] };
+        let (mut differ, mut variance_mm2) = (Vec::new(), 0.0);
+        let on_grid = zero_error(grid);
+        for (k, band) in known.bands.iter_mut().enumerate() {
+            let of_band: Vec<&BandEvidence> = all.iter().filter_map(|of| of[k].as_ref()).collect();
+            let Some(share) = alike.own_share(band.from_mm).filter(|share| *share <= MAX_OWN_SHARE) else { continue };
+            let Some((values_mm, q)) = predicted(&of_band, share, grid.len()) else { continue };
+            let scatter_mm2 = of_band.iter().map(|of| of.noise_mm2).sum::<f64>() / of_band.len() as f64;
+            let counts = (VALUES_PER_INDEPENDENT_VALUE * band.independent(&on_grid)).recip();
+            band.scatter = [counts * scatter_mm2, counts];
+            band.belief = Some((q / scatter_mm2).max(MIN_VARIANCE_RATIO));
+            band.borrowed = 1.0;
+            variance_mm2 += q;
+            differ.push([band.from_mm, share.sqrt()]);
+            mean.values_mm.iter_mut().zip(values_mm).for_each(|(sum, value)| *sum += value);
+        }
+        if !differ.is_empty() {
+            // A state with only the means of others carries no information on its own machine.
+            let own = |of: &&Vec<Option<BandEvidence>>| of.iter().any(Option::is_some);
+            let tell: Vec<&Self> = others.iter().zip(&all).filter(|(_, of)| own(of)).map(|(other, _)| *other).collect();
+            known.response = response(&tell, self.response);
+            known.whole = whole(&known.whole, &tell, variance_mm2);
+            known.wanted_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
+            known.mean = Some(mean);
+        }
+        Some(TransferredState { state: known, own_shares: differ })
+    }
+}
+
+fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
+    let same = |(a, b): (&Band, &Band)| (a.from_mm - b.from_mm).abs() <= SAME * a.from_mm;
+    one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
+}
+
+/// Returns an error of 0 on all of a grid.
+fn zero_error(grid: Grid) -> ResampledError {
+    ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
+}
+
+/// Returns what the passes of a machine show of each band, on a grid; `None` if its variance is unknown, or if most
+/// of it comes from other machines.
+fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>> {
+    let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
+    let on_grid = zero_error(*grid);
+    let parts = known.split_bands(&on_grid, mean.grid.resample(&mean.values_mm, grid));
+    let of_band = |(band, values_mm): (&Band, Vec<f64>)| {
+        let (belief, scatter_mm2) = band.belief.zip(band.noise_mm2())?;
+        let is_told = scatter_mm2 > 0.0 && band.borrowed <= MAX_BORROWED_SHARE;
+        // The machine's own part of the mean is what remains without the borrowed share, so its variance is larger.
+        let variance_mm2 = belief * scatter_mm2 / (1.0 - band.borrowed).powi(2);
+        let mean_mm2 = on_grid.mean_square(&values_mm);
+        is_told.then_some(BandEvidence { values_mm, mean_mm2, variance_mm2, noise_mm2: scatter_mm2 })
+    };
+    known.bands.iter().zip(parts).map(of_band).collect()
+}
+
+/// Returns the power in a band that is the machine's own, and all of its power; `None` if no power exceeds the noise.
+fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
+    let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
+    let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
+    let apart_mm2 = apart / a.values_mm.len().max(1) as f64;
+    let own_mm2 = 0.5 * (apart_mm2 - a.variance_mm2 - b.variance_mm2).max(0.0);
+    (power_mm2 > 0.0).then_some([own_mm2, power_mm2])
+}
+
+/// Returns the predicted repeatable error in a band on a machine that has not ground the recipe, and its variance;
+/// `None` if there is no common part.
+fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option<(Vec<f64>, f64)> {
+    let power = machines.iter().map(|of| of.mean_mm2 - of.variance_mm2).sum::<f64>() / machines.len().max(1) as f64;
+    let (own, common) = (own_share * power, (1.0 - own_share) * power);
+    if common.is_nan() || common <= 0.0 {
+        return None;
+    }
+    let weights: Vec<f64> = machines.iter().map(|of| 1.0 / (own + of.variance_mm2)).collect();
+    let rest = 1.0 + common * weights.iter().sum::<f64>();
+    let mut values_mm = vec![0.0; nodes];
+    for (of, weight) in machines.iter().zip(&weights) {
+        values_mm.iter_mut().zip(&of.values_mm).for_each(|(sum, value)| *sum += common * weight / rest * value);
+    }
+    Some((values_mm, own + common / rest))
+}
+
+/// Returns the band of all wavelengths together, with the non-repeatable error of the others unless it has its own.
+fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
+    let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
+    let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
+    let scatter = if own.noise_mm2().is_some() || of_others.is_empty() {
+        own.scatter
+    } else {
+        let counts = VALUES_PER_INDEPENDENT_VALUE.recip();
+        [counts * others_mm2, counts]
+    };
+    let with = Band { scatter, ..*own };
+    let belief = with.noise_mm2().filter(|n2| *n2 > 0.0).map(|n2| (variance_mm2 / n2).max(MIN_VARIANCE_RATIO));
+    Band { belief, borrowed: 1.0, ..with }
+}
+
+/// Returns the expected response and its standard uncertainty, from the responses of the others, as far as machines
+/// differ in it, and from the earlier estimate.
+fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
+    let n = others.len() as f64;
+    let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;
+    let squares: f64 = others.iter().map(|other| (other.response[0] - mean).powi(2)).sum();
+    let between = (PRIOR_MACHINES * RESPONSE_SIGMA_BETWEEN_MACHINES.powi(2) + squares) / (PRIOR_MACHINES + n - 1.0);
+    let each = others.iter().map(|other| other.response[1].powi(2)).sum::<f64>() / n;
+    let [w, v] = [sigma * sigma, between * (1.0 + 1.0 / n) + each / n].map(f64::recip);
+    let [least, most] = RESPONSE_LIMITS;
+    [((w * before + v * mean) / (w + v)).clamp(least, most), (w + v).sqrt().recip()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::{Correction, ErrorMap, GainRule, MapOptions, PassObservation};
+
+    const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+
+    fn fresh(rule: GainRule) -> LearningState {
+        LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None)
+    }
+
+    /// Returns pseudo-random values of power 1 that are the same for the same seed.
+    fn field(seed: u64) -> Vec<f64> {
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(1);
+        let mut next = || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        (0..GRID.len()).map(|_| 12f64.sqrt() * next()).collect()
+    }
+
+    /// Returns the state of a machine with this mean, variance ratio of the mean and noise variance.
+    fn machine(rule: GainRule, values_mm: Vec<f64>, [belief, scatter_mm2]: [f64; 2]) -> LearningState {
+        let mut known = fresh(rule);
+        for band in known.bands.iter_mut().chain([&mut known.whole]) {
+            (band.belief, band.scatter) = (Some(belief), [3.0 * scatter_mm2, 3.0]);
+        }
+        known.mean = Some(MeanError { grid: GRID, values_mm });
+        known
+    }
+
+    fn similarity_of(rms_share: f64) -> MachineSimilarity {
+        let mut alike = MachineSimilarity::default();
+        alike.add_statement(rms_share);
+        alike
+    }
+
+    fn sum(parts: &[(f64, &[f64])]) -> Vec<f64> {
+        (0..GRID.len()).map(|k| parts.iter().map(|(factor, of)| factor * of[k]).sum()).collect()
+    }
+
+    fn power(values: &[f64]) -> f64 {
+        values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64
+    }
+
+    #[test]
+    fn of_two_machines_it_is_what_is_worked_out_by_hand() {
+        // One band; means of a power of 5 and 5, v = 0.5 * 2 = 1: P = 4. A share of 0.25, twice (one comparison):
+        // k = 0.5, t = c = 2, w = 1/3, 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
+        let flat = |value: f64| machine(GainRule::Adaptive, vec![value; GRID.len()], [0.5, 2.0]);
+        let (one, two) = (flat(5f64.sqrt()), flat(-(5f64.sqrt())));
+        let begun =
+            |others: &[&LearningState]| fresh(GainRule::Adaptive).seeded_from(others, &similarity_of(0.5), GRID).unwrap();
+        let TransferredState { state: known, own_shares: differ } = begun(&[&one, &one]);
+        let values = &known.mean.as_ref().unwrap().values_mm;
+        assert!(values.iter().all(|v| (v - 4.0 / 7.0 * 5f64.sqrt()).abs() < 1e-12), "{}", values[0]);
+        assert!((known.bands[0].belief.unwrap() - 10.0 / 7.0).abs() < 1e-12, "{:?}", known.bands);
+        assert!((differ[0][1] - 0.5f64.sqrt()).abs() < 1e-12 && known.is_valid());
+        for (wanted, r) in known.next_correction_mm().unwrap().iter().zip(values) {
+            assert_eq!(*wanted, -r / known.response()[0]);
+        }
+        // Two machines that contradict each other.
+        assert!(power(&begun(&[&one, &two]).state.mean.unwrap().values_mm) < 1e-24);
+    }
+
+    #[test]
+    fn machines_that_have_nothing_in_common_teach_nothing_and_machines_that_are_alike_all() {
+        for rule in [GainRule::Adaptive, GainRule::Wavelength] {
+            let other = machine(rule, field(1), [0.5, 1e-9]);
+            let begun = |alike: &MachineSimilarity| fresh(rule).seeded_from(&[&other], alike, GRID).unwrap();
+            for unlike in [similarity_of(1.0), similarity_of(0.51), MachineSimilarity::default()] {
+                let TransferredState { state: known, own_shares: differ } = begun(&unlike);
+                assert!(differ.is_empty() && known == fresh(rule));
+            }
+            let TransferredState { state: known, own_shares: differ } = begun(&similarity_of(0.0));
+            assert_eq!(differ.len(), known.bands.len());
+            for (a, b) in known.mean.unwrap().values_mm.iter().zip(field(1)) {
+                assert!((a - b).abs() < 1e-6, "{a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn how_much_machines_differ_is_found_again() {
+        let (common, rule) = (field(7), GainRule::Wavelength);
+        for share in [0.0, 0.01, 0.1, 0.5, 1.0f64] {
+            let mut alike = MachineSimilarity::default();
+            for pair in 0..20 {
+                let of = |seed: u64| {
+                    let (own, noise) = (field(seed), field(seed + 1000));
+                    sum(&[((1.0 - share).sqrt(), &common), (share.sqrt(), &own), (0.05, &noise)])
+                };
+                // A noise of 0.05 in all, divided between the bands as white noise is.
+                let machines = [100 + 2 * pair, 101 + 2 * pair].map(|seed| {
+                    let mut known = machine(rule, of(seed), [1.0, 1.0]);
+                    let noise = known.split_bands(&zero_error(GRID), sum(&[(0.05, &field(seed + 1000))]));
+                    for (band, noise) in known.bands.iter_mut().zip(noise) {
+                        band.scatter = [power(&noise), 1.0];
+                    }
+                    known
+                });
+                assert!(alike.compare([&machines[0], &machines[1]], pair == 0));
+            }
+            let all = alike.expected_share(2.5, |_| true).unwrap();
+            assert!((all / 1.05 - share).abs() < 0.03 + 0.05 * share || all == 1.0 && share == 1.0, "{share}: {all}");
+            // The single comparison with this machine itself is widened more.
+            assert!(alike.own_share(2.5).unwrap() >= all);
+        }
+    }
+
+    #[test]
+    fn the_order_of_machines_does_not_matter() {
+        let rule = GainRule::Wavelength;
+        let machines: Vec<_> =
+            (0..4).map(|k| machine(rule, field(k), [0.3 + 0.2 * k as f64, 1e-2 * (k + 1) as f64])).collect();
+        let of = |order: [usize; 4]| {
+            let others: Vec<&LearningState> = order.iter().map(|k| &machines[*k]).collect();
+            let TransferredState { state: known, own_shares: differ } = fresh(rule).seeded_from(&others, &similarity_of(0.5), GRID).unwrap();
+            (known.mean.unwrap().values_mm, known.bands, known.response, differ)
+        };
+        let (values, bands, response, differ) = of([0, 1, 2, 3]);
+        let turned = of([3, 1, 0, 2]);
+        assert!(values.iter().zip(&turned.0).all(|(a, b)| (a - b).abs() < 1e-12));
+        assert!((response[0] - turned.2[0]).abs() < 1e-15 && differ == turned.3);
+        for (a, b) in bands.iter().zip(&turned.1) {
+            assert!((a.belief.unwrap() / b.belief.unwrap() - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn own_passes_soon_outweigh_what_others_taught() {
+        // However certain the others are.
+        let rule = GainRule::Adaptive;
+        let other = machine(rule, vec![5.0; GRID.len()], [0.02, 1e-4]);
+        let mut known = fresh(rule).seeded_from(&[&other], &similarity_of(0.01), GRID).unwrap().state;
+        let mut alone = fresh(rule);
+        let none = Correction::zero(GRID, 0.0);
+        for pass in 1..=8 {
+            let values = field(40 + pass).iter().map(|noise| 4.98 + 0.01 * noise).collect();
+            let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
+            let seen = PassObservation { correction: &none, error: &error, response: None, explained: None };
+            (known, alone) = (known.updated(&seen), alone.updated(&seen));
+            let [of, without] = [&known, &alone].map(|of| of.bands[0].belief.unwrap());
+            assert!(of <= without + 1e-12, "pass {pass}: {of} against {without}");
+        }
+        let [with, without] = [&known, &alone].map(|of| of.gains()[0][1]);
+        assert!((with / without - 1.0).abs() < 0.15, "{with} against {without}");
+        assert!(known.bands[0].borrowed < 0.15, "{}", known.bands[0].borrowed);
+        assert!((known.mean.as_ref().unwrap().values_mm[0] - 4.98).abs() < 0.01);
+    }
+
+    #[test]
+    fn what_a_machine_was_told_is_not_its_own_word() {
+        let rule = GainRule::Adaptive;
+        let (one, mut told) = (machine(rule, field(1), [0.1, 1e-3]), machine(rule, field(1), [0.1, 1e-3]));
+        told.bands[0].borrowed = 0.9;
+        let mut alike = MachineSimilarity::default();
+        assert!(!alike.compare([&one, &told], true) && alike.comparisons() == 0);
+        let shared = fresh(rule).seeded_from(&[&told], &similarity_of(0.1), GRID).unwrap();
+        assert!(shared.own_shares.is_empty());
+    }
+
+    #[test]
+    fn other_grids_are_taken_and_other_bands_left_alone() {
+        let (rule, wave) = (GainRule::Wavelength, |[x, y]: [f64; 2]| (0.2 * x).sin() + 0.05 * y);
+        let on = |grid: Grid| (0..grid.len()).map(|k| wave(grid.place_mm(k))).collect::<Vec<f64>>();
+        let finer = Grid { columns: 81, rows: 61, spacing_mm: [0.5, 0.5], ..GRID };
+        let mut other = machine(rule, on(GRID), [0.1, 1e-6]);
+        other.mean = Some(MeanError { grid: finer, values_mm: on(finer) });
+        let shared = fresh(rule).seeded_from(&[&other], &similarity_of(0.05), GRID).unwrap();
+        for (a, b) in shared.state.mean.unwrap().values_mm.iter().zip(on(GRID)) {
+            assert!((a - b).abs() < 0.02 * b.abs() + 0.01, "{a} {b}");
+        }
+        let mut alike = MachineSimilarity::default();
+        assert!(alike.compare([&machine(rule, on(GRID), [0.1, 1e-6]), &other], false));
+        assert!(alike.own_share(2.5).unwrap() < 1e-3, "{alike:?}");
+        // Bands of another cut-off, a machine that has ground nothing, no machine at all.
+        let coarse = LearningState::new(rule, &MapOptions::new(4.0, 1.0), [40.0, 30.0], None);
+        assert!(coarse.seeded_from(&[&other], &similarity_of(0.05), GRID).is_none());
+        assert!(fresh(rule).seeded_from(&[&fresh(rule)], &similarity_of(0.05), GRID).is_none());
+        assert!(fresh(rule).seeded_from(&[], &similarity_of(0.05), GRID).is_none());
+        assert!(!alike.compare([&coarse, &other], false) && !alike.compare([&other, &coarse], false));
+    }
+
+    #[test]
+    fn what_would_cost_more_than_it_tells_is_not_taught() {
+        let honest = machine(GainRule::Wavelength, field(1).iter().map(|v| 1e-3 * v).collect(), [0.3, 1e-8]);
+        assert_eq!(honest.transfer_obstacle(), None);
+        assert_eq!(fresh(GainRule::Wavelength).transfer_obstacle(), None);
+        let mut certain = honest.clone();
+        certain.bands[0].belief = Some(0.0);
+        let mut huge = honest.clone();
+        huge.mean.as_mut().unwrap().values_mm[7] = 1e200;
+        let mut long = honest.clone();
+        let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
+        long.mean = Some(MeanError { grid, values_mm: vec![0.0; grid.len()] });
+        for (state, why) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
+            assert!(state.is_valid() && state.transfer_obstacle().unwrap().contains(why), "{:?}", state.transfer_obstacle());
+        }
+    }
+
+    #[test]
+    fn a_response_that_was_told_is_not_told_again() {
+        let rule = GainRule::Fixed(1.0);
+        let values: Vec<f64> = field(3).iter().map(|v| 1e-3 * v).collect();
+        let mut own = machine(rule, values.clone(), [0.3, 1e-8]);
+        own.response = [0.9, 0.02];
+        let mut borrowed = own.clone();
+        borrowed.bands.iter_mut().for_each(|band| band.borrowed = 0.9);
+        let begun =
+            |others: &[&LearningState]| fresh(rule).seeded_from(others, &similarity_of(0.1), GRID).unwrap().state.response;
+        assert_eq!(begun(&[&own, &borrowed, &borrowed]), begun(&[&own]));
+    }
+
+    #[test]
+    fn waves_that_nobody_compared_are_not_taken_over() {
+        let compared = |is_own, share, whole| Comparison { is_own, shares: vec![(5.0, Some(share))], whole };
+        let mut alike = MachineSimilarity { comparisons: vec![compared(false, 0.02, 0.01)] };
+        assert_eq!(alike.own_share(2.5), None);
+        // The longest band contains all longer waves, but no band replaces one that was not comparable.
+        assert_eq!(alike.own_share(20.0), Some(0.04));
+        let shares = vec![(5.0, Some(0.02)), (10.0, None)];
+        let short = MachineSimilarity { comparisons: vec![Comparison { is_own: false, shares, whole: 0.01 }] };
+        assert_eq!([5.0, 10.0, 20.0].map(|from_mm| short.own_share(from_mm)), [Some(0.04), None, None]);
+        // This machine differs from the others by more than they differ from each other.
+        alike.comparisons.push(compared(true, 0.3, 0.1));
+        assert_eq!(alike.own_share(5.0), Some(0.6));
+        // A machine that differs as a whole differs in every band, even if a few waves agree.
+        alike.comparisons.push(compared(true, 0.0, 0.4));
+        assert!((alike.own_share(5.0).unwrap() - 0.35 * 1.5).abs() < 1e-12);
+    }
+}

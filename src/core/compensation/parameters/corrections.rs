@@ -1,0 +1,169 @@
+//! Parameter corrections of the next pass, and their effect on the map.
+
+use nalgebra::{Matrix6, Vector6};
+use serde::{Deserialize, Serialize};
+
+use super::columns::{Extent, motion_effect, slide_effect};
+use super::{SurfacePoint, ColumnFit, MIN_NZ, ParameterKind, ParameterOptions, WheelTerm, estimate_parameters};
+use crate::compensation::path::{HeightField, Jet};
+use crate::geometry::{Grid, Point, Vector};
+
+/// Minimum eigenvalue of a direction of the motions, as a share of the largest; a direction with less is ignored.
+const MIN_EIGENVALUE_SHARE: f64 = 1e-9;
+
+/// Part of the deviations that parameters and slides explain together, as a function of the place.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExplainedDeviation {
+    extent: Extent,
+    term: WheelTerm,
+    slides: Vec<f64>,
+    parameters: Vec<f64>,
+    motion: AbsorbedMotion,
+}
+
+impl ExplainedDeviation {
+    pub(super) fn new(contacts: &[SurfacePoint], extent: &Extent, options: &ParameterOptions, fitted: &ColumnFit) -> Self {
+        let believed = fitted.joint_expectation(options);
+        let (slides, parameters) = believed.as_slice().split_at(fitted.slides);
+        let none = AbsorbedMotion([0.0; 6]);
+        let (slides, parameters) = (slides.to_vec(), estimate_parameters.to_vec());
+        let whole = Self { extent: *extent, term: options.wheel_term, slides, estimate_parameters, motion: none };
+        let motion = AbsorbedMotion::fit(contacts, options.free_motions, |c| whole.deviation_with_motion_mm(c));
+        Self { motion, ..whole }
+    }
+
+    fn deviation_with_motion_mm(&self, contact: &SurfacePoint) -> f64 {
+        let slides = self.slides.iter().enumerate().map(|(k, value)| value * slide_effect(contact, &self.extent, k));
+        let parameters = ParameterKind::ALL.into_iter().zip(&self.parameters);
+        slides.sum::<f64>() + estimate_parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
+    }
+
+    /// Returns the part of the deviation at a contact that parameters and slides explain, after shrinkage and without
+    /// the motion of the part that it contains, in millimetres.
+    pub fn at(&self, contact: &SurfacePoint) -> f64 {
+        self.deviation_with_motion_mm(contact) - self.motion.at(contact)
+    }
+}
+
+/// Returns the part of values at the nodes of a correction that parameters and slides explain, estimated at the
+/// places where the part was measured; 0 everywhere if it cannot be estimated.
+///
+/// Shapes: `values_mm` at the nodes of `grid`; `contacts` where the part was measured; `nodes` the places of the
+/// surface under the nodes. The result is at the same nodes.
+pub fn explained_by_parameters(
+    values_mm: &[f64],
+    grid: &Grid,
+    [contacts, nodes]: [&[SurfacePoint]; 2],
+    options: &ParameterOptions,
+) -> Vec<f64> {
+    let on_part = |c: &SurfacePoint| SurfacePoint { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
+    let told = estimate_parameters(&contacts.iter().map(on_part).collect::<Vec<_>>(), None, options);
+    told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.explained.at(node)).collect())
+}
+
+/// Motion of the part that registration fits to a change of the surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct AbsorbedMotion([f64; 6]);
+
+impl AbsorbedMotion {
+    fn fit(contacts: &[SurfacePoint], free: [bool; 6], of: impl Fn(&SurfacePoint) -> f64) -> Self {
+        let row = |c: &SurfacePoint| Vector6::from_fn(|k, _| if free[k] { motion_effect(c, k) } else { 0.0 });
+        let gram: Matrix6<f64> = contacts.iter().map(|c| row(c) * row(c).transpose()).sum();
+        let towards: Vector6<f64> = contacts.iter().map(|c| row(c) * of(c)).sum();
+        // Turns and shifts have different units, so each is scaled to size 1.
+        let sizes = gram.diagonal().map(|v| if v > 0.0 { v.sqrt().recip() } else { 0.0 });
+        let parts = Matrix6::from_fn(|r, c| gram[(r, c)] * sizes[r] * sizes[c]).symmetric_eigen();
+        let towards = towards.component_mul(&sizes);
+        let least = MIN_EIGENVALUE_SHARE * parts.eigenvalues.max();
+        let mut motion = Vector6::zeros();
+        for (value, vector) in parts.eigenvalues.iter().zip(parts.eigenvectors.column_iter()) {
+            if *value > least {
+                motion += vector * (vector.dot(&towards) / value);
+            }
+        }
+        Self(motion.component_mul(&sizes).into())
+    }
+
+    fn at(&self, contact: &SurfacePoint) -> f64 {
+        self.0.iter().enumerate().map(|(k, value)| value * motion_effect(contact, k)).sum()
+    }
+}
+
+/// Parameter corrections of a pass. They are absolute: they replace those of the pass before.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ParameterCorrections {
+    /// Difference of each parameter from the value stated in the recipe, in its unit, in the order of
+    /// [`ParameterKind::ALL`].
+    pub values: [f64; ParameterKind::COUNT],
+    /// Number of the first pass that is ground with them.
+    pub since_cycle: u16,
+    /// Displacement of the surface along its normal by these corrections, at every node of the correction, in
+    /// millimetres.
+    pub displaced_mm: Vec<f64>,
+    /// Part of `displaced_mm` by setting and tilt: a grinder has an input for its wheel radius, but applies these
+    /// only by its map.
+    pub setting_mm: Vec<f64>,
+    /// Part of `displaced_mm` that remains after registration: a map without these corrections would have to contain
+    /// it.
+    pub seen_mm: Vec<f64>,
+}
+
+impl ParameterCorrections {
+    /// Returns the corrections that compensate these values from the pass `since_cycle` on; `None` if all values are
+    /// 0.
+    ///
+    /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the
+    /// correction. Units: millimetres, radians.
+    pub fn from_values(
+        values: [f64; ParameterKind::COUNT],
+        since_cycle: u16,
+        [contacts, nodes]: [&[SurfacePoint]; 2],
+        options: &ParameterOptions,
+    ) -> Option<Self> {
+        if values.iter().all(|value| *value == 0.0) {
+            return None;
+        }
+        let of = |c: &SurfacePoint, but: Option<ParameterKind>| {
+            let each = ParameterKind::ALL.into_iter().zip(values).filter(|(kind, _)| Some(*kind) != but);
+            -each.map(|(kind, value)| value * kind.effect(c, options.wheel_term)).sum::<f64>()
+        };
+        let motion = AbsorbedMotion::fit(contacts, options.free_motions, |c| of(c, None));
+        let displaced_mm: Vec<f64> = nodes.iter().map(|node| of(node, None)).collect();
+        let setting_mm = nodes.iter().map(|node| of(node, Some(ParameterKind::WheelRadius))).collect();
+        let seen_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
+        Some(Self { values, since_cycle, displaced_mm, setting_mm, seen_mm })
+    }
+
+    /// Returns the difference of a parameter from the value stated in the recipe.
+    pub fn value(&self, kind: ParameterKind) -> f64 {
+        ParameterKind::ALL.iter().position(|of| *of == kind).map_or(0.0, |k| self.values[k])
+    }
+
+    /// Returns true if every number is finite and each vector has one value per node.
+    pub fn is_valid(&self, nodes: usize) -> bool {
+        let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
+        self.values.iter().all(|v| v.is_finite())
+            && each.iter().all(|of| of.len() == nodes && of.iter().all(|v| v.is_finite()))
+    }
+}
+
+impl SurfacePoint {
+    /// Returns the places of a surface under the nodes of a grid; outside the known surface, the nearest known place.
+    pub fn under_nodes(surface: &HeightField, grid: &Grid) -> Vec<Self> {
+        let at = |k: usize| {
+            let [x, y] = grid.place_mm(k);
+            let Jet { value, slope: [p, q], .. } = surface.at([x, y]);
+            let normal = Vector::new(-p, -q, 1.0).normalize();
+            let is_known = value.is_finite() && normal.z >= MIN_NZ;
+            is_known.then_some(Self { point: Point::new(x, y, value), normal, deviation_mm: 0.0 })
+        };
+        let known: Vec<Option<Self>> = (0..grid.len()).map(at).collect();
+        let nearest = |k: usize| {
+            let [x, y] = grid.place_mm(k);
+            let far = |c: &&Self| (c.point.x - x).hypot(c.point.y - y);
+            known.iter().flatten().min_by(|a, b| far(a).total_cmp(&far(b))).copied()
+        };
+        let level = Self { point: Point::origin(), normal: Vector::z(), deviation_mm: 0.0 };
+        (0..grid.len()).map(|k| known[k].or_else(|| nearest(k)).unwrap_or(level)).collect()
+    }
+}

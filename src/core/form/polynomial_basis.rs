@@ -1,0 +1,300 @@
+//! Polynomial bases for the decomposition of form.
+
+use crate::geometry::{Aperture, DeviationSample};
+use crate::surface::analytic::{ZernikeNumbering, jacobi_values};
+
+use super::FormError;
+
+/// Maximum number of terms of a Legendre series: complete up to degree 13.
+const MAX_LEGENDRE_TERMS: usize = 105;
+/// Maximum number of terms of a Zernike series in Noll's and the ANSI numbering.
+const MAX_ZERNIKE_TERMS: usize = 105;
+
+/// Sequence of polynomials over x and y.
+///
+/// Frame: model. Units: millimetres. Each term has a mean square of 1 over its own domain, the full disc or rectangle.
+/// On another aperture, least squares over the points separates the terms ([`super::fit`]).
+#[derive(Clone, Debug, PartialEq)]
+pub enum PolynomialBasis {
+    /// Zernike polynomials, from the first index of the numbering on. Fringe terms have the same normalisation as the
+    /// others.
+    Zernike {
+        /// Numbering that assigns an index to each term.
+        numbering: ZernikeNumbering,
+        /// Centre of the disc.
+        centre_mm: [f64; 2],
+        /// Radius of the disc.
+        radius_mm: f64,
+    },
+    /// Products L_i(x) L_j(y) of Legendre polynomials, in order of rising i + j, then of falling i.
+    Legendre {
+        /// Centre of the rectangle.
+        centre_mm: [f64; 2],
+        /// Half of its size along x and y.
+        half_mm: [f64; 2],
+    },
+}
+
+impl PolynomialBasis {
+    /// Returns the polynomials that suit an aperture: Zernike for a disc, a ring and an ellipse, Legendre for a
+    /// rectangle and a polygon.
+    pub fn for_aperture(aperture: &Aperture) -> Self {
+        match aperture {
+            Aperture::Circle { .. } | Aperture::Annulus { .. } | Aperture::Ellipse { .. } => Self::zernike(aperture),
+            Aperture::Rectangle { .. } | Aperture::Polygon { .. } => Self::legendre(aperture.bounds()),
+        }
+    }
+
+    /// Returns the Fringe Zernike polynomials on the smallest disc that contains the aperture and is centred on its
+    /// bounds.
+    pub fn zernike(aperture: &Aperture) -> Self {
+        let (centre_mm, half_mm) = centre_and_half(aperture.bounds());
+        let radius_mm = match aperture {
+            Aperture::Circle { .. } | Aperture::Annulus { .. } | Aperture::Ellipse { .. } => half_mm[0].max(half_mm[1]),
+            Aperture::Rectangle { .. } => half_mm[0].hypot(half_mm[1]),
+            Aperture::Polygon { corners_mm } => {
+                corners_mm.iter().map(|[x, y]| (x - centre_mm[0]).hypot(y - centre_mm[1])).fold(0.0, f64::max)
+            }
+        };
+        Self::Zernike { numbering: ZernikeNumbering::Fringe, centre_mm, radius_mm }
+    }
+
+    /// Returns the Legendre polynomials on a rectangle, given by its two corners in mm.
+    pub fn legendre(bounds_mm: [[f64; 2]; 2]) -> Self {
+        let (centre_mm, half_mm) = centre_and_half(bounds_mm);
+        Self::Legendre { centre_mm, half_mm }
+    }
+
+    /// Returns the name of the polynomials.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Zernike { numbering: ZernikeNumbering::Noll, .. } => "Zernike (Noll)",
+            Self::Zernike { numbering: ZernikeNumbering::Ansi, .. } => "Zernike (ANSI)",
+            Self::Zernike { numbering: ZernikeNumbering::Fringe, .. } => "Zernike (Fringe)",
+            Self::Legendre { .. } => "Legendre",
+        }
+    }
+
+    /// Returns the name of a term, counted from 0: index and degree with azimuthal order, or the two degrees.
+    pub fn term_name(&self, k: usize) -> String {
+        match self {
+            Self::Zernike { numbering, .. } => {
+                let index = first(*numbering) + k as u32;
+                let (n, m) = numbering.degree_and_order(index).unwrap_or_default();
+                format!("Z{index} ({n}, {m})")
+            }
+            Self::Legendre { .. } => {
+                let [i, j] = degrees(k);
+                format!("L{i}(x) L{j}(y)")
+            }
+        }
+    }
+
+    /// Returns the maximum number of terms.
+    pub(super) fn max_terms(&self) -> usize {
+        match self {
+            Self::Zernike { numbering: ZernikeNumbering::Fringe, .. } => 37,
+            Self::Zernike { .. } => MAX_ZERNIKE_TERMS,
+            Self::Legendre { .. } => MAX_LEGENDRE_TERMS,
+        }
+    }
+
+    /// Returns the largest complete number of terms up to `most`: no term lacks its companions of the same order.
+    pub(super) fn complete_terms(&self, most: usize) -> usize {
+        let counts =
+            |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
+        let fringe = matches!(self, Self::Zernike { numbering: ZernikeNumbering::Fringe, .. });
+        counts(fringe).take_while(|count| *count <= most.min(self.max_terms())).last().unwrap_or(0)
+    }
+
+    /// Prepares the first terms for evaluation.
+    ///
+    /// # Errors
+    /// A number of terms out of range, and a domain without an area.
+    pub(super) fn prepare_terms(&self, terms: usize) -> Result<Terms, FormError> {
+        if !(1..=self.max_terms()).contains(&terms) {
+            return Err(FormError::Terms { terms, basis: self.name(), max_terms: self.max_terms() });
+        }
+        match self {
+            Self::Zernike { radius_mm, .. } if !(*radius_mm > 0.0 && radius_mm.is_finite()) => Err(FormError::NoArea),
+            Self::Zernike { numbering, centre_mm, radius_mm } => {
+                let index = |k: u32| numbering.degree_and_order(first(*numbering) + k).unwrap_or_default();
+                let orders = AzimuthalOrder::grouped((0..terms as u32).map(index));
+                Ok(Terms::Zernike { orders, terms, centre_mm: *centre_mm, radius_mm: *radius_mm })
+            }
+            Self::Legendre { half_mm, .. } if !(half_mm[0] > 0.0 && half_mm[1] > 0.0) => Err(FormError::NoArea),
+            Self::Legendre { centre_mm, half_mm } => {
+                let degrees = (0..terms).map(degrees).collect();
+                Ok(Terms::Legendre { degrees, centre_mm: *centre_mm, half_mm: *half_mm })
+            }
+        }
+    }
+}
+
+/// First terms of a basis, ready for evaluation.
+pub(super) enum Terms {
+    Zernike { orders: Vec<AzimuthalOrder>, terms: usize, centre_mm: [f64; 2], radius_mm: f64 },
+    Legendre { degrees: Vec<[usize; 2]>, centre_mm: [f64; 2], half_mm: [f64; 2] },
+}
+
+impl Terms {
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Self::Zernike { terms, .. } => *terms,
+            Self::Legendre { degrees, .. } => degrees.len(),
+        }
+    }
+
+    /// Writes the value of every term at a sample to `row`. `index` identifies the sample in errors.
+    pub(super) fn values(&self, index: usize, sample: &DeviationSample, row: &mut [f64]) -> Result<(), FormError> {
+        let [x, y] = sample.place_mm;
+        match self {
+            Self::Zernike { orders, centre_mm, radius_mm, .. } => {
+                let (x, y) = (x - centre_mm[0], y - centre_mm[1]);
+                let (u, v) = (x / radius_mm, y / radius_mm);
+                let q = u * u + v * v;
+                if q > MAX_RADIUS_RATIO * MAX_RADIUS_RATIO {
+                    return Err(FormError::FarOut { index, distance_mm: x.hypot(y), radius_mm: *radius_mm });
+                }
+                zernike(orders, [u, v], q, row);
+            }
+            Self::Legendre { degrees, centre_mm, half_mm } => {
+                let [u, v] = [(x - centre_mm[0]) / half_mm[0], (y - centre_mm[1]) / half_mm[1]];
+                let [along_x, along_y] = [legendre(u), legendre(v)];
+                for (value, [i, j]) in row.iter_mut().zip(degrees) {
+                    *value = along_x[*i] * along_y[*j];
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Largest distance from the centre of the disc, in radii, at which Zernike polynomials are evaluated.
+const MAX_RADIUS_RATIO: f64 = 1.5;
+/// Maximum number of radial polynomials of one azimuthal order: up to degree 13, and Fringe's term of degree 12.
+const MAX_RADIAL_TERMS: usize = 7;
+
+/// Zernike terms of one azimuthal order.
+pub(super) struct AzimuthalOrder {
+    m: u32,
+    /// Number of radial polynomials needed.
+    radial: usize,
+    /// For each term: its place in the row, (n - m) / 2, true if it is a sine, and the factor that makes its mean
+    /// square 1.
+    terms: Vec<(usize, usize, bool, f64)>,
+}
+
+impl AzimuthalOrder {
+    /// Groups terms, given by degree and azimuthal order, by the absolute azimuthal order.
+    fn grouped(terms: impl Iterator<Item = (u32, i32)>) -> Vec<Self> {
+        let mut orders: Vec<Self> = Vec::new();
+        for (place, (n, m)) in terms.enumerate() {
+            let k = ((n - m.unsigned_abs()) / 2) as usize;
+            let factor = (f64::from(n + 1) * if m == 0 { 1.0 } else { 2.0 }).sqrt();
+            while orders.len() <= m.unsigned_abs() as usize {
+                orders.push(Self { m: orders.len() as u32, radial: 0, terms: Vec::new() });
+            }
+            let order = &mut orders[m.unsigned_abs() as usize];
+            order.radial = order.radial.max(k + 1);
+            order.terms.push((place, k, m < 0, factor));
+        }
+        orders
+    }
+}
+
+/// Writes the values of all terms. rho^m cos and rho^m sin are the parts of (u + i v)^m; the radial factor is P_k^(0,
+/// m)(2 rho^2 - 1).
+fn zernike(orders: &[AzimuthalOrder], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
+    let mut power = [1.0, 0.0];
+    let mut radial = [0.0; MAX_RADIAL_TERMS];
+    for order in orders {
+        jacobi_values(order.m, 2.0 * q - 1.0, &mut radial[..order.radial]);
+        for &(place, k, sine, factor) in &order.terms {
+            row[place] = factor * radial[k] * power[usize::from(sine)];
+        }
+        power = [power[0] * u - power[1] * v, power[0] * v + power[1] * u];
+    }
+}
+
+/// Number of Legendre polynomials in one variable: degrees 0 to 13.
+const DEGREES: usize = 14;
+
+/// Returns the Legendre polynomials of degree 0 to 13 at `t`, times sqrt(2 n + 1), by Bonnet's recurrence.
+fn legendre(t: f64) -> [f64; DEGREES] {
+    let mut plain = [1.0; DEGREES];
+    plain[1] = t;
+    for n in 1..DEGREES - 1 {
+        let k = n as f64;
+        plain[n + 1] = ((2.0 * k + 1.0) * t * plain[n] - k * plain[n - 1]) / (k + 1.0);
+    }
+    std::array::from_fn(|n| plain[n] * (2.0 * n as f64 + 1.0).sqrt())
+}
+
+/// Returns the degrees of a Legendre term in x and y: by rising total degree, then by falling degree of x.
+fn degrees(k: usize) -> [usize; 2] {
+    let sum = ((8 * k + 1).isqrt() - 1) / 2;
+    let j = k - sum * (sum + 1) / 2;
+    [sum - j, j]
+}
+
+fn first(numbering: ZernikeNumbering) -> u32 {
+    u32::from(numbering != ZernikeNumbering::Ansi)
+}
+
+fn centre_and_half([low, high]: [[f64; 2]; 2]) -> ([f64; 2], [f64; 2]) {
+    (std::array::from_fn(|k| 0.5 * (low[k] + high[k])), std::array::from_fn(|k| 0.5 * (high[k] - low[k])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn terms_are_named_and_ordered() {
+        let rectangle = PolynomialBasis::legendre([[-2.0, 0.0], [4.0, 2.0]]);
+        assert_eq!((rectangle.term_name(0), rectangle.term_name(4)), ("L0(x) L0(y)".into(), "L1(x) L1(y)".into()));
+        assert_eq!((0..6).map(degrees).collect::<Vec<_>>(), [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]);
+        assert_eq!([1, 2, 3, 9, 36, 200].map(|most| rectangle.complete_terms(most)), [1, 1, 3, 6, 36, 105]);
+        let ring = Aperture::Annulus { centre_mm: [1.0, 2.0], inner_radius_mm: 3.0, outer_radius_mm: 9.0 };
+        let PolynomialBasis::Zernike { centre_mm, radius_mm, .. } = PolynomialBasis::for_aperture(&ring) else { panic!("discs have Zernike's") };
+        assert_eq!((centre_mm, radius_mm), ([1.0, 2.0], 9.0));
+        assert_eq!((PolynomialBasis::for_aperture(&ring).term_name(8), PolynomialBasis::for_aperture(&ring).complete_terms(40)), ("Z9 (4, 0)".into(), 36));
+        let square = Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 6.0, height_mm: 8.0 };
+        assert!(matches!(PolynomialBasis::zernike(&square), PolynomialBasis::Zernike { radius_mm: 5.0, .. }));
+        assert!(matches!(rectangle.prepare_terms(0), Err(FormError::Terms { max_terms: 105, .. })));
+    }
+
+    #[test]
+    fn zernike_terms_are_those_of_the_surfaces_of_that_name() {
+        use crate::surface::analytic::{Zernike, ZernikeDefinition, ZernikeNormalisation};
+        for numbering in [ZernikeNumbering::Fringe, ZernikeNumbering::Noll, ZernikeNumbering::Ansi] {
+            let basis = PolynomialBasis::Zernike { numbering, centre_mm: [1.0, -2.0], radius_mm: 20.0 };
+            let terms = basis.prepare_terms(basis.max_terms()).unwrap();
+            let mut row = vec![f64::NAN; terms.len()];
+            for at_mm in [[1.0, -2.0], [8.0, 3.0], [-12.0, 11.5], [21.0, -2.0], [1.0, -27.0]] {
+                terms.values(0, &DeviationSample { place_mm: at_mm, deviation_mm: 0.0 }, &mut row).unwrap();
+                for (k, value) in row.iter().enumerate() {
+                    let written = ZernikeDefinition {
+                        numbering,
+                        normalisation_radius_mm: 20.0,
+                        coefficients_mm: [((first(numbering) + k as u32).to_string(), 1.0)].into(),
+                        normalisation: Some(ZernikeNormalisation::Orthonormal),
+                        base: None,
+                    };
+                    let surface = Zernike::try_from(&written).unwrap();
+                    let (expected, _) = surface.sag_and_gradient(at_mm[0] - 1.0, at_mm[1] + 2.0).unwrap();
+                    assert!((value - expected).abs() <= 1e-11 * expected.abs().max(1.0), "{}: {value}", basis.term_name(k));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn legendre_by_hand() {
+        let [l0, l1, l2, l3, ..] = legendre(0.5);
+        assert_eq!((l0, l1), (1.0, 3f64.sqrt() * 0.5));
+        assert!((l2 + 5f64.sqrt() * 0.125).abs() < 1e-15 && (l3 + 7f64.sqrt() * 0.4375).abs() < 1e-15);
+        assert!((legendre(1.0)[13] - 27f64.sqrt()).abs() < 1e-13);
+    }
+}

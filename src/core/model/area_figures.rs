@@ -1,0 +1,110 @@
+//! Figures of sampled forms that belong to an area: slopes, and power, irregularity and related figures of ISO 10110-5.
+//!
+//! Each sampled form has figures of its own. The median over all forms and the interval that contains 95 % of them are
+//! the result. Everything that depends on the places alone is computed once: [`IsoFits`], [`SlopesAt`].
+
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::{Interval, ModelInputs};
+use crate::form::{IsoFits, IsoFormValues, SlopeOperator};
+
+/// Options for the figures of an area.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AreaOptions {
+    /// Centre of symmetry, x and y of the model frame; `None` for the centre of the bounds of the places.
+    pub middle_mm: Option<[f64; 2]>,
+    /// Length over which slopes are taken; it is increased if the places are too far apart for it. `None` for the
+    /// shortest length that the places allow.
+    pub integration_mm: Option<f64>,
+}
+
+/// Slopes of the smooth form; their uncertainty includes those of its pose and of the noise of the probe. Form that is
+/// too narrow to be distinguished from noise has a height but no measurable slope, so it is not included.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct SlopeFigures {
+    /// Root mean square of the length of the gradient.
+    pub rms: AngleInterval,
+    /// Maximum length of the gradient.
+    pub largest: AngleInterval,
+    /// Length over which the slopes were taken.
+    pub integration_mm: f64,
+    /// Number of places at which a slope was taken; edges have none.
+    pub places: usize,
+}
+
+/// Median of a slope, and its 95 % credible interval.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct AngleInterval {
+    /// Median: the slope is above and below it with equal probability.
+    pub median_rad: f64,
+    /// Lower end: the slope is below it with a probability of 2.5 %.
+    pub low_rad: f64,
+    /// Upper end: the slope is above it with a probability of 2.5 %.
+    pub high_rad: f64,
+}
+
+/// Figures of ISO 10110-5 of the form; [`crate::form::Iso10110`] has the same figures of points.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct IsoFigures {
+    /// A: PV of the power. The interval begins at 0 if the sign of the power is uncertain.
+    pub power: Interval,
+    /// Height of the power at the rim over the centre: above 0 if the rim is higher.
+    pub power_rim: Interval,
+    /// B: PV of the irregularity.
+    pub irregularity: Interval,
+    /// C: PV of the part of the irregularity that is symmetric about the centre.
+    pub symmetric: Interval,
+    /// RMSt: root mean square of the total.
+    pub rms_total: Interval,
+    /// RMSi: root mean square of the irregularity.
+    pub rms_irregularity: Interval,
+    /// RMSa: root mean square of the asymmetric part.
+    pub rms_varying: Interval,
+}
+
+impl SlopeFigures {
+    /// Computes the figures of smooth forms, a column each: the first matrix is for the figures, the second one raises
+    /// the upper ends of the maximum.
+    pub(super) fn from_forms(slopes: &SlopeOperator, forms: &[DMatrix<f64>; 2], (is_seen, inputs): (bool, &ModelInputs)) -> Self {
+        let found = forms.each_ref().map(|forms| map_columns(forms, |form| slopes.evaluate(form)));
+        let [rms, largest] = [0, 1].map(|k| {
+            let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
+            let of = Interval::from_samples(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, inputs);
+            AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
+        });
+        Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
+    }
+}
+
+impl IsoFigures {
+    /// Computes the figures of forms, a column each: the first matrix is for the figures, the second one raises the
+    /// upper ends of extremes.
+    pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
+        let found = forms.each_ref().map(|forms| map_columns(forms, |form| fits.evaluate(form)));
+        let values = |k: usize, of: fn(&IsoFormValues) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
+        let interval = |of: fn(&IsoFormValues) -> f64, has_low: bool| {
+            Interval::from_samples(values(0, of), (Vec::new(), std::iter::empty()), has_low, inputs)
+        };
+        let extreme = |of: fn(&IsoFormValues) -> f64| {
+            Interval::from_samples(values(0, of), (Vec::new(), std::iter::once(values(1, of))), is_seen, inputs)
+        };
+        let power_rim = interval(|of| of.power_rim_mm, true);
+        let has_sign = power_rim.low_mm * power_rim.high_mm > 0.0;
+        Self {
+            power: interval(|of| of.power_mm, is_seen && has_sign),
+            power_rim,
+            irregularity: extreme(|of| of.irregularity_mm),
+            symmetric: extreme(|of| of.symmetric_mm),
+            rms_total: interval(|of| of.rms_total_mm, is_seen),
+            rms_irregularity: interval(|of| of.rms_irregularity_mm, is_seen),
+            rms_varying: interval(|of| of.rms_varying_mm, is_seen),
+        }
+    }
+}
+
+/// Applies `make` to each column and returns the results in their order.
+fn map_columns<T: Send>(forms: &DMatrix<f64>, make: impl Fn(&[f64]) -> T + Send + Sync) -> Vec<T> {
+    forms.as_slice().par_chunks(forms.nrows().max(1)).map(make).collect()
+}

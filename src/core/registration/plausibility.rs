@@ -1,0 +1,271 @@
+//! Warnings about a fit that succeeded: a probe radius that does not match the ball, and too few usable points.
+
+use crate::geometry::Point;
+
+use super::isolated_touches::count_contradicted;
+use super::deviation::{StatusCounts, Deviation, PointStatus};
+use super::options::{Method, Options, Start};
+use super::part::Part;
+use super::result::{Registration, FiguresWithOutliers};
+use super::start::sample_evenly;
+use super::quality::format_length;
+
+/// Largest share of the rms that another radius leaves, if the given radius is doubted. On a free-form surface of 64 mm
+/// radius, half the radius leaves a quarter in addition to the form error of a ground part. Double the radius leaves
+/// less.
+const MAX_RMS_SHARE: f64 = 0.65;
+
+/// Smallest relative error of the radius at which it is doubted. A diameter in place of a radius, or the wrong ball,
+/// exceeds it. The form error of a worn wheel has the same shape as the effect of a wrong radius: in one case it made
+/// the estimate 0.25 mm less than the 1.5 mm of the ball.
+const MIN_RELATIVE_ERROR: f64 = 0.4;
+
+/// Smallest rms that a wrong radius explains, as a share of the cloud's size, at which it is doubted: 7 um on a part of
+/// 100 x 60 mm. A ground part bends less. The limit also excludes surfaces that hardly determine the radius.
+const MIN_RMS_PER_SIZE: f64 = 2e-4;
+
+/// Share of the given radius below which the points are contact points: the rest of the estimate is form error.
+const MAX_CONTACT_RADIUS_SHARE: f64 = 0.25;
+
+/// Smallest radius of a ball, in mm. A smaller value is an intended offset above the nominal surface, not a ball.
+const MIN_BALL_RADIUS_MM: f64 = 0.1;
+
+/// Fewest points in excess of the seven unknowns. With fewer, the estimated radius is chance.
+const MIN_DEGREES_OF_FREEDOM: usize = 20;
+
+/// Number of points that another radius is fitted to.
+const REFIT_POINTS: usize = 2048;
+
+/// Limits for a warning: shares of the points, and the share of the surface that is covered.
+const MAX_OUTLIER_SHARE: f64 = 0.05;
+const MAX_OFF_PART_SHARE: f64 = 0.2;
+const MIN_COVERAGE: f64 = 0.5;
+
+/// Returns warnings about the points, the nominal surface and the probe radius.
+pub(super) fn plausibility_warnings(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Vec<String> {
+    let mut doubts = point_warnings(found);
+    doubts.extend(nominal_noise_warning(part, found));
+    doubts.extend(radius_warning(part, found, measured, options));
+    doubts
+}
+
+/// Returns warnings about many rejected points, and about points that cover little of the surface.
+fn point_warnings(found: &Registration) -> Vec<String> {
+    let points = found.deviations.len();
+    let StatusCounts { outliers, off_part, .. } = StatusCounts::count(&found.deviations);
+    let share = |n: usize| n as f64 / points as f64;
+    let mut doubts: Vec<String> = outlier_warning(found).into_iter().collect();
+    doubts.extend(found.unjudgeable_reason());
+    if share(outliers) > MAX_OUTLIER_SHARE {
+        doubts.push(format!(
+            "{outliers} of {points} points ({:.0} %) are rejected as outliers: look for dirt or coolant on the part, \
+             a probe that slipped or wears, points of a fixture, or steps and edges that the nominal surface does \
+             not have",
+            100.0 * share(outliers),
+        ));
+    }
+    let in_gaps = if off_part > 0 { count_in_gaps(found, off_part) } else { 0 };
+    if share(off_part - in_gaps) > MAX_OFF_PART_SHARE {
+        doubts.push(format!(
+            "{} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and are not used: check that \
+             the nominal surface covers the part, and that the cloud belongs to it",
+            off_part - in_gaps,
+            100.0 * share(off_part - in_gaps),
+        ));
+    }
+    if in_gaps > 0 {
+        doubts.push(format!(
+            "{in_gaps} of {points} points ({:.0} %) lie over a gap of the nominal surface, where it has no points, \
+             and are not used: add nominal points there, if the part has a surface there",
+            100.0 * share(in_gaps),
+        ));
+    }
+    let coverage = found.quality.coverage;
+    if coverage < MIN_COVERAGE {
+        doubts.push(format!(
+            "the {} points used cover only {:.0} % of the nominal surface, and the rest is unknown: check whether \
+             the measurement or its file is cut short, or the nominal surface is larger than the part",
+            points - outliers - off_part,
+            100.0 * coverage,
+        ));
+    }
+    doubts
+}
+
+/// Estimates how many points off the part have points on the part in every direction.
+fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
+    /// Number of directions in the xy plane of the model frame.
+    const SECTORS: usize = 8;
+    /// Most points of each kind that are examined.
+    const MAX_EXAMINED: usize = 2000;
+    let some_of = |is_off: bool, count: usize| -> Vec<[f64; 2]> {
+        let of = found.deviations.iter().filter(|d| (d.status == PointStatus::OffPart) == is_off);
+        of.step_by(count.div_ceil(MAX_EXAMINED).max(1)).map(|d| [d.point.x, d.point.y]).collect()
+    };
+    let (looked_at, some) = (some_of(true, off_part), some_of(false, found.deviations.len() - off_part));
+    let is_surrounded = |place: &&[f64; 2]| {
+        let mut seen = [false; SECTORS];
+        for other in &some {
+            let angle = (other[1] - place[1]).atan2(other[0] - place[0]);
+            let turn = (angle / std::f64::consts::TAU).rem_euclid(1.0);
+            seen[((turn * SECTORS as f64) as usize).min(SECTORS - 1)] = true;
+        }
+        seen.iter().all(|seen| *seen)
+    };
+    let surrounded = looked_at.iter().filter(is_surrounded).count();
+    (surrounded * off_part) / looked_at.len().max(1)
+}
+
+impl Registration {
+    /// Returns why these points allow no judgement, or `None`. Too many of them contradict their neighbours, so it is
+    /// unknown which of the two groups is the part.
+    pub fn unjudgeable_reason(&self) -> Option<String> {
+        /// Largest share of the points on the part.
+        const MAX_CONTRADICTED_SHARE: f64 = 0.1;
+        let StatusCounts { off_part, left_out_of_fit: left, .. } = StatusCounts::count(&self.deviations);
+        if left as f64 <= MAX_CONTRADICTED_SHARE * (self.deviations.len() - off_part) as f64 {
+            return None;
+        }
+        let on_part: Vec<&Deviation> = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
+        let contradicted = count_contradicted(&self.deviations);
+        if contradicted as f64 <= MAX_CONTRADICTED_SHARE * on_part.len() as f64 {
+            return None;
+        }
+        let figures = |some: &mut dyn Iterator<Item = f64>| {
+            let add = |(low, high, squares, n): (f64, f64, f64, usize), d: f64| {
+                (f64::min(low, d), f64::max(high, d), squares + d * d, n + 1)
+            };
+            let (low, high, squares, n) = some.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
+            format!("PV {} and RMS {}", format_length(high - low), format_length((squares / n.max(1) as f64).sqrt()))
+        };
+        let with = figures(&mut on_part.iter().map(|d| d.deviation_mm));
+        let without = figures(&mut on_part.iter().filter(|d| d.in_fit).map(|d| d.deviation_mm));
+        Some(format!(
+            "{contradicted} of {} points ({:.0} %) contradict their neighbours, so no verdict is possible: with them \
+             {with}, without them {without}; clean the part, check the probe, and measure again",
+            on_part.len(),
+            100.0 * contradicted as f64 / on_part.len() as f64,
+        ))
+    }
+}
+
+/// Warns that the nominal points have noise of their own, if it contributes noticeably to the deviations.
+fn nominal_noise_warning(part: &Part, found: &Registration) -> Option<String> {
+    /// Limits for the warning; both must be exceeded. A file with four digits of a millimetre has a noise of 0.03 um.
+    const MIN_NOISE_MM: f64 = 1e-4;
+    const MIN_RMS_SHARE: f64 = 0.1;
+    let scatter_mm = part.nominal.noise_sigma_mm();
+    (scatter_mm > MIN_NOISE_MM.max(MIN_RMS_SHARE * found.quality.rms_mm)).then(|| {
+        format!(
+            "the nominal points have a noise of {} about a smooth surface, and each deviation has about as much: \
+             give them with more digits, or give the surface that they come from",
+            format_length(scatter_mm),
+        )
+    })
+}
+
+/// Names the rejected points, and gives the figures that include them.
+fn outlier_warning(found: &Registration) -> Option<String> {
+    let FiguresWithOutliers { outliers: points, rms_mm, pv_mm, description: places } = found.figures_with_outliers()?;
+    let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
+    Some(format!(
+        "{were} rejected, because no neighbour confirms the deviation: {places}; with all points PV is {} and RMS \
+         {}: clean the place and touch it again",
+        format_length(pv_mm),
+        format_length(rms_mm),
+    ))
+}
+
+/// Describes another probe radius that fits the points much better, if there is one.
+pub(super) fn radius_warning(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Option<String> {
+    let given_mm = options.probe_radius_mm;
+    if !is_radius_testable(part, found, options) {
+        return None;
+    }
+    let sample: Vec<Point> = sample_evenly(measured, REFIT_POINTS).copied().collect();
+    let told_mm = converged_radius_mm(given_mm + found.estimate_radius()?.difference_mm, given_mm, &|radius_mm| {
+        refit_with_radius(part, found, &sample, options, radius_mm)
+    })?;
+    let is_contact = told_mm.abs() < MAX_CONTACT_RADIUS_SHARE * given_mm;
+    if (told_mm - given_mm).abs() < MIN_RELATIVE_ERROR * given_mm {
+        return None;
+    }
+    let other = refit_with_radius(part, found, &sample, options, if is_contact { 0.0 } else { told_mm })?;
+    let (rms_mm, other_rms_mm) = (found.quality.rms_mm, other.quality.rms_mm);
+    is_better(part, rms_mm, other_rms_mm).then(|| {
+        let (rms, other_rms) = (format_length(rms_mm), format_length(other_rms_mm));
+        if is_contact {
+            format!(
+                "the points look like contact points on the surface, not like centres of a ball of {given_mm} mm: as \
+                 contact points they fit to {other_rms} rms instead of {rms}; if the CMM has already subtracted the \
+                 radius, register with the method `contact`"
+            )
+        } else {
+            let side = if told_mm < 0.0 { " on the other side of the surface" } else { "" };
+            format!(
+                "a probe radius of about {:.2} mm{side} fits the points to {other_rms} rms, the given {given_mm} mm \
+                 to {rms}: check which ball was in the probe, and that the value is its radius, not its diameter; \
+                 otherwise the part itself is bent in this way, as after a wheel of a wrong radius",
+                told_mm.abs()
+            )
+        }
+    })
+}
+
+/// Registers a sample of the points with another radius, in mm. A negative radius is a ball on the other side of the
+/// surface. Zero means contact points.
+fn refit_with_radius(part: &Part, found: &Registration, sample: &[Point], given: &Options, radius_mm: f64) -> Option<Registration> {
+    let is_ball = radius_mm.abs() >= MIN_BALL_RADIUS_MM;
+    let options = Options {
+        probe_radius_mm: if is_ball { radius_mm.abs() } else { 0.0 },
+        method: if is_ball { given.method } else { Method::Contact },
+        start: Start::Pose(found.cmm_from_model),
+        side: if is_ball && radius_mm < 0.0 { found.side.other() } else { found.side }.into(),
+        ..*given
+    };
+    let part = Part::new(part.nominal, sample, &options).ok()?;
+    super::fit(&part, sample, &options).ok()
+}
+
+/// Returns true if another radius fits so much better that form error cannot explain the difference.
+fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
+    let taken2 = rms_mm * rms_mm - other_rms_mm * other_rms_mm;
+    other_rms_mm <= MAX_RMS_SHARE * rms_mm && taken2 >= (MIN_RMS_PER_SIZE * part.size_mm).powi(2)
+}
+
+/// Returns true if another radius is worth a fit: by the linear model it removes enough rms, and the noise leaves it
+/// well determined.
+fn is_radius_testable(part: &Part, found: &Registration, options: &Options) -> bool {
+    /// The model is linear, and a wrong radius is far off. So this test lets through a little more than the final one.
+    const MARGIN: f64 = 1.15;
+    let (given_mm, rms_mm) = (options.probe_radius_mm, found.quality.rms_mm);
+    // With a locked coordinate, a wrong position of the fixture would look like a wrong radius.
+    let is_ball = options.method != Method::Contact && given_mm >= MIN_BALL_RADIUS_MM && !options.locked.contains(&true);
+    if !is_ball || found.quality.inliers < 7 + MIN_DEGREES_OF_FREEDOM || rms_mm < MIN_RMS_PER_SIZE * part.size_mm {
+        return false;
+    }
+    found.estimate_radius().is_some_and(|told| {
+        let off_mm = told.difference_mm.abs();
+        MARGIN * off_mm >= MIN_RELATIVE_ERROR * given_mm
+            && off_mm > 5.0 * told.sigma_mm
+            && is_better(part, MARGIN * rms_mm, told.rms_share * rms_mm)
+    })
+}
+
+/// Iterates the radius that the points give until it no longer changes, and returns it in mm. It may change sign, to
+/// the other side of the surface. Returns `None` if a fit fails.
+fn converged_radius_mm(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
+    const MAX_ITERATIONS: usize = 5;
+    let mut radius_mm = first_mm;
+    for _ in 0..MAX_ITERATIONS {
+        if radius_mm.abs() < MIN_BALL_RADIUS_MM {
+            radius_mm = 0.0;
+        }
+        let more_mm = refit(radius_mm)?.estimate_radius()?.difference_mm * if radius_mm < 0.0 { -1.0 } else { 1.0 };
+        radius_mm += more_mm;
+        if more_mm.abs() < 0.01 * given_mm {
+            break;
+        }
+    }
+    Some(radius_mm)
+}

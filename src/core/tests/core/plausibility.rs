@@ -1,0 +1,156 @@
+//! What is said of a fit that was found, and of one that was not: each false cloud with its cause, each good one in silence.
+
+use std::sync::OnceLock;
+
+use crate::common::{RADIUS_MM, centres, placed, points};
+use regrind_core::geometry::{Point, Pose};
+use regrind_core::registration::{Method, Options, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::surface::{Nominal, PlaneProjection};
+use regrind_sim::form::FormError;
+use regrind_sim::probe::{Placement, add_noise};
+use regrind_sim::shape::{Shape, XyPolynomial};
+
+/// The free-form mirror that ships as a recipe.
+fn mirror() -> XyPolynomial {
+    #[rustfmt::skip]
+    let terms = vec![
+        (1, 0, 2.1), (0, 1, -1.4), (2, 0, 10.5), (1, 1, 2.4), (0, 2, -13.3), (3, 0, 2.6), (2, 1, -3.5), (1, 2, 3.0), (0, 3, 1.6),
+        (4, 0, -1.7), (3, 1, 1.2), (2, 2, 1.6), (1, 3, -1.4), (0, 4, 1.2),
+    ];
+    XyPolynomial { normalisation_radius_mm: 50.0, terms }
+}
+
+fn nominal() -> &'static Nominal {
+    static NOMINAL: OnceLock<Nominal> = OnceLock::new();
+    NOMINAL
+        .get_or_init(|| Nominal::from_points(points(&mirror().grid(102.0, 62.0, 205, 125)), PlaneProjection::Auto).unwrap())
+}
+
+/// 1,800 centres of a part with 20 um of form error, within a rectangle.
+fn measured(seed: u64, half: [f64; 2]) -> Vec<Point> {
+    let form = FormError::new(seed, 30.0, 0.02, 102.0, 62.0);
+    let placement = Placement::new([12.0, -8.0, 5.0], [4.0, -3.0, 20.0]);
+    let mut all = placed(&placement, &centres(&mirror(), &form, [[-half[0], -half[1]], half], [60, 30]));
+    add_noise(&mut regrind_sim::rng(seed), &mut all, 2e-4);
+    points(&all)
+}
+
+fn whole(seed: u64) -> Vec<Point> {
+    measured(seed, [50.0, 30.0])
+}
+
+fn with_radius(radius_mm: f64, measured: &[Point]) -> Registration {
+    register(nominal(), measured, &Options::new(radius_mm)).unwrap()
+}
+
+fn warnings(found: &Registration) -> String {
+    found.quality.warnings.join("; ")
+}
+
+#[test]
+fn of_a_ground_part_nothing_is_said() {
+    for seed in 1..=4 {
+        let found = with_radius(RADIUS_MM, &whole(seed));
+        assert!(found.quality.rms_mm > 1e-3, "{}", found.quality.rms_mm);
+        assert_eq!(warnings(&found), "", "seed {seed}");
+    }
+}
+
+#[test]
+fn a_diameter_and_half_a_radius_are_told() {
+    for seed in 1..=4 {
+        for factor in [0.5, 2.0] {
+            let given_mm = factor * RADIUS_MM;
+            let words = warnings(&with_radius(given_mm, &whole(seed)));
+            let told: f64 = words
+                .strip_prefix("a probe radius of about ")
+                .and_then(|rest| rest.split_once(" mm fits the points to "))
+                .unwrap_or_else(|| panic!("{given_mm} mm, seed {seed}: {words:?}"))
+                .0
+                .parse()
+                .unwrap();
+            assert!((told / RADIUS_MM - 1.0).abs() < 0.2, "{words}");
+            assert!(
+                words.contains(&format!("the given {given_mm} mm")) && words.contains("not its diameter"),
+                "{words}"
+            );
+        }
+    }
+}
+
+#[test]
+fn contact_points_that_were_taken_for_centres_are_told() {
+    for seed in 1..=4 {
+        let right = with_radius(RADIUS_MM, &whole(seed));
+        let contacts: Vec<Point> = right.deviations.iter().map(|d| right.cmm_from_model.transform_point(&d.point)).collect();
+        let words = warnings(&with_radius(RADIUS_MM, &contacts));
+        assert!(words.contains("look like contact points") && words.contains("`contact`"), "{words}");
+        let found = register(nominal(), &contacts, &Options { method: Method::Contact, ..Options::new(0.0) }).unwrap();
+        assert_eq!(warnings(&found), "");
+    }
+}
+
+#[test]
+fn a_fit_that_is_refused_for_its_radius_says_so() {
+    let options = Options { rms_limit_mm: Some(0.01), ..Options::new(2.0 * RADIUS_MM) };
+    let told = register(nominal(), &whole(1), &options).unwrap_err();
+    assert!(matches!(told, RegistrationError::DoesNotFit { .. }), "{told}");
+    assert!(told.to_string().contains("a probe radius of about 1."), "{told}");
+    let told = register(nominal(), &whole(1), &Options { rms_limit_mm: Some(1e-4), ..Options::new(RADIUS_MM) });
+    assert!(told.unwrap_err().to_string().contains("check part, units"));
+}
+
+#[test]
+fn few_points_of_the_part_are_told() {
+    let words = warnings(&with_radius(RADIUS_MM, &measured(1, [25.0, 15.0])));
+    assert!(words.contains("1800 points used cover only 2") && words.contains("cut short"), "{words}");
+    // The first rows of a file that was cut.
+    let words = warnings(&with_radius(RADIUS_MM, &whole(1)[..180]));
+    assert!(words.contains("180 points used cover only ") && words.contains("cut short"), "{words}");
+}
+
+#[test]
+fn many_outliers_are_told() {
+    // No two of them are neighbours in the pattern of 60 columns.
+    let spoiled = |every: usize| {
+        let mut cloud = whole(1);
+        cloud.iter_mut().step_by(every).for_each(|p| p.z += 0.5);
+        warnings(&with_radius(RADIUS_MM, &cloud))
+    };
+    let words = spoiled(31);
+    assert!(
+        words.starts_with(
+            "59 points were rejected, because no neighbour confirms the deviation: point 0 at (-50.0, -30.0) mm by "
+        ),
+        "{words}"
+    );
+    assert!(words.contains("and 54 more; with all points PV is 0.") && !words.contains("%"), "{words}");
+    let words = spoiled(13);
+    assert!(words.contains("139 of 1800 points (8 %) are rejected as outliers"), "{words}");
+}
+
+#[test]
+fn a_mirror_image_is_told_however_it_fails() {
+    let as_it_is = whole(1);
+    for axis in 0..3 {
+        let mirrored: Vec<Point> = as_it_is
+            .iter()
+            .map(|p| {
+                let mut p = *p;
+                p[axis] = -p[axis];
+                p
+            })
+            .collect();
+        for side in [ProbeSide::Auto, ProbeSide::Above] {
+            for start in [Start::Search, Start::Pose(Pose::identity())] {
+                let told =
+                    register(nominal(), &mirrored, &Options { side, start, ..Options::new(RADIUS_MM) }).unwrap_err();
+                assert!(matches!(told, RegistrationError::Mirrored { .. }), "axis {axis}, {side:?}, {start:?}: {told}");
+            }
+        }
+    }
+    // A cloud that lies elsewhere is no mirror image.
+    let far = Pose { translation_mm: [400.0, 0.0, 0.0].into(), ..Pose::identity() };
+    let told = register(nominal(), &as_it_is, &Options { start: Start::Pose(far), ..Options::new(RADIUS_MM) });
+    assert!(!matches!(told, Err(RegistrationError::Mirrored { .. })), "{told:?}");
+}

@@ -1,0 +1,68 @@
+//! Execution of blocking work outside the loop: on threads of the computer, or in turn with all other tasks if the time
+//! of the run is simulated, because threads would not follow the simulated time.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::task::{AbortHandle, JoinSet};
+
+/// Kind of blocking work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum BlockingWork {
+    /// Registration, correction, or files that are written and read.
+    Computation,
+    /// Record on its way to the disk.
+    Record,
+}
+
+/// Executor of blocking work.
+#[derive(Clone, Default)]
+pub enum BlockingExecutor {
+    /// Threads of the computer.
+    #[default]
+    Threads,
+    /// In turn with everything else, each after the duration that this function returns for it.
+    SimulatedTime(Arc<dyn Fn(BlockingWork) -> Duration + Send + Sync>),
+}
+
+impl BlockingExecutor {
+    /// Runs a piece of work as one of a set of tasks. Returns the handle to abort it.
+    pub(super) fn spawn_computation<T: Send + 'static>(
+        &self,
+        among: &mut JoinSet<T>,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> AbortHandle {
+        match self.clone() {
+            Self::Threads => among.spawn_blocking(work),
+            in_turn => among.spawn(async move {
+                in_turn.wait_simulated_duration(BlockingWork::Computation).await;
+                work()
+            }),
+        }
+    }
+
+    /// Runs a task that may block for long. Returns its thread, if it has one.
+    pub(super) fn spawn_service(
+        &self,
+        name: &str,
+        attending: impl Future<Output = ()> + Send + 'static,
+    ) -> Option<JoinHandle<()>> {
+        if let Self::SimulatedTime(_) = self {
+            tokio::spawn(attending);
+            return None;
+        }
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("it asks for nothing");
+        let thread = std::thread::Builder::new().name(name.into()).spawn(move || runtime.block_on(attending));
+        Some(thread.expect("a thread can be had"))
+    }
+
+    /// Waits for the simulated duration of a piece of work, if the time is simulated.
+    pub(super) async fn wait_simulated_duration(&self, what: BlockingWork) {
+        if let Self::SimulatedTime(time) = self {
+            tokio::time::sleep(time(what)).await;
+        }
+    }
+}

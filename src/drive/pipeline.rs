@@ -1,0 +1,911 @@
+//! Computations between a measurement and the next pass: plan, gates, registration, map, correction.
+//!
+//! All functions here block and run off the asynchronous threads. They share their inputs. They return the event for
+//! the cell and write the files of the run folder.
+
+use std::borrow::Cow;
+use std::collections::HashSet;
+use std::path::Path;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::cell::{
+    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, RecordedFormFigures, GateResult, GateFailure, RecordedInterval,
+    OutlierFigures, RecordedParameter, PartResponse, FurtherTouches,
+};
+use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map, response};
+use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus, TargetKind};
+use crate::form::pv_998;
+use crate::formats::{
+    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
+    write_json_atomic, write_points,
+};
+use crate::geometry::{Point, Vector};
+use crate::measuring::fit_sphere;
+use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
+use crate::registration::{Options, PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
+
+use super::cycle_output;
+use super::recorder::{OutputFiles, ComputationError, classify_error};
+use super::task::{RepeatedTouches, ControlPoint, CycleState, UsablePoints, ComputationProduct, RegistrationProduct, Task, deviation_samples, used_deviations};
+use super::adaptive_measurement;
+
+/// Checks if the measurement of a cycle can be used, and writes its points.
+pub(super) fn gate_cycle(
+    task: &Task,
+    files: &mut OutputFiles,
+    number: u32,
+    cycle: Option<&CycleState>,
+    (earlier, measurement): (Option<&(u32, Arc<UsablePoints>)>, &Measurement),
+) -> (Event, ComputationProduct) {
+    let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model, false) };
+    let plan = cycle.and_then(|cycle| cycle.plan.as_deref()).map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
+    let before = cycle.filter(|_| task.adaptive.is_some());
+    let so_far = before.and_then(|cycle| cycle.points.as_deref());
+    let again = cycle.and_then(|cycle| Some((cycle.repeated_touches.as_deref()?, cycle.points.as_deref()?)));
+    let planned = plan.targets.iter().filter(|t| t.kind == TargetKind::Part).count() as u32;
+    let planned = planned + so_far.map_or(0, |points| points.tried_targets.iter().map(Vec::len).sum::<usize>() as u32);
+    let unusable = result_failure(task, &plan, measurement)
+        .or_else(|| repeated_result_failure(task, earlier, measurement))
+        .or_else(|| temperature_failure(task, measurement));
+    let (found, usable) = match unusable {
+        Some(failure) => (0, Err(failure)),
+        None => {
+            if let Some((again, points)) = again {
+                merge_repeated_touches(again, points, measurement)
+                    .map_or_else(|why| (0, Err(why)), |(points, found)| (found, Ok(points)))
+            } else {
+                let [part, sphere] = touched_points(&plan, planned, measurement);
+                let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
+                let asked = before.map(|cycle| &cycle.batch_targets[..]).unwrap_or_default();
+                let touches = TouchRecord::with_batch(so_far, asked, &plan, measurement);
+                let (part, sphere) = match so_far {
+                    Some(points) => ([&points.part[..], &part].concat(), points.sphere.clone()),
+                    None => (part, sphere),
+                };
+                (part.len() as u32, gate_points(task, planned, part, sphere, told, touches))
+            }
+        }
+    };
+    let saved = usable.map_err(ComputationError::Failed).and_then(|points| {
+        let made = ResultFolder::prepare(files.folder()).map(ResultFolder::keep);
+        let saved = made.and_then(|()| write_measured_points(task, files, &points));
+        saved.map(|()| points).map_err(|error| match classify_error(error) {
+            ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+            ComputationError::Failed(message) => ComputationError::Failed(GateFailure::Broken(message)),
+        })
+    });
+    let (gate, product) = match saved {
+        Ok(points) => (GateResult::Passed, ComputationProduct::Points(points)),
+        Err(ComputationError::Failed(failure)) => (GateResult::Failed(failure), ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => return (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+    };
+    (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
+}
+
+/// Replaces the touches that were repeated and adds those around them. Returns the points and the number of touches
+/// found.
+///
+/// A miss leaves the old touch in place: only a touch replaces a touch. The control points keep their first touches.
+///
+/// # Errors
+/// Other coordinates than those of the first touches, or control points that have moved: the two sets of touches are
+/// not of one measurement.
+fn merge_repeated_touches(again: &RepeatedTouches, points: &UsablePoints, measurement: &Measurement) -> Result<(UsablePoints, u32), GateFailure> {
+    if measurement.coordinates != points.coordinates {
+        let message = "one measurement cannot mix probe centres and contact points; measure again";
+        return Err(GateFailure::Broken(message.to_owned()));
+    }
+    let (outliers, planned) = (again.outlier_points.len(), again.outlier_points.len() + again.control_points.len());
+    if measurement.points.len() < planned {
+        let found = measurement.points.len();
+        return Err(GateFailure::Broken(format!(
+            "the machine returned {found} points, at least {planned} are required"
+        )));
+    }
+    let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
+    let (repeated, rest) = measurement.points.split_at(outliers);
+    let (controls, around) = rest.split_at(again.control_points.len());
+    check_control_points(again, points, controls)?;
+    let mut all = points.clone();
+    all.repeat_rounds += 1;
+    for (point, &number) in repeated.iter().zip(&again.outlier_points).filter(|(p, _)| p.status == PointStatus::Touched) {
+        all.part[number] = point.position_mm.into();
+    }
+    all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.position_mm)));
+    Ok((all, found as u32))
+}
+
+/// Compares the repeated control points with their first touches, along the normals.
+///
+/// One control point may be a wrong touch, so the second largest change decides.
+///
+/// # Errors
+/// A change that the noise of the probe does not explain, or fewer than two control points that were touched.
+fn check_control_points(again: &RepeatedTouches, points: &UsablePoints, repeated: &[MeasuredPoint]) -> Result<(), GateFailure> {
+    let pairs = again.control_points.iter().zip(repeated).filter(|(_, p)| p.status == PointStatus::Touched);
+    let change_mm = |control: &ControlPoint, now: &MeasuredPoint| {
+        (Point::from(now.position_mm) - points.part[control.point_index]).dot(&control.normal).abs()
+    };
+    let mut changes_mm: Vec<f64> = pairs.map(|(control, now)| change_mm(control, now)).collect();
+    changes_mm.sort_by(|a, b| b.total_cmp(a));
+    let limit_mm = again.max_control_change_mm;
+    match changes_mm.get(1) {
+        Some(&second_mm) if second_mm <= limit_mm => Ok(()),
+        Some(&second_mm) => Err(GateFailure::Moved(format!(
+            "{} control points lie {:.2} µm and more from their first touches, limit {:.2} µm",
+            changes_mm.iter().filter(|&&change| change > limit_mm).count(),
+            1e3 * second_mm,
+            1e3 * limit_mm,
+        ))),
+        None => Err(GateFailure::Moved(format!(
+            "{} of {} control points were found, at least 2 are required",
+            changes_mm.len(),
+            again.control_points.len()
+        ))),
+    }
+}
+
+/// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
+/// the points that the operator took.
+fn touched_points(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
+    let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.position_mm.into());
+    let of = |kind: TargetKind| -> Vec<Point> {
+        let pairs = measurement.points.iter().zip(&plan.targets);
+        let touched = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.kind == kind);
+        touched.map(|(p, _)| p.position_mm.into()).collect()
+    };
+    let part = if planned == 0 { taken.collect() } else { of(TargetKind::Part) };
+    [part, of(TargetKind::ReferenceSphere)]
+}
+
+fn gate_points(
+    task: &Task,
+    planned: u32,
+    part: Vec<Point>,
+    sphere: Vec<Point>,
+    (coordinates, temperature_c): (Coordinates, Option<f64>),
+    TouchRecord { tried, of, .. }: TouchRecord,
+) -> Result<UsablePoints, GateFailure> {
+    if part.is_empty() {
+        return Err(GateFailure::NoPart);
+    }
+    let ball = fit_probe_radius(task, &sphere)?;
+    let (found, share) = (part.len(), part.len() as f64 / f64::from(planned.max(1)));
+    // In a small batch one touch may miss.
+    let spared = if tried.is_empty() { 0.0 } else { 1.0 / f64::from(planned.max(1)) };
+    if planned > 0 && share + spared < task.min_found_share {
+        let limit = 100.0 * task.min_found_share;
+        return Err(GateFailure::Coverage(format!(
+            "{found} of {planned} points were found ({:.1} %), at least {limit:.1} % are required (min_coverage)",
+            100.0 * share
+        )));
+    }
+    let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
+    let probe_scatter_mm = ball.map_or([0.0; 2], |[.., rms_mm]| probe_noise(rms_mm, sphere.len()));
+    Ok(UsablePoints {
+        part,
+        sphere,
+        probe_radius_mm: radius_mm,
+        probe_radius_sigma_mm: radius_sigma_mm,
+        probe_noise_mm: probe_scatter_mm,
+        temperature_c,
+        coordinates,
+        tried_targets: tried,
+        point_targets: of,
+        repeat_rounds: 0,
+    })
+}
+
+/// Returns the standard deviation of the probe's noise from the residuals on a sphere, and its relative uncertainty.
+/// The fit uses four degrees of freedom.
+fn probe_noise(rms_mm: f64, points: usize) -> [f64; 2] {
+    const FITTED: f64 = 4.0;
+    let free = (points as f64 - FITTED).max(1.0);
+    [rms_mm * (points as f64 / free).sqrt(), 1.0 / (2.0 * free).sqrt()]
+}
+
+/// Targets that were tried and targets that were found, if they are chosen batch by batch.
+#[derive(Default, Serialize, Deserialize)]
+pub(super) struct TouchRecord {
+    simulation: bool,
+    /// Targets of each batch, by their positions in the pattern.
+    tried: Vec<Vec<usize>>,
+    /// Target of each point that was found.
+    of: Vec<usize>,
+}
+
+impl TouchRecord {
+    /// Adds a batch to the touches so far.
+    fn with_batch(so_far: Option<&UsablePoints>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
+        let (mut tried, mut of) = so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
+        if !asked.is_empty() {
+            let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.kind == TargetKind::Part);
+            let found = pairs.zip(asked).filter(|((p, _), _)| p.status == PointStatus::Touched);
+            of.extend(found.map(|(_, target)| *target));
+            tried.push(asked.to_vec());
+        }
+        Self { simulation: false, tried, of }
+    }
+}
+
+/// Returns the points of a measurement that passed the gate earlier, from its files.
+pub(super) fn gate_recorded_points(
+    task: &Task,
+    part: Vec<Point>,
+    sphere: Vec<Point>,
+    told: (Coordinates, Option<f64>),
+    (touches, rounds): (Option<TouchRecord>, u32),
+) -> Result<UsablePoints, GateFailure> {
+    let points = gate_points(task, 0, part, sphere, told, touches.unwrap_or_default())?;
+    Ok(UsablePoints { repeat_rounds: rounds, ..points })
+}
+
+/// Maximum relative difference of a qualified probe's radius from the stated one. A larger one means another stylus.
+const MAX_PROBE_RADIUS_DIFFERENCE: f64 = 0.01;
+
+/// Returns why a result is foreign or broken: another plan, or values that are impossible.
+fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
+    if measurement.plan_identity != plan.identity() {
+        return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
+    }
+    match (measurement.coordinates, task.expected_coordinates) {
+        (Coordinates::Contacts, Some(Coordinates::Centres)) => return Some(GateFailure::Contacts),
+        (Coordinates::Centres, Some(Coordinates::Contacts)) => {
+            let message = "the machine returns probe centres, the cell file expects contact points";
+            return Some(GateFailure::Broken(message.into()));
+        }
+        _ => {}
+    }
+    let stated_mm = task.probing.probe_radius_mm;
+    let told = measurement.probe_radius_mm.filter(|told| *told > 0.0);
+    if let Some(told_mm) = told.filter(|told| (told - stated_mm).abs() > MAX_PROBE_RADIUS_DIFFERENCE * stated_mm) {
+        let message =
+            format!("the probe radius of the measurement is {told_mm:.4} mm, that of the recipe is {stated_mm:.4} mm");
+        return Some(GateFailure::Broken(message));
+    }
+    if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
+        let (found, planned) = (measurement.points.len(), plan.targets.len());
+        return Some(GateFailure::Broken(format!("the machine returned {found} points for {planned} targets")));
+    }
+    if let Some(flaw) = measurement.range_violation() {
+        return Some(GateFailure::Broken(flaw));
+    }
+    let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
+    if let Some(k) = order {
+        let (found, planned) = (measurement.points[k].index, plan.targets[k].index);
+        return Some(GateFailure::Broken(format!("point {} is of target {found}, expected target {planned}", k + 1)));
+    }
+    match plan.check(measurement).err()? {
+        PlanMismatch::EqualsPlan if task.rehearsal => None,
+        given_back @ PlanMismatch::EqualsPlan => Some(GateFailure::Foreign(given_back.to_string())),
+        elsewhere => Some(GateFailure::Broken(elsewhere.to_string())),
+    }
+}
+
+/// Minimum number of touches for the comparison: fewer may be equal by chance, if a machine reports coarse steps.
+const MIN_COMPARED_TOUCHES: usize = 8;
+
+/// Returns a failure if a machine has given its earlier result again. No probe repeats every place to the last bit.
+fn repeated_result_failure(task: &Task, earlier: Option<&(u32, Arc<UsablePoints>)>, measurement: &Measurement) -> Option<GateFailure> {
+    let (number, points) = earlier.filter(|_| !task.rehearsal)?;
+    let touched = || measurement.points.iter().filter(|point| point.status == PointStatus::Touched);
+    // Ignore the order of the plan and the points of the reference sphere.
+    let bits = |at_mm: [f64; 3]| at_mm.map(f64::to_bits);
+    let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
+    let is_same = touched().filter(|point| old.contains(&bits(point.position_mm))).count() >= old.len();
+    (is_same && old.len() >= MIN_COMPARED_TOUCHES).then(|| {
+        let message =
+            format!("the points equal those of cycle {number} to the last bit: the machine returned its old result");
+        GateFailure::Foreign(message)
+    })
+}
+
+/// Returns a failure if the temperature is outside the window of the recipe, or is missing when there is a window.
+fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
+    if task.expansion.is_some() && measurement.temperature_c.is_none() {
+        let message = "the measurement has no temperature, which the compensation of the expansion requires (part.expansion_um_m_k)";
+        return Some(GateFailure::Temperature(message.to_owned()));
+    }
+    let [least, most] = task.temperature_range_c?;
+    let wanted = format!("limits {least:.2} to {most:.2} °C (measure.temperature_c)");
+    match measurement.temperature_c {
+        Some(told) if (least..=most).contains(&told) => None,
+        Some(told) => Some(GateFailure::Temperature(format!("it was {told:.2} °C, {wanted}"))),
+        None => Some(GateFailure::Temperature(format!("the measurement has no temperature, {wanted}"))),
+    }
+}
+
+/// Fits the probe radius on the reference sphere. Returns the radius, its standard uncertainty and the rms residual of
+/// the points. Detects contact points and inches in place of centres in millimetres.
+fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
+    let Some(sphere) = task.reference_sphere else { return Ok(None) };
+    let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
+    let (stated, found) = (task.probing.probe_radius_mm, fit.radius_mm - sphere.radius_mm);
+    // Contact points lie on the sphere itself; inches make it 25.4 times smaller.
+    if found.abs() < 0.2 * stated {
+        return Err(GateFailure::Contacts);
+    }
+    if (fit.radius_mm * 25.4 / (sphere.radius_mm + stated) - 1.0).abs() < 0.05 {
+        return Err(GateFailure::Inches);
+    }
+    Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
+}
+
+/// Registers the points of a cycle and writes the result. `before` is the last judged measurement of an earlier pass.
+pub(super) fn register_cycle(
+    task: &Task,
+    files: &mut OutputFiles,
+    number: u32,
+    cycle: &CycleState,
+    before: Option<&CycleState>,
+) -> (Event, ComputationProduct) {
+    match register_and_evaluate(task, files, number, cycle, before) {
+        Ok(found) => {
+            let event = Event::Registered { cycle: number, figures: found.figures.clone() };
+            (event, ComputationProduct::Registered(Box::new(found)))
+        }
+        Err(ComputationError::Failed(why)) => (Event::RegistrationFailed { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+    }
+}
+
+fn register_and_evaluate(
+    task: &Task,
+    files: &mut OutputFiles,
+    number: u32,
+    cycle: &CycleState,
+    before: Option<&CycleState>,
+) -> Result<RegistrationProduct, ComputationError<String>> {
+    let none = || ComputationError::Failed("this cycle has no points".to_owned());
+    let points = cycle.points.as_ref().ok_or_else(none)?;
+    // The target surface of this pass is above the nominal one by its level, and the ball rolls on it.
+    let radius_mm = points.probe_radius_mm.unwrap_or(task.probing.probe_radius_mm);
+    let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
+    let grown = task.expansion.as_ref().zip(points.temperature_c);
+    let (ball_mm, part, scale_sigma) = match grown {
+        Some((expansion, told_c)) => {
+            let part = Cow::Owned(expansion.at_reference(&points.part, told_c));
+            (ball_mm / expansion.length_factor(told_c), part, expansion.length_factor_sigma(told_c))
+        }
+        None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
+    };
+    let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
+    // The first few touches show only if the right part is in the right place. A search on them would be a guess.
+    let at_fixture = task.start_at_fixture || points.tried_targets.len() == 1;
+    let (mut found, options) = task.register_with_start(&part, probe_radius_mm, at_fixture).map_err(classify_error)?;
+    if let Some(why) = found.unjudgeable_reason() {
+        return Err(ComputationError::Failed(why));
+    }
+    found.add_radius_uncertainty(points.probe_radius_sigma_mm.hypot(task.machine_uncertainty.reference_sphere_mm));
+    let given = ModelInputs {
+        machine: task.machine_uncertainty,
+        prior: field_prior(task, cycle, before),
+        radius_sigma_mm: points.probe_radius_sigma_mm,
+        scale_sigma,
+        locked_sigmas: task.locked_direction_sigmas(),
+        is_corrected: !cycle.correction.is_zero(),
+        probe_noise_mm: points.probe_noise_mm,
+        area: cycle_output::area_options(task),
+        ..ModelInputs::default()
+    };
+    let looked = task.adaptive.as_ref().filter(|_| !points.tried_targets.is_empty());
+    let looked_at = looked.is_some();
+    let looked = looked.map(|adaptive| adaptive_measurement::evaluate_touches(task, adaptive, (number, cycle), points, (&found, given)));
+    let (form, next) = match looked {
+        Some(adaptive_measurement::TouchEvaluation { form, next }) => (form, next),
+        None => (Form::estimate(&found, &given).map_err(|error| error.to_string()), None),
+    };
+    if looked_at && next.is_none() {
+        files.switch_to_final_subfolder().and_then(|()| write_measured_points(task, files, points)).map_err(classify_error)?;
+    }
+    write_registration(task, files, &found, &options).map_err(classify_error)?;
+    if let Ok(form) = &form {
+        for name in ["form.csv", "model.json"] {
+            files.add_file(name);
+        }
+        save_form(&files.folder(), form, &found, Some(task.simulation)).map_err(classify_error)?;
+    }
+    // If touches were chosen, the map is the estimated form between them. Otherwise it is the filtered deviations.
+    let error = match &form {
+        Ok(form) if looked_at => adaptive_measurement::interpolate_form(task, form),
+        Err(_) if looked_at => None,
+        _ => error_map(&deviation_samples(&found), &task.map_options).ok(),
+    };
+    cycle_output::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(classify_error)?;
+    let contacts = cycle_output::surface_points(&found);
+    let told = cycle_output::save_parameters(task, files, cycle, &contacts).map_err(classify_error)?;
+    // Every measurement leaves its map, whatever happens to the correction.
+    error.as_ref().map_or(Ok(()), |map| cycle_output::save_error_map(task, files, (number, cycle), map, &found))?;
+    let answer = error.as_ref().and_then(|error| part_response(before?, cycle, &found, error));
+    // Only the first pass of a run reveals parameters of the machine. Later changes are wear and drift, which the
+    // learning covers.
+    let parameters = told.filter(|_| before.is_none());
+    let offered: Vec<String> = parameters.iter().flat_map(offered_messages).collect();
+    let set = match &parameters {
+        Some(told) => cycle_output::next_parameter_corrections(task, cycle, &contacts, told),
+        None => cycle.correction.set.clone(),
+    };
+    let known = error.as_ref().map(|error| update_learning(task, cycle, before, error, (answer, &contacts)));
+    let forecast =
+        known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error, task.scallops_rms_mm()));
+    let mut figures = cell_figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
+    figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
+    if task.expansion.is_some() && grown.is_none() {
+        let message =
+            "the measurement has no temperature: the expansion of the part is not compensated (part.expansion_um_m_k)";
+        figures.warnings.push(message.to_owned());
+    }
+    let untold =
+        |error: &String| format!("form and noise of the probe could not be separated, so U is too small: {error}");
+    if next.is_none() {
+        figures.warnings.extend(form.as_ref().err().map(untold));
+    }
+    figures.touch_on =
+        next.as_ref().map(|(next, why)| Box::new(FurtherTouches { targets: next.len() as u32, why: (*why).to_owned() }));
+    if next.is_some() && form.is_err() {
+        // The first few touches have six motions fitted: their residuals say nothing about the form.
+        figures.form = None;
+    }
+    let next = next.map(|(next, _)| next);
+    // Without a model, the residuals of the fit bound the noise from above.
+    let noise_sigma_mm =
+        form.as_ref().map_or(found.quality.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
+    let again = if looked_at { None } else { adaptive_measurement::plan_repeated_touches(task, &found, points, noise_sigma_mm) };
+    if let Some(left_out) = figures.left_out.as_mut() {
+        left_out.again = again.is_some();
+    }
+    // Before a person is called, the machine checks the touches by repeating them.
+    let again = again.filter(|_| task.tolerance.outliers_decide(&figures));
+    if let Some(again) = again.as_ref().filter(|_| points.repeat_rounds == 0) {
+        let targets = again.targets.len() as u32;
+        let why = "a touch is an outlier: it is repeated, with a few touches around it".to_owned();
+        figures.touch_on = Some(Box::new(FurtherTouches { targets, why }));
+    }
+    let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
+    Ok(RegistrationProduct { registration: found, form: form.ok(), field_hyperparameters: field, error_map: error, learning: known, parameters, parameter_corrections: set, figures, next_targets: next, repeated_touches: again })
+}
+
+/// Returns the messages for the offered parameters.
+fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<Item = String> {
+    told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
+}
+
+/// Returns the prior for the error field of a cycle: from earlier parts for passes of its kind, or else from the
+/// previous pass of this run if it is of the same kind.
+fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> Option<Prior> {
+    let is_corrected = !cycle.correction.is_zero();
+    let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
+    let alike = before.filter(|before| before.correction.is_zero() != is_corrected);
+    let of_this_part = || Some(PartFit::updated(None, &alike?.field_hyperparameters?));
+    taught.or_else(of_this_part).map(|lesson| lesson.prior())
+}
+
+/// Updates the state of the learning with a measured pass.
+fn update_learning(
+    task: &Task,
+    cycle: &CycleState,
+    before: Option<&CycleState>,
+    error: &ErrorMap,
+    (answer, contacts): (Option<compensation::Response>, &[compensation::SurfacePoint]),
+) -> LearningState {
+    let earlier = before.and_then(|before| before.learning.as_deref().cloned()).unwrap_or_else(|| task.initial_learning());
+    let smoother = cycle_output::parameter_explainer(task, cycle, contacts);
+    let smooth = smoother.as_ref().map(|smoother| smoother as compensation::ParameterExplainer<'_>);
+    earlier.updated(&PassObservation { correction: &cycle.correction, error, response: answer, explained: smooth })
+}
+
+fn write_registration(task: &Task, files: &mut OutputFiles, found: &Registration, options: &Options) -> Result<(), FormatError> {
+    let nominal = NominalInput {
+        file: &task.nominal_path,
+        points: task.nominal.len(),
+        kind: format!("{:?}", task.nominal.kind()),
+    };
+    let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    document.simulation = Some(task.simulation);
+    for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {
+        files.add_file(name);
+    }
+    save_registration(&files.folder(), &document, &found.deviations)
+}
+
+fn cell_figures(
+    task: &Task,
+    cycle: &CycleState,
+    found: &Registration,
+    form: Option<&Form>,
+    error: Option<&ErrorMap>,
+    answer: Option<compensation::Response>,
+    forecast: Option<compensation::Forecast>,
+) -> Figures {
+    let verdict = &found.quality;
+    let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
+    let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
+    // The filter removes the noise of a point: noise of the probe and the finest texture.
+    let filtered_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
+    let scatter_mm = form.map_or(filtered_mm, |form| form.hyperparameters.noise_sigma_mm);
+    let pv_robust_mm = pv_998(used_deviations(found).map(|d| d.deviation_mm));
+    // Difference of two extreme points, each with this noise; k = 2.
+    let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
+    // The peak to valley is not negative.
+    let pv_about = |mm| {
+        let of = RecordedInterval::from_expanded(mm, pv_expanded_mm);
+        RecordedInterval { low_mm: of.low_mm.max(0.0), ..of }
+    };
+    let by_points = RecordedFormFigures {
+        pv: pv_about(verdict.pv_mm),
+        pv_robust: pv_about(pv_robust_mm.unwrap_or(verdict.pv_mm)),
+        rms: rms_without_noise(scatter_mm, verdict),
+        scatter_mm,
+    };
+    let told = form.map_or(by_points, |form| cell_form_figures(&form.figures, scatter_mm));
+    // The forecast must be of the same figure: the filtered map still contains the noise of the probe, and the part
+    // does not.
+    let bare = |mm: f64| subtract_in_quadrature(scatter_mm, mm);
+    Figures {
+        pv_mm: verdict.pv_mm,
+        pv_robust_mm,
+        rms_mm: verdict.rms_mm,
+        form: Some(told),
+        pv_expanded_mm,
+        rms_expanded_mm: by_points.rms.expanded_mm(),
+        coverage: verdict.coverage,
+        points: verdict.inliers as u32,
+        outliers,
+        left_out: found
+            .figures_with_outliers()
+            .map(|of| Box::new(OutlierFigures { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.description, again: false })),
+        shift_mm: moved.translation_mm.norm(),
+        turn_rad: moved.angle_rad(),
+        weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
+        warnings: verdict.warnings.clone(),
+        response: answer.map(|answer| cell_response(answer.sense)),
+        forecast: forecast.map(|f| Forecast {
+            rms_mm: bare(f.rms_mm),
+            sigma_mm: f.sigma_mm,
+            floor_mm: f.floor_mm.map(bare),
+        }),
+        removed_mm: Some(task.correction_limits.allowance_mm - cycle.correction.level_mm),
+        unstated: form.and_then(|form| unstated_contributions(task, form)),
+        touch_on: None,
+    }
+}
+
+/// Returns the number of contributions to the uncertainty without a stated value, and the number of all. Without a
+/// locked direction the datum is no contribution.
+fn unstated_contributions(task: &Task, form: &Form) -> Option<[u32; 2]> {
+    let counts = |share: &&model::BudgetEntry| {
+        share.is_stated || share.source != model::UncertaintySource::Datum || task.locked_direction_sigmas().is_some()
+    };
+    let all: Vec<_> = form.budget.iter().filter(counts).collect();
+    let some = all.iter().filter(|share| !share.is_stated).count();
+    (!all.is_empty()).then_some([some as u32, all.len() as u32])
+}
+
+/// Returns the rms after an independent contribution is removed in quadrature.
+fn subtract_in_quadrature(scatter_mm: f64, rms_mm: f64) -> f64 {
+    (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
+}
+
+// The model and the record must use the same probabilities.
+const _: () = {
+    let mut k = 0;
+    while k < RecordedInterval::COUNT {
+        assert!(RecordedInterval::PROBABILITIES[k] == model::Interval::PROBABILITIES[k]);
+        k += 1;
+    }
+};
+
+/// Converts the figures of the model into those of the cell.
+fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFigures {
+    let interval = |of: model::Interval| {
+        let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
+        RecordedInterval { median_mm, low_mm, high_mm, quantiles_mm: Some(quantiles_mm) }
+    };
+    RecordedFormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
+}
+
+/// Returns the root mean square without the noise s of n points, of which the registration used p degrees of freedom:
+/// F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
+fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> RecordedInterval {
+    const MOTIONS: f64 = 6.0;
+    let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
+    let scatter2 = scatter_mm * scatter_mm;
+    let form2 = (verdict.rms_mm.powi(2) - scatter2 * (1.0 - MOTIONS / n)).max(0.0);
+    let expanded2 = 2.0 * ((4.0 * form2 * scatter2 + 2.0 * scatter2 * scatter2) / n).sqrt();
+    RecordedInterval {
+        median_mm: form2.sqrt(),
+        low_mm: (form2 - expanded2).max(0.0).sqrt(),
+        high_mm: (form2 + expanded2).sqrt(),
+        quantiles_mm: None,
+    }
+}
+
+fn part_response(before: &CycleState, cycle: &CycleState, found: &Registration, error: &ErrorMap) -> Option<compensation::Response> {
+    let earlier = before.error_map.as_ref()?;
+    let places: Vec<(Point, Vector)> = used_deviations(found).map(|d| (d.point, d.normal)).collect();
+    let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
+    Some(estimate_response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm))
+}
+
+fn cell_response(sense: ResponseKind) -> PartResponse {
+    match sense {
+        ResponseKind::AsCommanded => PartResponse::Expected,
+        ResponseKind::Flipped => PartResponse::SignFlipped,
+        ResponseKind::MirroredX | ResponseKind::MirroredY | ResponseKind::Turned => PartResponse::Mirrored,
+        ResponseKind::NoEffect => PartResponse::NoEffect,
+        ResponseKind::Doubled => PartResponse::Doubled,
+        ResponseKind::Unclear => PartResponse::Unclear,
+    }
+}
+
+/// Computes the correction of the next pass and writes it.
+pub(super) fn compensate_cycle(task: &Task, files: &mut OutputFiles, number: u32, cycle: &CycleState) -> (Event, ComputationProduct) {
+    match compute_correction(task, files, cycle) {
+        Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, ComputationProduct::Correction(next)),
+        Err(ComputationError::Failed(why)) => (Event::CompensationRefused { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+    }
+}
+
+fn compute_correction(
+    task: &Task,
+    files: &mut OutputFiles,
+    cycle: &CycleState,
+) -> Result<(CompensationSummary, Correction), ComputationError<CompensationRefusal>> {
+    let failed = |why: &dyn std::fmt::Display| ComputationError::Failed(CompensationRefusal::Failed(why.to_string()));
+    let found =
+        cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
+    // If the part may slide within its own surface, the place of the map on the part is unknown.
+    let covariance = cycle.form.as_ref().map_or(&found.quality.covariance, |form| &form.frame_covariance);
+    if let Some(why) = map_obstacle(found, covariance, &task.map_limits) {
+        return Err(ComputationError::Failed(CompensationRefusal::WeakDirections(vec![why])));
+    }
+    let map = match &cycle.error_map {
+        Some(map) => Arc::clone(map),
+        None => Arc::new(error_map(&deviation_samples(found), &task.map_options).map_err(|error| failed(&error))?),
+    };
+    let known = match &cycle.learning {
+        Some(known) => Arc::clone(known),
+        None => Arc::new(update_learning(task, cycle, None, &map, (None, &cycle_output::surface_points(found)))),
+    };
+    let step =
+        cycle.correction.next_pass(&map, &known, cycle.parameter_corrections.as_deref(), &task.correction_limits).map_err(|error| match error {
+            NextPassError::BudgetSpent { .. } => ComputationError::Failed(CompensationRefusal::BudgetSpent(error.to_string())),
+            error => failed(&error),
+        })?;
+    // A pass that cannot be ground must leave no correction that could be mistaken for one.
+    let warning = task.save_program(files, &step.correction).map_err(|error| match classify_error(error) {
+        ComputationError::Failed(why) => failed(&format_args!("the next pass cannot be ground: {why}")),
+        ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+    })?;
+    task.save_correction(files, &step.correction, &cycle.correction).map_err(|error| match classify_error(error) {
+        ComputationError::Failed(why) => failed(&why),
+        ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+    })?;
+    let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
+    let told = cycle.figures.as_ref().and_then(|figures| figures.form);
+    let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.quality.pv_mm, found.quality.rms_mm, 0.0], |form| {
+        [form.pv_robust.median_mm, form.rms.median_mm, form.scatter_mm]
+    });
+    let expected_mm = subtract_in_quadrature(scatter_mm, known.forecast(&map, task.scallops_rms_mm()).rms_mm);
+    let summary = CompensationSummary {
+        largest_mm,
+        depth_mm: step.depth_mm,
+        predicted_pv_mm: expected_mm * pv_mm / rms_mm.max(f64::MIN_POSITIVE),
+        predicted_rms_mm: expected_mm,
+        air_share: step.air_share,
+        gains: known.gains(),
+        response: known.response()[0],
+        warnings: warning.into_iter().collect(),
+        map_rms_mm: task.parameter_compensation.as_ref().map(|_| rms(&step.correction.values_mm)),
+        parameters: recorded_parameters(task, cycle),
+        asks: parameter_questions(cycle),
+    };
+    Ok((summary, step.correction))
+}
+
+/// Returns the estimates of the parameters that the recipe compensates. Empty after the first pass, when they no longer
+/// change.
+pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<RecordedParameter> {
+    let Some(taken) = &task.parameter_compensation else { return Vec::new() };
+    let told = cycle.parameters.iter().flat_map(|told| told.estimates.iter().enumerate());
+    let wanted = told.filter(|(k, p)| taken.tolerances[*k].is_some() && p.inseparable_from.is_empty());
+    let told = |(k, p): (usize, &compensation::EstimatedParameter)| {
+        let units = p.kind.display_units_per_unit();
+        RecordedParameter {
+            name: p.kind.name().to_owned(),
+            unit: p.kind.unit().to_owned(),
+            off: units * p.value,
+            expanded: 2.0 * units * p.sigma,
+            taken: units * p.compensated,
+            told: units * cycle.parameter_corrections.as_ref().map_or(0.0, |set| set.values[k]),
+            removes_rms_um: 1e3 * p.rms_reduction_mm,
+        }
+    };
+    wanted.map(told).collect()
+}
+
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
+}
+
+/// Returns the questions to a person before the next pass: parameters with an error beyond the tolerance of the recipe.
+fn parameter_questions(cycle: &CycleState) -> Vec<String> {
+    let beyond = cycle.parameters.iter().flat_map(|told| &told.estimates).filter(|p| p.exceeds_tolerance);
+    let question = |p: &compensation::EstimatedParameter| {
+        let (units, unit) = (p.kind.display_units_per_unit(), p.kind.unit());
+        let key = p.kind.recipe_key().unwrap_or_default();
+        format!(
+            "{}: error {:.2} \u{b1} {:.2} {unit}; its compensation of {:.2} {unit} exceeds compensation.parameters.{key}",
+            p.kind.name(),
+            units * p.value,
+            2.0 * units * p.sigma,
+            units * p.compensated
+        )
+    };
+    beyond.map(question).collect()
+}
+
+/// Returns the initial state for the next part of this kind. Returns `None` if this run did not get that far, or the
+/// part responded wrongly.
+pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleState, PartPriors)) -> Option<Learned> {
+    let known = cycle.learning.as_deref()?;
+    let wrong = [PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled];
+    if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&estimate_response)) {
+        return None;
+    }
+    let (setting, simulation) = (task.setting.clone(), task.simulation);
+    let correction = cycle.correction.compensating(known, cycle.parameter_corrections.as_deref());
+    Some(
+        Learned::new(simulation, setting, run, correction, known.clone())
+            .with_fields(fields)
+            .of_kind(task.kind.clone()),
+    )
+}
+
+/// Files of the conditions, the touches and the repeated touches of a measurement.
+pub(super) const CONDITIONS_FILE: &str = "measured.json";
+pub(super) const TOUCHES_FILE: &str = "touches.json";
+pub(super) const REPEATED_TOUCHES_FILE: &str = "touched_again.json";
+
+/// Number of rounds in which outliers of a measurement were touched again.
+#[derive(Serialize, Deserialize)]
+pub(super) struct RepeatedTouchesRecord {
+    simulation: bool,
+    pub(super) rounds: u32,
+}
+
+/// Conditions of a measurement, as far as the registration uses them.
+#[derive(Serialize, Deserialize)]
+pub(super) struct MeasurementConditions {
+    simulation: bool,
+    /// Temperature of the part, in °C.
+    pub(super) temperature_c: f64,
+}
+
+/// Writes the points of a measurement, in the CMM frame, and its conditions.
+fn write_measured_points(task: &Task, files: &mut OutputFiles, points: &UsablePoints) -> Result<(), FormatError> {
+    if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
+        let conditions = MeasurementConditions { simulation: task.simulation, temperature_c };
+        write_json_atomic(files.add_file(CONDITIONS_FILE), &conditions)?;
+    }
+    if points.repeat_rounds > 0 {
+        let again = RepeatedTouchesRecord { simulation: task.simulation, rounds: points.repeat_rounds };
+        write_json_atomic(files.add_file(REPEATED_TOUCHES_FILE), &again)?;
+    }
+    if !points.tried_targets.is_empty() {
+        let (tried, of) = (points.tried_targets.clone(), points.point_targets.clone());
+        write_json_atomic(files.add_file(TOUCHES_FILE), &TouchRecord { simulation: task.simulation, tried, of })?;
+    }
+    let header = if task.simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
+    if !points.sphere.is_empty() {
+        write_points(files.add_file("reference_sphere.csv"), header, &points.sphere)?;
+    }
+    write_points(files.add_file("measured.csv"), header, &points.part)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Standard limit of the tests: changes of control points up to 2 µm are noise.
+    const LIMIT_MM: f64 = 2e-3;
+
+    /// Returns five points in a row on a plane, of which the last is an outlier and the others are control points.
+    fn first_touches() -> (RepeatedTouches, UsablePoints) {
+        let part: Vec<Point> = (0..5).map(|k| Point::new(f64::from(k), 0.0, 1.0)).collect();
+        let normal = Vector::z();
+        let again = RepeatedTouches {
+            outlier_points: vec![4],
+            control_points: (0..4).map(|point| ControlPoint { point_index: point, normal }).collect(),
+            max_control_change_mm: LIMIT_MM,
+            targets: Vec::new(),
+        };
+        let points = UsablePoints {
+            part,
+            sphere: Vec::new(),
+            probe_radius_mm: None,
+            coordinates: Coordinates::Centres,
+            probe_radius_sigma_mm: 0.0,
+            probe_noise_mm: [0.0; 2],
+            temperature_c: None,
+            tried_targets: Vec::new(),
+            point_targets: Vec::new(),
+            repeat_rounds: 0,
+        };
+        (again, points)
+    }
+
+    /// Returns a repetition: the outlier, the four control points, and one point around the outlier. `None` is a miss.
+    fn repeated_measurement(heights_mm: [Option<f64>; 6]) -> Measurement {
+        let x_mm = [4.0, 0.0, 1.0, 2.0, 3.0, 3.6];
+        let points = heights_mm.iter().zip(x_mm).zip(0..).map(|((height, x), index)| MeasuredPoint {
+            index,
+            position_mm: [x, 0.0, height.unwrap_or(0.0)],
+            status: if height.is_some() { PointStatus::Touched } else { PointStatus::NotFound },
+            quality: 0,
+        });
+        Measurement {
+            points: points.collect(),
+            coordinates: Coordinates::Centres,
+            probe_radius_mm: None,
+            temperature_c: None,
+            duration_s: None,
+            plan_identity: [0; 32],
+            job: 1,
+            cycle: 1,
+            done: 1,
+        }
+    }
+
+    fn heights(controls_mm: [f64; 4]) -> [Option<f64>; 6] {
+        let [a, b, c, d] = controls_mm;
+        [Some(0.5), Some(a), Some(b), Some(c), Some(d), Some(0.75)]
+    }
+
+    #[test]
+    fn repeated_touches_replace_outliers_and_keep_controls() {
+        let (again, points) = first_touches();
+        let (all, found) = merge_repeated_touches(&again, &points, &repeated_measurement(heights([1.001; 4]))).unwrap();
+        assert_eq!((found, all.repeat_rounds, all.part.len()), (6, 1, 6));
+        assert_eq!(all.part[4], Point::new(4.0, 0.0, 0.5));
+        assert_eq!(all.part[5], Point::new(3.6, 0.0, 0.75));
+        assert_eq!(all.part[..4], points.part[..4]);
+    }
+
+    #[test]
+    fn a_missed_outlier_keeps_its_first_touch() {
+        let (again, points) = first_touches();
+        let missed = [None, Some(1.0), Some(1.0), Some(1.0), Some(1.0), None];
+        let (all, found) = merge_repeated_touches(&again, &points, &repeated_measurement(missed)).unwrap();
+        assert_eq!((found, all.part), (4, points.part));
+    }
+
+    #[test]
+    fn a_part_that_moved_between_the_touches_is_refused() {
+        let (again, points) = first_touches();
+        // A tilt changes only the far control points.
+        for controls in [[1.0021; 4], [0.9979; 4], [1.0, 1.001, 1.0022, 1.0033]] {
+            let refused = merge_repeated_touches(&again, &points, &repeated_measurement(heights(controls)));
+            assert!(matches!(refused, Err(GateFailure::Moved(_))), "{controls:?}");
+        }
+        // A single wrong touch says nothing about the part.
+        assert!(merge_repeated_touches(&again, &points, &repeated_measurement(heights([1.0, 1.0, 9.0, 1.0]))).is_ok());
+    }
+
+    #[test]
+    fn without_two_control_points_the_touches_are_refused() {
+        let (again, points) = first_touches();
+        let missed = [Some(1.0), Some(1.0), None, None, None, Some(1.0)];
+        assert!(matches!(merge_repeated_touches(&again, &points, &repeated_measurement(missed)), Err(GateFailure::Moved(_))));
+    }
+
+    #[test]
+    fn centres_and_contact_points_are_not_mixed() {
+        let (again, points) = first_touches();
+        let contacts = Measurement { coordinates: Coordinates::Contacts, ..repeated_measurement(heights([1.0; 4])) };
+        assert!(matches!(merge_repeated_touches(&again, &points, &contacts), Err(GateFailure::Broken(_))));
+    }
+}

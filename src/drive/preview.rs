@@ -1,0 +1,135 @@
+//! Preliminary figures of the points that a CMM gives while it still measures, for display only. No gate has checked
+//! them, they are not registered, and nothing is judged or recorded by them.
+
+use regrind_control::PreviewStatistics;
+
+use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, PreliminaryPoints, TargetKind};
+
+/// Sums over the touches of the part received for a job so far.
+#[derive(Debug, Default)]
+pub(super) struct PreviewAccumulator {
+    job: Option<Job>,
+    received_points: usize,
+    /// Deviations of the touched points of the part: number, sum of squares, range.
+    touch_count: u32,
+    square_sum_mm2: f64,
+    range_mm: Option<[f64; 2]>,
+}
+
+impl PreviewAccumulator {
+    /// Adds new points. Points that do not continue the previous ones, or do not belong to the plan, discard everything
+    /// received so far.
+    pub(super) fn add_points(&mut self, plan: &Plan, preliminary: &PreliminaryPoints) {
+        let PreliminaryPoints { job, first_index: from, points, coordinates } = preliminary;
+        if *from == 0 {
+            *self = Self { job: Some(*job), ..Self::default() };
+        }
+        let due = plan.targets.get(*from..from.saturating_add(points.len())).unwrap_or_default();
+        let fits =
+            points.len() == due.len() && points.iter().zip(due).all(|(point, target)| point.index == target.index);
+        if self.job != Some(*job) || self.received_points != *from || !fits {
+            return self.reset();
+        }
+        self.received_points += points.len();
+        let part = points.iter().zip(due).filter(|(_, target)| target.kind == TargetKind::Part);
+        for (point, target) in part.filter(|(point, _)| point.status == PointStatus::Touched) {
+            let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
+            self.add_deviation(deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
+        }
+    }
+
+    fn add_deviation(&mut self, mm: f64) {
+        let [least, most] = self.range_mm.unwrap_or([mm, mm]);
+        self.range_mm = Some([least.min(mm), most.max(mm)]);
+        self.square_sum_mm2 += mm * mm;
+        self.touch_count += 1;
+    }
+
+    pub(super) fn reset(&mut self) {
+        *self = Self::default();
+    }
+
+    /// Returns the figures for display. Returns `None` before the part was touched.
+    pub(super) fn statistics(&self) -> Option<PreviewStatistics> {
+        let [least, most] = self.range_mm?;
+        let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touch_count)).sqrt();
+        Some(PreviewStatistics { touched: self.touch_count, rms_um, least_um: 1e3 * least, most_um: 1e3 * most })
+    }
+}
+
+/// Returns the signed distance of a touch from its target along the normal: the error of the part and of its place
+/// together.
+fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
+    (0..3).map(|k| (point.position_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::Target;
+
+    const JOB: Job = Job { job: 1, cycle: 1, digest: 7 };
+
+    fn plan() -> Plan {
+        let target = |index: u32| Target {
+            index,
+            kind: if index == 0 { TargetKind::ReferenceSphere } else { TargetKind::Part },
+            point_mm: [f64::from(index), 0.0, 5.0],
+            normal: [0.6, 0.0, 0.8],
+        };
+        Plan {
+            targets: (0..6).map(target).collect(),
+            probe_radius_mm: 2.0,
+            approach_mm: 1.0,
+            search_mm: 1.0,
+            speed_mm_s: 2.0,
+            safe_height_mm: 20.0,
+            careful_start: None,
+        }
+    }
+
+    /// Centres that are higher than the plan by the given values, and each a little to the side, which is no deviation.
+    fn centres(from: u32, proud_mm: &[f64]) -> PreliminaryPoints {
+        let point = |(index, proud): (u32, &f64)| MeasuredPoint {
+            index,
+            status: PointStatus::Touched,
+            quality: 0,
+            position_mm: [f64::from(index) + (2.0 + proud) * 0.6 + 0.8, 0.3, 5.0 + (2.0 + proud) * 0.8 - 0.6],
+        };
+        let points = (from..).zip(proud_mm).map(point).collect();
+        PreliminaryPoints { job: JOB, first_index: from as usize, points, coordinates: Coordinates::Centres }
+    }
+
+    #[test]
+    fn what_came_is_told_along_the_normals_without_the_sphere_and_what_was_not_touched() {
+        let mut touching = PreviewAccumulator::default();
+        assert_eq!(touching.statistics(), None);
+        touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
+        let mut rest = centres(2, &[-0.004, 9.0]);
+        rest.points[1].status = PointStatus::NotFound;
+        touching.add_points(&plan(), &rest);
+        let told = touching.statistics().unwrap();
+        assert_eq!(told.touched, 2);
+        let near = |found: f64, is: f64| (found - is).abs() < 1e-9;
+        assert!(near(told.least_um, -4.0) && near(told.most_um, 3.0) && near(told.rms_um, 12.5_f64.sqrt()), "{told:?}");
+    }
+
+    #[test]
+    fn what_does_not_follow_or_is_of_another_plan_makes_it_nothing() {
+        for wrong in [
+            centres(3, &[0.001]),
+            PreliminaryPoints { job: Job { job: 2, ..JOB }, ..centres(2, &[0.001]) },
+            PreliminaryPoints { first_index: 2, ..centres(3, &[0.001]) },
+            PreliminaryPoints { first_index: usize::MAX - 1, ..centres(3, &[0.001]) },
+            centres(2, &[0.001; 9]),
+        ] {
+            let mut touching = PreviewAccumulator::default();
+            touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
+            touching.add_points(&plan(), &wrong);
+            assert_eq!(touching.statistics(), None, "{wrong:?}");
+            // Given from the beginning they count again.
+            touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
+            assert_eq!(touching.statistics().map(|told| told.touched), Some(1));
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! Recovery of a machine that holds a job or result of no known run. A person who has seen the state of the machine
+//! decides on each step. Each step is recorded before it is sent.
+
+use std::time::Duration;
+
+use serde_json::json;
+use thiserror::Error;
+use tokio::time::Instant;
+
+use super::recorder::nanoseconds;
+use crate::cell::{Actor, Device};
+use crate::device::{Answer, DeviceError, Fault, Machine, State, Status};
+use crate::journal::{Entry, Journal, JournalError, Kind};
+
+/// Interval between two status reads of a machine in motion.
+const STATUS_INTERVAL: Duration = Duration::from_millis(200);
+
+/// Time after which a machine has certainly released a client that has died.
+const OWNER_RELEASE_TIME: Duration = Duration::from_secs(10);
+/// Interval between two attempts to claim the machine.
+const CLAIM_RETRY_INTERVAL: Duration = Duration::from_millis(500);
+
+/// Step that brings a machine nearer to idle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RecoveryStep {
+    /// End its job in order, or take its preparation back.
+    Stop,
+    /// Discard its result.
+    Acknowledge,
+    /// Leave ABORTED or FAULTED.
+    Clear,
+}
+
+/// Reason why a machine was not recovered.
+#[derive(Debug, Error)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum RecoveryError {
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+    #[error("the {device} was {seen} and is now {found}; no command was sent; check the machine again")]
+    Changed { device: Device, shown: String, found: String },
+    #[error("the {device} is still {found} after {} s; check the machine, then run the command again", .limit.as_secs())]
+    TimedOut { device: Device, found: State, limit: Duration },
+}
+
+impl RecoveryStep {
+    /// Returns the next step for a machine in a state, or `None` if it is idle. A machine that moves is stopped.
+    pub fn for_state(state: State) -> Option<Self> {
+        match state {
+            State::Idle => None,
+            State::Complete => Some(Self::Acknowledge),
+            State::Aborted | State::Faulted => Some(Self::Clear),
+            _ => Some(Self::Stop),
+        }
+    }
+
+    /// Returns the name of the step that a person confirms.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Stop => "STOP",
+            Self::Acknowledge => "ACKNOWLEDGE",
+            Self::Clear => "CLEAR",
+        }
+    }
+
+    /// Returns the effect of the step, and the loss that it causes.
+    pub fn consequence(self, device: Device) -> &'static str {
+        match (self, device) {
+            (Self::Stop, _) => "ends its job in order, clear of the part, or withdraws its preparation",
+            (Self::Acknowledge, Device::Cmm) => "discards its result: a measurement that no run has collected is lost",
+            (Self::Acknowledge, Device::Grinder) => {
+                "discards its result: the part has had this pass, but no run will know it"
+            }
+            (Self::Clear, _) => {
+                "returns it to idle: first check that it is at rest, clear of the part, and why it was stopped"
+            }
+        }
+    }
+}
+
+/// Connects and returns the status of a machine. Writes nothing to it but the heartbeat of this client.
+pub async fn read_status<M: Machine>(machine: &mut M) -> Result<Status, RecoveryError> {
+    machine.connect().await?;
+    Ok(machine.status().await?)
+}
+
+/// Sends one step to a machine if its status is still as a person has seen it. Returns the status when the machine has
+/// come to rest. The step is recorded before it is sent, and its outcome after. `by` is the person who decided, and the
+/// place.
+///
+/// # Errors
+/// A machine that cannot be reached, belongs to another client, has changed, refuses, or does not come to rest within
+/// the limit; a record that cannot be written.
+pub async fn execute_step<M: Machine>(
+    machine: &mut M,
+    device: Device,
+    step: RecoveryStep,
+    seen: &Status,
+    limit: Duration,
+    journal: &mut Journal,
+    by: &Actor,
+) -> Result<Status, RecoveryError> {
+    let began = Instant::now();
+    let found = read_status(machine).await?;
+    if describe_status(&found) != describe_status(seen) {
+        return Err(RecoveryError::Changed { device, shown: describe_status(seen), found: describe_status(&found) });
+    }
+    claim_with_retry(machine).await?;
+    let by = |kind, payload| {
+        let (actor, station) = (by.name.clone(), by.station.clone());
+        Entry { actor, station, ..Entry::new(kind, nanoseconds(began.elapsed()), 0, payload) }
+    };
+    let payload = json!({ "recover": step.name(), "device": device, "seen": describe_status(&found) });
+    let intent = journal.intend(by(Kind::Intent, payload))?;
+    let given = match step {
+        RecoveryStep::Stop => machine.stop().await,
+        RecoveryStep::Acknowledge => machine.acknowledge(found.done).await,
+        RecoveryStep::Clear => machine.clear().await,
+    };
+    let ended = match given {
+        Ok(status) => wait_until_at_rest(machine, device, status, limit).await,
+        Err(error) => Err(error.into()),
+    };
+    let told = ended.as_ref().map_or_else(ToString::to_string, describe_status);
+    journal.append(Entry { command_id: Some(intent), ..by(Kind::Outcome, json!({ "found": told })) })?;
+    // Optional: a machine whose owner is silent can be claimed by the next client.
+    let _ = machine.release().await;
+    ended
+}
+
+/// Claims the machine for this program. A previous client may have died a moment ago; the machine then waits for it for
+/// a while.
+async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
+    let by = Instant::now() + OWNER_RELEASE_TIME;
+    loop {
+        match machine.claim().await {
+            Err(DeviceError::Refused { answer: Answer::NotOwner, .. }) if Instant::now() < by => {
+                tokio::time::sleep(CLAIM_RETRY_INTERVAL).await;
+            }
+            claimed => return claimed.map(drop),
+        }
+    }
+}
+
+/// Describes a machine in short: its state, its job, and the result that it holds.
+pub fn describe_status(status: &Status) -> String {
+    let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
+    let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
+    let result = if status.state == State::Complete { format!(", result {}", status.done) } else { String::new() };
+    format!("{}{job}{fault}{result}", status.state)
+}
+
+/// Waits until a machine stands still.
+async fn wait_until_at_rest<M: Machine>(
+    machine: &mut M,
+    device: Device,
+    mut status: Status,
+    limit: Duration,
+) -> Result<Status, RecoveryError> {
+    let by = Instant::now() + limit;
+    while status.state.is_moving() {
+        if Instant::now() > by {
+            return Err(RecoveryError::TimedOut { device, found: status.state, limit });
+        }
+        tokio::time::sleep(STATUS_INTERVAL).await;
+        status = machine.status().await?;
+    }
+    Ok(status)
+}

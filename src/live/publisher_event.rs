@@ -1,0 +1,98 @@
+//! Events from the publishers to the program that started them: refused requests, and whether the peer is connected.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use regrind_document::visible;
+use tokio::sync::mpsc;
+
+/// Maximum number of queued events.
+const WAITING: usize = 256;
+/// Maximum length of a reported text from outside, in characters.
+const LONGEST: usize = 200;
+
+/// Event of a publisher.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "named for what they are")]
+pub enum PublisherEvent {
+    /// The publisher is connected from now on.
+    Connected { place: String },
+    /// The publisher is not connected; it retries.
+    Retrying { place: String, why: String },
+    /// A client requested something that it may not do here.
+    Refused { by: String, what: String },
+    /// This many more refusals did not fit in the queue.
+    RefusedMore { times: u32 },
+}
+
+/// Sender of events. It never blocks: events that do not fit in the queue are counted.
+#[derive(Clone, Debug)]
+pub struct EventSender {
+    to: mpsc::Sender<PublisherEvent>,
+    missed: Arc<AtomicU32>,
+}
+
+/// Creates the queue of events; returns its sender and its receiver.
+pub fn event_queue() -> (EventSender, mpsc::Receiver<PublisherEvent>) {
+    let (to, heard) = mpsc::channel(WAITING);
+    (EventSender { to, missed: Arc::default() }, heard)
+}
+
+impl EventSender {
+    pub(crate) fn connected(&self, place: &str) {
+        // A lost event does no harm here: the published values show the same.
+        let _ = self.to.try_send(PublisherEvent::Connected { place: place.to_owned() });
+    }
+
+    pub(crate) fn retrying(&self, place: &str, why: String) {
+        let _ = self.to.try_send(PublisherEvent::Retrying { place: place.to_owned(), why });
+    }
+
+    pub(crate) fn refused(&self, by: String, what: &str) {
+        let times = self.missed.swap(0, Ordering::Relaxed);
+        if times > 0 && self.to.try_send(PublisherEvent::RefusedMore { times }).is_err() {
+            self.missed.fetch_add(times, Ordering::Relaxed);
+        }
+        if self.to.try_send(PublisherEvent::Refused { by: in_a_line(&by), what: in_a_line(what) }).is_err() {
+            self.missed.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Returns the beginning of a text from outside as one line, without invisible characters.
+fn in_a_line(text: &str) -> String {
+    let mut line: String = text.chars().take(LONGEST).collect();
+    if line.len() < text.len() {
+        line.push_str(" ...");
+    }
+    visible(&line.replace(['\n', '\t'], " "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_hears_is_counted_and_told_later() {
+        let (notes, mut heard) = event_queue();
+        for k in 0..WAITING + 3 {
+            notes.refused("somebody".into(), &format!("order {k}"));
+        }
+        for _ in 0..2 {
+            heard.try_recv().unwrap();
+        }
+        notes.refused("somebody".into(), "the last");
+        let mut last = Vec::new();
+        while let Ok(news) = heard.try_recv() {
+            last.push(news);
+        }
+        let the_last = PublisherEvent::Refused { by: "somebody".into(), what: "the last".into() };
+        assert_eq!(last.split_off(last.len() - 2), [PublisherEvent::RefusedMore { times: 3 }, the_last]);
+    }
+
+    #[test]
+    fn a_text_from_outside_is_a_short_line_that_is_what_it_seems() {
+        assert_eq!(in_a_line("a\nb\u{202e}c"), "a b<U+202E>c");
+        assert_eq!(in_a_line(&"x".repeat(1000)).len(), LONGEST + 4);
+    }
+}

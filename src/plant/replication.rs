@@ -1,0 +1,361 @@
+//! Replication of the journals of a cell to the plant. Records are sent at least once, and stored exactly once.
+//!
+//! ```text
+//!  runs/<id>/journal.sqlite --records--> ship() --+--> record      held against the chain as it arrives
+//!                  files on record --by hash----> +--> artefact    each content once
+//!                  what a glance shows ---------> +--> run, cycle
+//! ```
+//!
+//! The plant alone stores how far a run is replicated. After any loss, a round therefore continues from the plant's
+//! state. A journal that is shorter than the plant's copy, or differs from it, was cut or rewritten; it is reported and
+//! not replicated further.
+
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use regrind_formats::{LEARNED, ResultFolder, write_atomic};
+use regrind_journal::{DATABASE, Kind, Reader, Record, Stamp, sha256_hex, stamp};
+use regrind_report::{RunResult, RunSummary, run_summary};
+use serde_json::{Value, json};
+use tokio_postgres::types::ToSql;
+
+use super::copy::PlantRun;
+use super::error::{PlantError, refused};
+use super::hex::{digits, unhex};
+use super::knowledge::teach;
+use super::link::Link;
+use super::settings::ArtefactSettings;
+
+/// Maximum number of records, and of bytes of text, in one batch.
+const MOST_RECORDS: usize = 1000;
+const MOST_BYTES: usize = 1 << 20;
+/// Maximum size of a content in the database.
+const MAX_CONTENT_BYTES: u64 = 256 << 20;
+
+/// Replicates the runs of a folder.
+pub struct Replicator {
+    runs: PathBuf,
+    artefacts: Option<ArtefactSettings>,
+    /// Runs that are completely replicated, with the stamp of their files at that time.
+    settled: HashMap<String, Stamp>,
+    /// Runs that cannot be replicated, with the reason.
+    left_alone: HashMap<String, String>,
+    /// Files, by run and name, that cannot be replicated and were reported.
+    reported: HashSet<(String, String)>,
+}
+
+/// Result of one round.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ReplicationResult {
+    /// Number of records that the plant did not have.
+    pub records: u64,
+    /// Number of file contents that the plant did not have.
+    pub files: u64,
+    /// Number of runs of which something was sent.
+    pub runs: u64,
+    /// Runs that differ from the plant's copy, or that have a file which cannot be sent, with the reason. Each is
+    /// reported once.
+    pub differ: Vec<(String, String)>,
+}
+
+/// State of a run in the plant.
+struct There {
+    id: i32,
+    records: i32,
+    head: Vec<u8>,
+}
+
+impl Replicator {
+    /// Creates a shipper for a folder of runs.
+    pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
+        Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), reported: HashSet::new() }
+    }
+
+    /// Returns the runs that differ from the plant's copy, with the reason.
+    pub fn left_alone(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
+    }
+
+    /// Sends everything that the plant does not have, the newest run first.
+    ///
+    /// # Errors
+    /// The plant cannot be reached, or refuses everything. A fault of one run is in the result, and the other runs
+    /// continue.
+    pub async fn round(&mut self, link: &Link) -> Result<ReplicationResult, PlantError> {
+        let mut shipped = ReplicationResult::default();
+        for (name, stamp) in self.unsettled() {
+            match self.replicate_run(link, &name, &mut shipped).await {
+                Ok(true) => drop(self.settled.insert(name, stamp)),
+                Ok(false) => {}
+                Err(PlantError::Differs { run, what }) => {
+                    self.left_alone.insert(run.clone(), what.clone());
+                    shipped.differ.push((run, what));
+                }
+                // The journal is being created, or cannot be read now: a later round retries.
+                Err(PlantError::Journal(_) | PlantError::Report(_)) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(shipped)
+    }
+
+    /// Returns the runs that can have new content.
+    fn unsettled(&self) -> Vec<(String, Stamp)> {
+        let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
+        let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
+        let mut open: Vec<(String, Stamp)> = named
+            .filter(|name| !name.starts_with('.') && self.runs.join(name).join(DATABASE).is_file())
+            .map(|name| (stamp(&self.runs.join(&name)), name))
+            .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.left_alone.contains_key(name))
+            .map(|(stamp, name)| (name, stamp))
+            .collect();
+        open.sort_by_key(|(_, stamp)| std::cmp::Reverse(stamp.iter().flatten().map(|(at, _)| *at).max()));
+        open
+    }
+
+    /// Replicates one run; returns true if the plant then has all of it.
+    async fn replicate_run(&mut self, link: &Link, name: &str, shipped: &mut ReplicationResult) -> Result<bool, PlantError> {
+        let folder = self.runs.join(name);
+        let Some(last) = Reader::open(&folder)?.last()? else { return Ok(false) };
+        let mut there = open_run(link, name).await?;
+        let began_with = there.records;
+        compare_with_plant(link, &folder, name, &there).await?;
+        while i64::from(there.records) < last.seq as i64 {
+            let batch = batch(&folder, there.records)?;
+            if batch.is_empty() {
+                break;
+            }
+            there = give(link, name, there, &batch).await?;
+        }
+        let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
+        let is_over = || Ok::<_, PlantError>(matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?);
+        if there.records > began_with || is_over()? {
+            report_run(link, there.id, &glance(&folder)?).await?;
+        }
+        if missing == 0 && is_over()? {
+            self.teach(link, &folder, name, there.id, shipped).await?;
+        }
+        shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);
+        shipped.files += given;
+        shipped.runs += u64::from(there.records > began_with || given > 0);
+        Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
+    }
+
+    /// Registers in the plant what a finished run has learned.
+    async fn teach(
+        &mut self,
+        link: &Link,
+        folder: &Path,
+        run: &str,
+        id: i32,
+        shipped: &mut ReplicationResult,
+    ) -> Result<(), PlantError> {
+        if let Some(why) = teach(link, folder, id).await?
+            && self.reported.insert((run.to_owned(), LEARNED.to_owned()))
+        {
+            shipped.differ.push((run.to_owned(), why));
+        }
+        Ok(())
+    }
+
+    /// Sends the contents of the recorded files that the plant does not have. Returns how many were sent and how many
+    /// could not be sent.
+    async fn give_files(
+        &mut self,
+        link: &Link,
+        folder: &Path,
+        run: &str,
+        id: i32,
+        shipped: &mut ReplicationResult,
+    ) -> Result<[u64; 2], PlantError> {
+        let failed = refused("the query of missing files");
+        let rows = link.client().query("SELECT name, sha256, bytes FROM missing_artefacts($1)", &[&id]).await;
+        let mut files = [0; 2];
+        for row in rows.map_err(failed)? {
+            let (name, sha256, bytes): (&str, &[u8], i64) = (row.get(0), row.get(1), row.get(2));
+            let Some(what) = self.give_file(link, &folder.join(name), sha256, bytes as u64).await? else {
+                files[0] += 1;
+                continue;
+            };
+            files[1] += 1;
+            if self.reported.insert((run.to_owned(), name.to_owned())) {
+                let what = format!("the file {name} {what}");
+                complain(link, run, "a file that cannot be shipped", &what).await?;
+                shipped.differ.push((run.to_owned(), what));
+            }
+        }
+        Ok(files)
+    }
+
+    /// Sends the content of one file; returns the reason if it cannot be sent.
+    async fn give_file(
+        &self,
+        link: &Link,
+        path: &Path,
+        sha256: &[u8],
+        bytes: u64,
+    ) -> Result<Option<String>, PlantError> {
+        let read = match fs::metadata(path) {
+            Ok(found) if found.len() == bytes => fs::read(path),
+            Ok(_) => return Ok(Some("was changed".into())),
+            Err(error) => Err(error),
+        };
+        let content = match read {
+            Ok(content) => content,
+            Err(error) => return Ok(Some(format!("cannot be read: {error}"))),
+        };
+        if sha256_hex(&content) != digits(sha256) {
+            return Ok(Some("was changed".into()));
+        }
+        let failed = refused("the content of a file");
+        if let Some(kept) = self.artefacts.as_ref().filter(|kept| bytes as f64 >= kept.from_mb * 1e6) {
+            put_aside(&kept.folder, sha256, &content)?;
+            let placed = link.client().query_one("SELECT place_artefact($1, $2)", &[&sha256, &(bytes as i64)]).await;
+            if placed.map_err(&failed)?.get(0) {
+                return Ok(None);
+            }
+        }
+        if bytes > MAX_CONTENT_BYTES {
+            let most = MAX_CONTENT_BYTES >> 20;
+            return Ok(Some(format!(
+                "has {} MB, and the database accepts at most {most} MB: name a folder in [artefacts]",
+                bytes >> 20
+            )));
+        } else {
+            link.client().query_one("SELECT give_artefact($1, $2)", &[&sha256, &content]).await.map_err(failed)?;
+        }
+        Ok(None)
+    }
+}
+
+/// Writes a content to the folder of the plant, under its hash. An existing file is checked, and repaired if it
+/// differs.
+fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
+    let name = digits(sha256);
+    let path = folder.join(&name[..2]).join(&name);
+    if fs::read(&path).is_ok_and(|found| found == content) {
+        return Ok(());
+    }
+    let parent = folder.join(&name[..2]);
+    ResultFolder::prepare(&parent)?.keep();
+    Ok(write_atomic(&path, content)?)
+}
+
+async fn open_run(link: &Link, name: &str) -> Result<There, PlantError> {
+    let row = link.client().query_one("SELECT id, records, head FROM open_run($1)", &[&name]).await;
+    let row = row.map_err(refused("to open a run"))?;
+    Ok(There { id: row.get(0), records: row.get(1), head: row.get(2) })
+}
+
+/// Compares a journal with the plant's copy, and reports a difference to the plant.
+async fn compare_with_plant(link: &Link, folder: &Path, run: &str, there: &There) -> Result<(), PlantError> {
+    let copy = PlantRun {
+        id: there.id,
+        cell: String::new(),
+        name: run.to_owned(),
+        records: u64::try_from(there.records).unwrap_or(0),
+        head: digits(&there.head),
+        keys: Vec::new(),
+    };
+    match copy.stands_in(folder) {
+        Err(PlantError::Differs { run, what }) => {
+            complain(link, &run, "a journal that differs", &what).await?;
+            Err(PlantError::Differs { run, what })
+        }
+        other => other,
+    }
+}
+
+/// Reads the next batch of records.
+fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
+    let mut batch = Vec::new();
+    let mut bytes = 0;
+    let reader = Reader::open(folder)?;
+    for record in reader.records(u64::try_from(records).unwrap_or(0) + 1) {
+        let record = record?;
+        bytes += record.payload.len() + 300;
+        batch.push(record);
+        if batch.len() == MOST_RECORDS || bytes > MOST_BYTES {
+            break;
+        }
+    }
+    Ok(batch)
+}
+
+/// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
+/// the state.
+async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<There, PlantError> {
+    let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
+    let texts: Vec<String> = batch.iter().map(Record::text).collect();
+    let from = there.records + 1;
+    let values: [&(dyn ToSql + Sync); 4] = [&there.id, &from, &hashes, &texts];
+    let row = link.client().query_one("SELECT records, head, refused FROM ship($1, $2, $3, $4)", &values).await;
+    let row = row.map_err(refused("records"))?;
+    match row.get::<_, Option<String>>(2) {
+        Some(what) => Err(PlantError::Differs { run: run.to_owned(), what: format!("the plant refuses it: {what}") }),
+        None => Ok(There { records: row.get(0), head: row.get(1), ..there }),
+    }
+}
+
+/// Returns true if the run with this last record has its end on record.
+fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
+    if last.kind == Kind::End {
+        return Ok(true);
+    }
+    let before = Reader::open(folder)?.records(last.seq - 1).next().transpose()?;
+    Ok(before.is_some_and(|before| before.kind == Kind::End))
+}
+
+async fn complain(link: &Link, run: &str, what: &str, words: &str) -> Result<(), PlantError> {
+    let told = link.client().query_one("SELECT complain($1, $2, $3)", &[&run, &what, &words]).await;
+    told.map(drop).map_err(refused("the report of a problem"))
+}
+
+async fn report_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> {
+    let text = told.to_string();
+    let asked = link.client().execute("SELECT tell_run($1, $2::text::jsonb)", &[&id, &text]).await;
+    asked.map(drop).map_err(refused("the status of a run"))
+}
+
+/// Returns the summary of a run from its record: result, limits, machines, and the figures of each cycle in µm.
+///
+/// # Errors
+/// The record cannot be read.
+pub fn glance(folder: &Path) -> Result<Value, PlantError> {
+    let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
+    // A missing limit is infinite, which JSON cannot represent.
+    let limit = |mm: f64| mm.is_finite().then_some(1e3 * mm);
+    let cycles = cycles.iter().map(|of| {
+        let [[pv, pv_u], [rms, rms_u]] = of.figures.map_or([[None; 2]; 2], |figures| figures.map(|of| of.map(Some)));
+        let [expected_pv, expected_rms] = of.expected.map_or([None; 2], |of| of.map(Some));
+        json!({
+            "cycle": of.cycle, "verdict": of.verdict, "reason": of.reason, "pv_um": pv, "pv_u_um": pv_u, "rms_um": rms, "rms_u_um": rms_u,
+            "expected_pv_um": expected_pv, "expected_rms_um": expected_rms, "map": of.map,
+        })
+    });
+    let [cmm, grinder] = machines;
+    Ok(json!({
+        "result": result_word(result), "verdict": verdict, "alarms": alarms.len(), "cmm": cmm, "grinder": grinder,
+        "wheel": wheel_radius_mm.map(|mm| format!("R {mm:.3} mm")), "probe": probe_of(folder).map(|mm| format!("R {mm:.3} mm")),
+        "pv_limit_um": tolerance.and_then(|of| limit(of.pv_mm)), "rms_limit_um": tolerance.and_then(|of| limit(of.rms_mm)),
+        "cycles": cycles.collect::<Vec<_>>(),
+    }))
+}
+
+/// Returns the radius of the probe from the recipe of the run.
+fn probe_of(folder: &Path) -> Option<f64> {
+    let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
+    recipe.get("measure")?.get("probe_radius_mm")?.as_float()
+}
+
+fn result_word(result: RunResult) -> &'static str {
+    match result {
+        RunResult::Open => "open",
+        RunResult::Accepted => "accepted",
+        RunResult::NotAccepted => "not accepted",
+        RunResult::Stopped => "stopped",
+        RunResult::Aborted => "aborted",
+        RunResult::Recovery => "recovery",
+    }
+}

@@ -1,0 +1,307 @@
+//! History of a run from its journal, as far as a report shows it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::ReportError;
+use super::record_content::RecordContent;
+use super::words::{gate_words, words};
+use regrind_cell::{
+    Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, RecordedParameter, Reconciliation,
+    Tolerance,
+};
+use regrind_journal::{Reader, Record, Verified, verify};
+
+/// File of the error map of a cycle, as text.
+const MAP: &str = "error_map.csv";
+
+/// File of the points of a cycle with their deviations, as text.
+const DEVIATIONS: &str = "deviations.csv";
+
+/// File of the registration of a cycle.
+const REGISTRATION: &str = "registration.json";
+
+/// File of the figures of a cycle.
+const FIGURES: &str = "figures.json";
+
+#[derive(Default)]
+pub(super) struct RunHistory {
+    pub(super) begin: Option<Record>,
+    pub(super) end: Option<Record>,
+    pub(super) ending: Option<Ending>,
+    /// For each machine, true if it came home; `None` if this is not the record of a recovery.
+    pub(super) home: Option<[bool; 2]>,
+    pub(super) cycles: BTreeMap<u32, CycleHistory>,
+    /// Name and address of each machine, as it reported them.
+    pub(super) machines: [Option<[String; 2]>; 2],
+    /// Radius of the wheel that the grinder reported last.
+    pub(super) wheel_radius_mm: Option<f64>,
+    /// Cycle and value of the last error of the probe's radius on the reference sphere.
+    pub(super) radius_error_mm: Option<(u32, f64)>,
+    pub(super) alarms: Vec<AlarmHistory>,
+    pub(super) orders: Vec<Order>,
+    /// Pass that was started last.
+    pub(super) pass: Option<PassHistory>,
+    /// Time of the last record.
+    pub(super) last: String,
+}
+
+/// Progress of a pass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct PassHistory {
+    pub(super) cycle: u32,
+    /// Ground part of its path and whole path, as the grinder reported them last.
+    pub(super) ground: Option<[u32; 2]>,
+    /// Result of the pass; `None` if it is not on record.
+    pub(super) result: Option<JobResult>,
+}
+
+#[derive(Default)]
+pub(super) struct CycleHistory {
+    pub(super) measurements: Vec<Measurement>,
+    /// Height of the target surface above the nominal one.
+    pub(super) level_um: Option<f64>,
+    /// Name of the map within the run folder, and the time at which it was recorded.
+    pub(super) map: Option<(String, String)>,
+    /// Name of the file of points with their deviations within the run folder.
+    pub(super) deviations: Option<String>,
+    /// Name of the registration file within the run folder.
+    pub(super) registration: Option<String>,
+    /// Name of the file of figures within the run folder.
+    pub(super) form: Option<String>,
+    /// PV and RMS that are expected after the next pass, in millimetres.
+    pub(super) expected_mm: Option<[f64; 2]>,
+    /// Estimates of the parameters of the machine.
+    pub(super) parameters: Vec<RecordedParameter>,
+    /// Root mean square of the error that is left for the map in addition to the parameters, in millimetres.
+    pub(super) map_rms_mm: Option<f64>,
+}
+
+/// Measurement of a cycle: its figures, or the reason why there are none.
+#[derive(Default)]
+pub(super) struct Measurement {
+    /// Time of the last record about the measurement.
+    pub(super) utc: String,
+    pub(super) figures: Option<Figures>,
+    pub(super) unusable: Option<String>,
+    /// Judgements in their order. A judgement can be amended; the last one counts.
+    pub(super) judgements: Vec<Judgement>,
+}
+
+impl Measurement {
+    /// Returns true if further touches belong to this measurement.
+    fn goes_on(&self) -> bool {
+        self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
+    }
+}
+
+/// Alarm from the record.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AlarmHistory {
+    /// Alarm itself.
+    pub alarm: Alarm,
+    /// Time at which it was raised, RFC 3339 in UTC.
+    pub raised: String,
+    /// Time at which it was withdrawn; `None` if it was active until the end of the record.
+    pub withdrawn: Option<String>,
+}
+
+/// Order of a person, or confirmation of the state of a machine.
+pub(super) struct Order {
+    pub(super) record: Record,
+    /// Event that the cell processed; `None` for an order that goes directly to a machine, past the cell.
+    event: Option<Event>,
+    pub(super) refused: Option<String>,
+}
+
+impl RunHistory {
+    /// Verifies the record of a run and reads its history, as far as the record is verified.
+    ///
+    /// # Errors
+    /// Fails if the record cannot be read or does not pass verification.
+    pub(super) fn read_verified(folder: &Path) -> Result<(Self, Verified), ReportError> {
+        let verified = verify(folder)?;
+        let mut story = Self::default();
+        for record in Reader::open(folder)?.records(0).take(verified.records as usize) {
+            story.add_record(record?);
+        }
+        Ok((story, verified))
+    }
+
+    pub(super) fn add_record(&mut self, record: Record) {
+        self.last.clone_from(&record.utc);
+        match RecordContent::from_record(&record) {
+            RecordContent::Begun(_) => self.begin = Some(record),
+            RecordContent::Command(command) => self.add_command(record, *command),
+            RecordContent::Event(event) => self.add_event(record, *event),
+            RecordContent::Confirmation(..) | RecordContent::Step(..) => self.orders.push(Order { record, event: None, refused: None }),
+            RecordContent::File(file) => self.add_file(&record, file["name"].as_str().unwrap_or_default()),
+            RecordContent::End(ending, cycles) => {
+                self.add_levels(&cycles);
+                self.ending = Some(ending);
+                self.end = Some(record);
+            }
+            RecordContent::Pass(pass) => {
+                self.wheel_radius_mm = pass["wheel_radius_mm"].as_f64().or(self.wheel_radius_mm);
+            }
+            RecordContent::Home(home) => {
+                self.home = Some(home);
+                self.end = Some(record);
+            }
+            RecordContent::Unknown if record.kind == regrind_journal::Kind::End => self.end = Some(record),
+            RecordContent::Reopened
+            | RecordContent::Answer(_)
+            | RecordContent::Remarks(..)
+            | RecordContent::Remark(_)
+            | RecordContent::Transfer(_)
+            | RecordContent::Seal(_)
+            | RecordContent::Unknown => {}
+        }
+    }
+
+    fn add_command(&mut self, record: Record, command: Command) {
+        match command {
+            Command::LoadPass { cycle } | Command::LoadPlan { cycle } => drop(self.cycle(cycle)),
+            Command::Announce(judgement) => self.measurement(judgement.cycle).judgements.push(judgement),
+            Command::Raise(alarm) => {
+                self.alarms.push(AlarmHistory { alarm, raised: record.utc, withdrawn: None });
+            }
+            Command::Withdraw { alarm } => {
+                let standing = |a: &&mut AlarmHistory| a.alarm.id == alarm && a.withdrawn.is_none();
+                self.alarms.iter_mut().filter(standing).for_each(|a| a.withdrawn = Some(record.utc.clone()));
+            }
+            Command::Refuse { event, why, .. } => {
+                let given = |order: &&mut Order| order.event.as_ref() == Some(&*event) && order.refused.is_none();
+                if let Some(order) = self.orders.iter_mut().rev().find(given) {
+                    order.refused = Some(why);
+                }
+            }
+            Command::Finish(ending) => self.ending = Some(ending),
+            _ => {}
+        }
+    }
+
+    fn add_event(&mut self, record: Record, event: Event) {
+        match event {
+            Event::Collected { cycle, gate, .. } => {
+                let unusable = Some(&gate).filter(|gate| **gate != GateResult::Passed).map(gate_words);
+                let measurements = &mut self.cycle(cycle).measurements;
+                match measurements.last_mut().filter(|last| last.goes_on()) {
+                    // Further touches belong to the same measurement. Its earlier result stays valid until more is
+                    // known.
+                    Some(last) if unusable.is_none() => last.utc = record.utc,
+                    Some(last) => *last = Measurement { utc: record.utc, unusable, ..Measurement::default() },
+                    None => measurements.push(Measurement { utc: record.utc, unusable, ..Measurement::default() }),
+                }
+            }
+            Event::Registered { cycle, figures } => {
+                // A judged measurement keeps its figures.
+                if self.measurement(cycle).figures.is_some() && !self.measurement(cycle).goes_on() {
+                    self.cycle(cycle).measurements.push(Measurement::default());
+                }
+                let measurement = self.measurement(cycle);
+                measurement.figures = Some(figures);
+                measurement.utc = record.utc;
+            }
+            Event::Connected { device, .. } => {
+                let detail = &record.value()["detail"];
+                let [name, address] =
+                    ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not told").to_owned());
+                self.machines[device as usize] = Some([name, address]);
+            }
+            Event::Started { device: Device::Grinder, cycle } => {
+                self.pass = Some(PassHistory { cycle, ground: None, result: None });
+            }
+            Event::Progressed { device: Device::Grinder, done, total } => {
+                let under_way = self.pass.as_mut().filter(|pass| pass.result.is_none());
+                under_way.into_iter().for_each(|pass| pass.ground = Some([done, total]));
+            }
+            Event::Ended { device: Device::Grinder, cycle, result }
+            | Event::Reconciled { device: Device::Grinder, cycle, outcome: Reconciliation::Ended(result) } => {
+                let of_it = self.pass.as_mut().filter(|pass| pass.cycle == cycle);
+                of_it.into_iter().for_each(|pass| pass.result = Some(result));
+            }
+            Event::Qualified { cycle, radius_error_mm } => self.radius_error_mm = Some((cycle, radius_error_mm)),
+            Event::Compensated { cycle, summary } => {
+                let story = self.cycle(cycle);
+                story.expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
+                (story.parameters, story.map_rms_mm) = (summary.parameters, summary.map_rms_mm);
+            }
+            Event::RegistrationFailed { cycle, why } => {
+                self.measurement(cycle).unusable = Some(format!("not registered: {why}"));
+            }
+            event if event.actor().is_some() => {
+                self.orders.push(Order { record, event: Some(event), refused: None });
+            }
+            _ => {}
+        }
+    }
+
+    fn add_file(&mut self, record: &Record, name: &str) {
+        // Results computed again after an interruption are in a separate folder. The last ones count.
+        if !name.starts_with(&format!("cycle-{}/", record.cycle)) {
+            return;
+        }
+        if name.ends_with(&format!("/{MAP}")) {
+            self.cycle(record.cycle).map = Some((name.to_owned(), record.utc.clone()));
+        } else if name.ends_with(&format!("/{DEVIATIONS}")) {
+            self.cycle(record.cycle).deviations = Some(name.to_owned());
+        } else if name.ends_with(&format!("/{REGISTRATION}")) {
+            self.cycle(record.cycle).registration = Some(name.to_owned());
+        } else if name.ends_with(&format!("/{FIGURES}")) {
+            self.cycle(record.cycle).form = Some(name.to_owned());
+        }
+    }
+
+    fn add_levels(&mut self, cycles: &Value) {
+        for row in cycles.as_array().into_iter().flatten() {
+            if let Some(cycle) = row["cycle"].as_u64().and_then(|cycle| u32::try_from(cycle).ok()) {
+                self.cycle(cycle).level_um = row["level_um"].as_f64();
+            }
+        }
+    }
+
+    fn cycle(&mut self, number: u32) -> &mut CycleHistory {
+        self.cycles.entry(number).or_default()
+    }
+
+    /// Returns the last measurement of a cycle.
+    fn measurement(&mut self, number: u32) -> &mut Measurement {
+        let measurements = &mut self.cycle(number).measurements;
+        if measurements.is_empty() {
+            measurements.push(Measurement::default());
+        }
+        let last = measurements.len() - 1;
+        &mut measurements[last]
+    }
+
+    /// Returns the tolerance of the recipe at the start of the run; `None` if it is not on record.
+    pub(super) fn tolerance(&self) -> Option<Tolerance> {
+        let begin = self.begin.as_ref()?.value();
+        serde_json::from_value(begin["content"]["plan"]["tolerance"].clone()).ok()
+    }
+
+    /// Returns the last measurement with figures, and its cycle.
+    pub(super) fn last_measured(&self) -> Option<(u32, &Measurement, &Figures)> {
+        let all = self.cycles.iter().flat_map(|(cycle, story)| story.measurements.iter().map(|of| (*cycle, of)));
+        all.rev().find_map(|(cycle, of)| Some((cycle, of, of.figures.as_ref()?)))
+    }
+}
+
+impl Order {
+    pub(super) fn words(&self) -> String {
+        words(&self.record)
+    }
+
+    /// Returns the result of the order in words.
+    pub(super) fn answer(&self) -> String {
+        match (&self.refused, &self.event) {
+            (Some(why), _) => format!("refused: {why}"),
+            (None, Some(_)) => "taken".to_owned(),
+            // The order went to the machine; later records show the result.
+            (None, None) => "on record".to_owned(),
+        }
+    }
+}
