@@ -145,7 +145,7 @@ fn judged(story: &Story) -> String {
     for compared in tolerance.compare(figures) {
         let Compared { name, found_mm, expanded_mm, between_mm: [low_mm, high_mm], limit_mm, .. } = compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
-        let within = compared.within_in_words().unwrap_or_default();
+        let within = escaped(&compared.within_in_words().unwrap_or_default());
         let _ = writeln!(
             html,
             "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
