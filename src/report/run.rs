@@ -291,7 +291,7 @@ fn parameters(story: &Story) -> String {
     let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
     let left: String = left
-        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} um rms.</p>\n", um(mm)))
+        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} µm RMS.</p>\n", um(mm)))
         .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
