@@ -130,7 +130,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// Returns a summary of the corrected program, as lines.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
-        "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",
+        "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} µm\n",
         amended.straight,
         amended.arcs,
         amended.written,

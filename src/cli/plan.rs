@@ -133,7 +133,7 @@ impl ArcsDocument {
     fn in_words(&self, points: u64) -> String {
         let n = three_digits;
         format!(
-            "{} and {} in place of {}, {} a second in place of {}; within {} um of the path ({} um allowed), corners of {} mrad at most in place of {}",
+            "{} and {} in place of {}, {} a second in place of {}; within {} µm of the path ({} µm allowed), corners of {} mrad at most in place of {}",
             counted(self.arcs as usize, "arc"),
             counted(self.lines as usize, "line"),
             counted(points as usize, "line"),
@@ -222,10 +222,10 @@ impl ScallopsDocument {
         let n = three_digits;
         let allowed: Vec<String> = [("PV", self.allowed_pv_um), ("RMS", self.allowed_rms_um)]
             .into_iter()
-            .filter_map(|(what, um)| um.map(|um| format!("{what} {} um", n(um))))
+            .filter_map(|(what, um)| um.map(|um| format!("{what} {} µm", n(um))))
             .collect();
         format!(
-            "PV {} um and RMS {} um between tracks {} mm apart; {} allowed of all errors together",
+            "PV {} µm and RMS {} µm between tracks {} mm apart; {} allowed of all errors together",
             n(self.pv_um),
             n(self.rms_um),
             n(track_mm),
@@ -427,7 +427,7 @@ fn words(d: &Document) -> String {
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\
-         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
+         level       {} µm over the nominal surface first, at least {} µm deeper each pass, so {} µm at the last\nbudget      {} µm in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,

@@ -210,7 +210,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
             count(document.off_part.len()),
         ),
     );
-    line("deviation", format!("rms {} um, PV {} um", um(document.rms_mm), um(document.pv_mm)));
+    line("deviation", format!("RMS {} µm, PV {} µm", um(document.rms_mm), um(document.pv_mm)));
     line("pose", pose_in_words(document));
     line("iterations", format!("{}, converged", document.iterations));
     line("coverage", format!("{:.0} % of the nominal surface", 100.0 * document.coverage));
@@ -221,7 +221,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
         line("warning", warning.clone());
     }
     for other in &document.alternatives {
-        line("", format!("{} apart, rms {} um over some points", apart(document, other), um(other.rms_mm)));
+        line("", format!("{} apart, RMS {} µm over some points", apart(document, other), um(other.rms_mm)));
     }
     line("files", format!("registration.json, deviations.csv, deviation_uncertainty.csv in {}", folder.display()));
     text
@@ -231,7 +231,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
 fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =
-        |figure: &Interval| format!("{} um ({} to {})", um(figure.median_mm), um(figure.low_mm), um(figure.high_mm));
+        |figure: &Interval| format!("{} µm ({} to {})", um(figure.median_mm), um(figure.low_mm), um(figure.high_mm));
     let Form { hyperparameters, figures, frame_covariance, .. } = form;
     let drift = match hyperparameters.noise_autocorrelation {
         0.0 => String::new(),
@@ -252,8 +252,8 @@ fn form_in_words(form: &Form) -> String {
         false => String::new(),
     };
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
-         frame       known to {sigma} um along x, y, z beside that form\n",
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       the form is {} µm strong and {} mm wide{lay}, a point scatters by {} µm{drift}\n\
+         frame       known to {sigma} µm along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),
         within(&figures.pv_998),

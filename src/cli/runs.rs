@@ -63,7 +63,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 fn in_words(run: &Listed) -> String {
     let Listed { folder, is_live, summary } = run;
     let figures = summary.cycles.iter().rev().find_map(|of| of.figures);
-    let measured = figures.map_or(String::new(), |[[pv, _], [rms, _]]| format!(", PV {pv:.2} um, RMS {rms:.3} um"));
+    let measured = figures.map_or(String::new(), |[[pv, _], [rms, _]]| format!(", PV {pv:.2} µm, RMS {rms:.3} µm"));
     let cycles = summary.cycles.len();
     let counted = format!("{cycles} cycle{}", if cycles == 1 { "" } else { "s" });
     let ended = match summary.result {

@@ -235,7 +235,7 @@ impl View {
             Line::from(format!("{cycle:>5} {pv_um:>12.2} {rms_um:>8.3}"))
         };
         let falls = sparkline(self.snapshot.cycles.iter().map(|row| row.judged_um()[1]));
-        let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS um"));
+        let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS µm"));
         let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
         Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })
     }
@@ -251,8 +251,8 @@ impl View {
         };
         let lines: Vec<Line> = blocks.rows.iter().map(|row| row.iter().map(cell).collect()).collect();
         let title = match self.as_sigma {
-            true => format!("known to: {:.3} um at worst", blocks.limit_um),
-            false => format!("error, filtered: +- {:.2} um", blocks.limit_um),
+            true => format!("known to: {:.3} µm at worst", blocks.limit_um),
+            false => format!("error, filtered: ± {:.2} µm", blocks.limit_um),
         };
         frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(title)), area);
     }

@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(wrapped("", 4), "");
         assert_eq!(wrapped("any length", usize::MAX), "any length\n");
         for columns in 0..40 {
-            let text = "cycle 1: PV 99.8 % 28.8 of 7.00 um, RMS 5.28 of 1.00 um \u{b1} 0.01  ";
+            let text = "cycle 1: PV 99.8 % 28.8 of 7.00 µm, RMS 5.28 of 1.00 µm \u{b1} 0.01  ";
             let words = |text: &str| text.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
             let broken = wrapped(text, columns);
             assert_eq!(words(&broken), words(text), "{columns}");

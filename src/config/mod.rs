@@ -82,7 +82,7 @@ pub struct GrinderConfig {
     pub rotary: Option<RotaryConfig>,
 }
 
-/// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::Rotary`] is the
+/// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::RotaryAxis`] is the
 /// same axis in the form that paths use.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RotaryConfig {

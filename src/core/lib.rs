@@ -20,7 +20,7 @@
 //! ```
 //! use regrind_core::geometry::Point;
 //! use regrind_core::registration::{Options, register};
-//! use regrind_core::surface::{Nominal, Projection};
+//! use regrind_core::surface::{Nominal, PlaneProjection};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let (dome_mm, probe_mm) = (60.0_f64, 1.5);
@@ -28,7 +28,7 @@
 //! let height = |r: f64, x: f64, y: f64| (r * r - x * x - y * y).sqrt();
 //!
 //! let nominal: Vec<Point> = grid(81, 0.5).map(|(x, y)| Point::new(x, y, height(dome_mm, x, y))).collect();
-//! let nominal = Nominal::from_points(nominal, Projection::Auto)?;
+//! let nominal = Nominal::from_points(nominal, PlaneProjection::Auto)?;
 //!
 //! // The centres lie on a dome that is larger by the probe's radius; the part is shifted by 250 mm, and lower.
 //! let centres: Vec<Point> =
@@ -36,9 +36,9 @@
 //!
 //! let found = register(&nominal, &centres, &Options::new(probe_mm))?;
 //! assert!((found.cmm_from_model.translation_mm.x - 250.0).abs() < 1e-3);
-//! assert!(found.verdict.rms_mm < 1e-5);
+//! assert!(found.quality.rms_mm < 1e-5);
 //! // No measurement can determine the rotation of a sphere, and the verdict says so.
-//! assert!(!found.verdict.weak_directions.is_empty());
+//! assert!(!found.quality.weak_directions.is_empty());
 //! # Ok(())
 //! # }
 //! ```

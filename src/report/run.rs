@@ -145,7 +145,7 @@ fn judged(story: &RunHistory) -> String {
     for compared in tolerance.compare(figures) {
         let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } = compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
-        let within = compared.probability_in_words().unwrap_or_default();
+        let within = escaped(&compared.probability_in_words().unwrap_or_default());
         let _ = writeln!(
             html,
             "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
@@ -291,7 +291,7 @@ fn parameters(story: &RunHistory) -> String {
     let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
     let left: String = left
-        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} um rms.</p>\n", um(mm)))
+        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} µm RMS.</p>\n", um(mm)))
         .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\

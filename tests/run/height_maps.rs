@@ -379,7 +379,7 @@ fn every_kind_of_map_is_a_measurement_of_contact_points() {
         assert_eq!((taken.points.len(), taken.coordinates), (19, Coordinates::Contacts));
         let content = Content { coordinates: Some(Said::Centres), ..Content::default() };
         let (taken, said) = exchanged(&path, content);
-        assert!(taken.is_none() && said.join("\n").contains("coordinates is contacts, the cell file says centres"));
+        assert!(taken.is_none() && said.join("\n").contains("coordinates is contacts, in the cell file centres"));
     }
 }
 

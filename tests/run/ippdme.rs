@@ -37,6 +37,6 @@ fn a_doctor_sees_the_server_and_leaves_it_to_others() {
     for _ in 0..2 {
         let (code, told, error) = run(&["doctor", cell.to_str().unwrap()], home.path());
         assert_eq!(code, 0, "{told}\n{error}");
-        assert!(told.contains("CartCMM_Simulated, I++ DME 1.4 stands IDLE"), "{told}");
+        assert!(told.contains("CartCMM_Simulated, I++ DME 1.4 is IDLE"), "{told}");
     }
 }

@@ -353,7 +353,7 @@ fn the_doctor_says_what_stands_in_the_way_of_a_run_and_moves_nothing() {
     at(["cmm", "grinder"].map(|machine| wires[machine]["port"].to_string()));
     let cell = path;
     let (code, said, errors) = run(&["doctor", &cell], home.path());
-    assert!(code == 0 && said.contains("unit 1 stands IDLE") && said.contains("unit 2 stands IDLE"), "{said}{errors}");
+    assert!(code == 0 && said.contains("unit 1 is IDLE") && said.contains("unit 2 is IDLE"), "{said}{errors}");
     drop(simulated);
     let (code, said, _) = run(&["doctor", &cell, "--json"], home.path());
     let found: serde_json::Value = serde_json::from_str(&said).unwrap();

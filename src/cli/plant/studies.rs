@@ -342,7 +342,7 @@ fn in_words(jobs: &[Value]) -> String {
     sets.sort_by_key(|(_, (first, _))| *first);
     let mut text = format!(
         "{:>5} {:>5} {:>7} {:>24} {:>7} {:>9} {:>9} {:>9}  values\n",
-        "runs", "open", "failed", "accepted", "cycles", "PV um", "RMS um", "false"
+        "runs", "open", "failed", "accepted", "cycles", "PV µm", "RMS µm", "false"
     );
     for (_, (_, jobs)) in &sets {
         text += &line_of(jobs);

@@ -22,13 +22,13 @@ pub enum MapError {
     #[error("deviation {} is not finite; do not use this measurement", index + 1)]
     NotFinite { index: usize },
     #[error(
-        "only {valid} of {nodes} nodes have {LEAST_READINGS} measured points within the cut-off of {cutoff_mm} mm; \
+        "only {valid} of {nodes} nodes have {MIN_READINGS} measured points within the cut-off of {cutoff_mm} mm; \
          measure more densely or choose a longer cut-off"
     )]
     TooSparse { valid: usize, nodes: usize, cutoff_mm: f64 },
     #[error(
         "a cut-off of {cutoff_mm} mm on a grid of {width_mm:.1} x {depth_mm:.1} mm requires {nodes:.0} nodes for the \
-         filter, more than {MOST_WORKED:.0}; choose a longer cut-off"
+         filter, more than {MAX_FILTER_NODES:.0}; choose a longer cut-off"
     )]
     CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
     #[error(
@@ -37,7 +37,7 @@ pub enum MapError {
     )]
     CutoffBelowContact { cutoff_mm: f64, min_mm: f64, contact_width_mm: f64 },
     #[error(
-        "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance between measured points, \
+        "the cut-off of {cutoff_mm:.3} mm is below {min_mm:.3} mm, twice the distance between measured points, \
          {point_spacing_mm:.3} mm: the points do not show shorter waves; choose a longer cut-off or measure more \
          densely"
     )]

@@ -189,7 +189,7 @@ impl LearningState {
         }
     }
 
-    /// Updates the state with the error of a pass; afterwards [`Self::wanted_mm`] returns the next correction.
+    /// Updates the state with the error of a pass; afterwards [`Self::next_correction_mm`] returns the next correction.
     ///
     /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
     pub fn updated(&self, seen: &PassObservation) -> Self {
@@ -455,7 +455,7 @@ impl Band {
     }
 }
 
-/// Returns the number of independent values on an area for waves longer than `from_mm`: [`CORRELATED`] squares with
+/// Returns the number of independent values on an area for waves longer than `from_mm`: [`VALUES_PER_INDEPENDENT_VALUE`] squares with
 /// sides of twice this wavelength make one.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
     (area_mm2 / (2.0 * from_mm).powi(2) / VALUES_PER_INDEPENDENT_VALUE).max(1.0)

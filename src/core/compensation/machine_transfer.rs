@@ -32,7 +32,7 @@ use crate::geometry::Grid;
 const MIN_VARIANCE_RATIO: f64 = 1.0;
 /// Standard deviation of the response between machines, before any is known.
 const RESPONSE_SIGMA_BETWEEN_MACHINES: f64 = 0.05;
-/// Number of machines that [`RESPONSES_DIFFER`] weighs as.
+/// Number of machines that [`RESPONSE_SIGMA_BETWEEN_MACHINES`] weighs as.
 const PRIOR_MACHINES: f64 = 2.0;
 /// Maximum share of the power that is a machine's own; above it machines have next to nothing to share, and can agree
 /// by chance.
@@ -67,7 +67,7 @@ struct Comparison {
 /// Initial state of a machine that has not ground a recipe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TransferredState {
-    /// State of the machine, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first
+    /// State of the machine, as after passes of its own; [`LearningState::next_correction_mm`] is the correction of its first
     /// pass.
     pub state: LearningState,
     /// For each band taken over: its shortest wavelength, in millimetres, and the assumed rms share of the repeatable
@@ -147,7 +147,7 @@ impl Comparison {
 impl LearningState {
     /// Returns why this state cannot seed, or be compared with, another machine's; `None` if it can.
     ///
-    /// The state can be unfit even if [`LearningState::is_sound`] returns true.
+    /// The state can be unfit even if [`LearningState::is_valid`] returns true.
     pub fn transfer_obstacle(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
             return Some("a mean has no uncertainty".into());

@@ -102,7 +102,7 @@ pub struct ErrorMap {
 /// Rejects outliers among the deviations, filters the rest and returns the map on a grid.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least
-/// squares of a polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the
+/// squares of a polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`FilterOrder::alpha`]; or the
 /// smoothing spline.
 ///
 /// A feature is far from the surface in two neighbouring readings. The Gaussian filter keeps at least half of its

@@ -60,7 +60,7 @@ pub enum SplineSmoothness {
 pub enum SplineError {
     #[error(
         "a spline with a cut-off of {cutoff_mm} mm over {width_mm:.1} x {depth_mm:.1} mm requires {coefficients:.0} \
-         coefficients, more than {MOST_COEFFICIENTS:.0}; choose a longer cut-off, or the Gaussian filter"
+         coefficients, more than {MAX_COEFFICIENTS:.0}; choose a longer cut-off, or the Gaussian filter"
     )]
     TooFine { cutoff_mm: f64, width_mm: f64, depth_mm: f64, coefficients: f64 },
     #[error("the {points} points do not determine a surface; they must not lie on one line")]

@@ -80,7 +80,7 @@ pub struct DeviationFigures {
     pub pv_mm: f64,
     /// Robust peak to valley.
     pub pvr: RobustPv,
-    /// PV of all points without the outermost 0.2 %, by [`pv_of_most`].
+    /// PV of all points without the outermost 0.2 %, by [`pv_998`].
     pub pv_998_mm: f64,
     /// Root mean square about zero.
     pub rms_mm: f64,
@@ -103,7 +103,7 @@ pub struct DeviationFigures {
 /// Computes the form figures of deviations.
 ///
 /// Shapes: samples in any order, without the rejected points. Frame: x and y of the model frame. Units: millimetres.
-/// The polynomials of PVr suit the aperture: Zernike or Legendre ([`Basis::of`]).
+/// The polynomials of PVr suit the aperture: Zernike or Legendre ([`PolynomialBasis::for_aperture`]).
 ///
 /// # Errors
 /// Fewer than four points, points on a line, numbers that are not finite, a point far outside of the aperture, and a

@@ -13,7 +13,7 @@ const MAX_ZERNIKE_TERMS: usize = 105;
 /// Sequence of polynomials over x and y.
 ///
 /// Frame: model. Units: millimetres. Each term has a mean square of 1 over its own domain, the full disc or rectangle.
-/// On another aperture, least squares over the points separates the terms ([`super::fit`]).
+/// On another aperture, least squares over the points separates the terms ([`super::fit_polynomials`]).
 #[derive(Clone, Debug, PartialEq)]
 pub enum PolynomialBasis {
     /// Zernike polynomials, from the first index of the numbering on. Fringe terms have the same normalisation as the

@@ -71,10 +71,10 @@ pub enum Aperture {
 #[non_exhaustive]
 pub enum ApertureError {
     /// A coordinate is NaN, infinite or too large.
-    #[error("`{key}` is {value_mm} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]
+    #[error("`{key}` is {value_mm} mm; it must be a number between -{MAX_COORDINATE_MM:e} and {MAX_COORDINATE_MM:e} mm")]
     Coordinate { key: &'static str, value_mm: f64 },
     /// A size is zero, negative, NaN or too large.
-    #[error("`{key}` is {value_mm} mm; it must be greater than 0 and at most {LARGEST_MM:e} mm")]
+    #[error("`{key}` is {value_mm} mm; it must be greater than 0 and at most {MAX_COORDINATE_MM:e} mm")]
     Size { key: &'static str, value_mm: f64 },
     /// The hole of an annulus is negative or as large as the rim.
     #[error(
@@ -82,7 +82,7 @@ pub enum ApertureError {
     )]
     Hole { inner_mm: f64, outer_mm: f64 },
     /// Too few or too many corners.
-    #[error("`corners_mm` has {count} corners; a polygon has from 3 to {MOST_CORNERS}")]
+    #[error("`corners_mm` has {count} corners; a polygon has from 3 to {MAX_CORNERS}")]
     CornerCount { count: usize },
     /// Two neighbouring corners coincide; often the first is repeated at the end.
     #[error("corners {first} and {second} of `corners_mm` are the same point; write each corner once")]

@@ -28,7 +28,7 @@ pub enum GridError {
     Spacing { spacing_mm: f64 },
     #[error(
         "a map with nodes every {spacing_mm} mm over {width_mm:.1} x {depth_mm:.1} mm has {nodes:.0} nodes, more than \
-         {MOST_NODES:.0}; choose a wider spacing"
+         {MAX_NODES:.0}; choose a wider spacing"
     )]
     TooFine { spacing_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
     #[error("there are no points for a map; check the measurement")]

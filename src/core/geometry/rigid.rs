@@ -54,7 +54,7 @@ pub enum RigidError {
     NotFinite { index: usize },
     /// All points lie on a line.
     #[error(
-        "the points lie on one line: their width is {share:.1e} of their length; at least {LEAST_WIDTH_SHARE:.0e} is \
+        "the points lie on one line: their width is {share:.1e} of their length; at least {MIN_WIDTH_SHARE:.0e} is \
          required to determine the rotation about it; add a reference point off the line"
     )]
     Collinear { share: f64 },

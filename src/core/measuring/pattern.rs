@@ -45,10 +45,10 @@ pub enum Layout {
 pub enum PatternError {
     #[error("the measuring pattern has a spacing of {spacing_mm} mm; it must be above 0")]
     Spacing { spacing_mm: f64 },
-    #[error("the measuring pattern has {count:.0} points, more than {MOST_TARGETS:.0}; choose a wider spacing")]
+    #[error("the measuring pattern has {count:.0} points, more than {MAX_TARGETS:.0}; choose a wider spacing")]
     TooMany { count: f64 },
     #[error(
-        "none of the {asked} places of the measuring pattern lies on the part at least {margin_mm} mm inside its \
+        "none of the {requested} places of the measuring pattern lies on the part at least {margin_mm} mm inside its \
          edge; reduce edge_margin_mm or the spacing"
     )]
     NoneOnPart { requested: usize, margin_mm: f64 },

@@ -24,7 +24,7 @@ impl ThermalExpansion {
         1.0 + (self.part_per_k - self.scales_per_k) * (temperature_c - REFERENCE_TEMPERATURE_C)
     }
 
-    /// Returns the standard uncertainty of [`Expansion::measured`].
+    /// Returns the standard uncertainty of [`ThermalExpansion::length_factor`].
     pub fn length_factor_sigma(&self, temperature_c: f64) -> f64 {
         let by_temperature = (self.part_per_k - self.scales_per_k) * self.temperature_sigma_k;
         by_temperature.hypot(self.part_sigma_per_k * (temperature_c - REFERENCE_TEMPERATURE_C))
@@ -33,7 +33,7 @@ impl ThermalExpansion {
     /// Returns points of a part at a temperature as they would be at 20 degrees Celsius, scaled about their centroid.
     ///
     /// Frame: any. The scaling also moves a probe centre nearer to the surface by the same factor, so its radius is the
-    /// radius of the ball divided by [`Expansion::measured`]. The expansion of the ball itself is already in the radius
+    /// radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the ball itself is already in the radius
     /// that was found on the reference sphere.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;

@@ -1,7 +1,7 @@
 //! Figures of sampled forms that belong to an area: slopes, and power, irregularity and related figures of ISO 10110-5.
 //!
 //! Each sampled form has figures of its own. The median over all forms and the interval that contains 95 % of them are
-//! the result. Everything that depends on the places alone is computed once: [`IsoFits`], [`SlopesAt`].
+//! the result. Everything that depends on the places alone is computed once: [`IsoFits`], [`SlopeOperator`].
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;

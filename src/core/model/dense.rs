@@ -181,7 +181,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 /// Returns the Cholesky factor of H'K^-1 H.
 ///
 /// # Errors
-/// Returns [`ModelError::EffectsAlike`] if the matrix, scaled to a unit diagonal, is singular within 1e-12.
+/// Returns [`ModelError::CollinearEffects`] if the matrix, scaled to a unit diagonal, is singular within 1e-12.
 pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const MIN_PIVOT: f64 = 1e-12;
     if gram.nrows() == 0 {

@@ -112,7 +112,7 @@ impl Field {
     /// Checks that strength, range and lay are possible.
     ///
     /// # Errors
-    /// Returns [`ModelError::Hyper`] or [`ModelError::Lay`] with the wrong value.
+    /// Returns [`ModelError::Hyperparameter`] or [`ModelError::Anisotropy`] with the wrong value.
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, value) in [("field", self.sigma_mm), ("range", self.range_mm)] {
             if !(value.is_finite() && value > 0.0) {

@@ -91,13 +91,13 @@ pub struct Interval {
     /// 97.5 % quantile.
     pub high_mm: f64,
     /// Lower bound for repeated looks at a growing measurement: the quantile of the probability
-    /// [`ModelInputs::look_risk`].
+    /// [`ModelInputs::decision_risk`].
     #[serde(skip)]
     pub least_mm: f64,
-    /// Upper bound for repeated looks: the quantile of the probability 1 - [`ModelInputs::look_risk`].
+    /// Upper bound for repeated looks: the quantile of the probability 1 - [`ModelInputs::decision_risk`].
     #[serde(skip)]
     pub most_mm: f64,
-    /// Bound for acceptance: the quantile of the probability [`ModelInputs::probability`].
+    /// Bound for acceptance: the quantile of the probability [`ModelInputs::acceptance_probability`].
     #[serde(skip)]
     pub accepted_mm: f64,
     /// Quantiles of the probabilities [`Interval::PROBABILITIES`].
@@ -525,7 +525,7 @@ fn xy((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
-/// Returns at most [`MOST_PLACES`] indices below `of`, evenly spaced.
+/// Returns at most [`MAX_PLACES`] indices below `of`, evenly spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
     let most = of.min(MAX_PLACES);
     (0..most).map(move |k| k * of / most)
@@ -1001,7 +1001,7 @@ impl Interval {
         Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
     }
 
-    /// Builds the interval as [`Interval::of`] does, and multiplies the values below the median by a factor.
+    /// Builds the interval as [`Interval::from_samples`] does, and multiplies the values below the median by a factor.
     fn with_low_factor(
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1072,7 +1072,7 @@ impl FreeMotions {
     /// Returns the effects of machine and datum on all points together, about their centroid.
     ///
     /// # Errors
-    /// [`ModelError::Stated`] if a stated uncertainty is not valid.
+    /// [`ModelError::StatedUncertainty`] if a stated uncertainty is not valid.
     pub(super) fn machine_effects(
         &self,
         registration: &Registration,

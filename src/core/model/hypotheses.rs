@@ -16,7 +16,7 @@
 //! the form after the best fit, in units of the variance of the noise. The noise s is integrated out with the prior
 //! density 1 / s^2.
 //!
-//! Points up to [`MOST_WHOLE`] are used one by one. For more points, a pivoted Cholesky factor of the products of the
+//! Points up to [`MAX_INDIVIDUAL_POINTS`] are used one by one. For more points, a pivoted Cholesky factor of the products of the
 //! basis functions keeps only what the points can distinguish. A field also has waves shorter than those of the basis.
 //! These are nearly independent from point to point, and add the same amount to every l.
 
@@ -46,7 +46,7 @@ const MIN_RANGE_HALF_WAVELENGTHS: f64 = 2.0;
 const VARIANCE_RATIOS: usize = 33;
 /// Lowest and highest variance ratio.
 const VARIANCE_RATIO_LIMITS: [f64; 2] = [1e-3, 1e5];
-/// Maximum number of cosines: for at most [`MOST_WHOLE`] points, and for more.
+/// Maximum number of cosines: for at most [`MAX_INDIVIDUAL_POINTS`] points, and for more.
 const MAX_COSINES: [usize; 2] = [1000, 600];
 /// Number of cosines for each point, within the limits of the total number.
 const COSINES_PER_POINT: f64 = 5.0;
@@ -54,7 +54,7 @@ const COSINES_PER_POINT: f64 = 5.0;
 const MIN_COSINES: usize = 150;
 /// Maximum number of points that are used one by one. More points are reduced to the products of the basis functions.
 const MAX_INDIVIDUAL_POINTS: usize = 600;
-/// Degree of the polynomials that are added to the cosines if there are more than [`MOST_WHOLE`] points. Few points
+/// Degree of the polynomials that are added to the cosines if there are more than [`MAX_INDIVIDUAL_POINTS`] points. Few points
 /// cannot distinguish these polynomials from wheel wear or from a motion of the part.
 const DEGREE: usize = 4;
 /// Relative limit of the standard deviation: a node drops the basis functions after the last one above this share of

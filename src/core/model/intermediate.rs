@@ -1,6 +1,6 @@
 //! Places between the touched ones: those nodes of a grid that touched places surround.
 //!
-//! A node without a touched place within [`FARTHEST`] spacings of the points on some side lies in an untouched area, or
+//! A node without a touched place within [`MAX_DISTANCE_SPACINGS`] spacings of the points on some side lies in an untouched area, or
 //! beyond the edge.
 
 use nalgebra::DMatrix;

@@ -187,7 +187,7 @@ impl Hyperparameters {
     /// Checks that every hyperparameter is within its range.
     ///
     /// # Errors
-    /// [`ModelError::Lay`], [`ModelError::Hyper`] or [`ModelError::Drift`].
+    /// [`ModelError::Anisotropy`], [`ModelError::Hyperparameter`] or [`ModelError::NoiseAutocorrelation`].
     fn check(&self) -> Result<(), ModelError> {
         let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;

@@ -7,7 +7,7 @@
 //! of the probe, s is sampled from its density in equal steps of ln s.
 //!
 //! A stationary field treats a single peak as noise and shrinks it. Therefore the upper bounds of extremes use fields
-//! of [`UNDER`] times the variance. These follow the points more closely.
+//! of [`UPPER_BOUND_VARIANCE_FACTOR`] times the variance. These follow the points more closely.
 
 use faer::Mat;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};

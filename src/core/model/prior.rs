@@ -26,7 +26,7 @@ impl Prior {
     /// Checks that each median is finite and above 0, and each factor finite and above 1.
     ///
     /// # Errors
-    /// Returns [`ModelError::Expected`] with the wrong values.
+    /// Returns [`ModelError::Prior`] with the wrong values.
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, [median, factor]) in [("range", self.range_mm), ("ratio of noise to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {

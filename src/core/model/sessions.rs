@@ -90,7 +90,7 @@ impl Sessions {
 
     /// Joins the used points of registrations, each with the number of the session of every measured point. The motions
     /// that a registration was free to make are fixed effects of its own. Outliers are left out: only points with
-    /// [`PointStatus::Used`] count.
+    /// [`PointStatus::Inlier`] count.
     ///
     /// # Errors
     /// Those of [`Sessions::new`]; also if a registration has no used point.

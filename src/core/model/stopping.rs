@@ -59,7 +59,7 @@ pub struct StoppingDecision {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// Every figure is within its limit, with the probability that one decision among many requires
-    /// ([`ModelInputs::look_risk`]).
+    /// ([`ModelInputs::decision_risk`]).
     WithinLimits,
     /// The part has to be corrected, and the form is known well enough for the correction.
     FormKnown,

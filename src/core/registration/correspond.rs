@@ -243,7 +243,7 @@ pub(crate) trait ProjectionReporter: Sync {
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Self::Item; LANES];
 }
 
-/// Groups of four points per task of [`at_feet`].
+/// Groups of four points per task of [`report_projections`].
 const GROUPS_PER_TASK: usize = 8;
 
 /// Projects all points once more and returns one reported item per point, in the order of the points.

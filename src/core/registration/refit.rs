@@ -169,7 +169,7 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
 }
 
 /// Selects the points that take part in the fit, and returns how many changed. A rejected point can still be form:
-/// [`super::alone`].
+/// [`super::isolated_touches`].
 ///
 /// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
 /// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.

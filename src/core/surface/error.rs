@@ -7,7 +7,7 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum SurfaceError {
-    #[error("the nominal surface has {points} points and needs at least {least}; give a denser nominal")]
+    #[error("the nominal surface has {points} points and needs at least {min_points}; give a denser nominal")]
     TooFewPoints { points: usize, min_points: usize },
     #[error("nominal point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },

@@ -33,7 +33,7 @@ impl OffsetSurface<'_> {
     }
 
     /// Returns the worst place where the offset surface folds among the touched places of a mesh.
-    /// [`OffsetSurface::fold`] checks a grid as a whole.
+    /// [`OffsetSurface::find_fold`] checks a grid as a whole.
     pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = FacetIndex>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
         let is_mesh = |patch: &Patch| matches!(patch.topology, Topology::Mesh(_));
@@ -161,7 +161,7 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 }
 
 impl WideRow<'_> {
-    /// Returns true if E + r B is not positive definite for any of four facets; see [`not_positive`].
+    /// Returns true if E + r B is not positive definite for any of four facets; see [`is_not_positive_definite`].
     #[inline(always)]
     fn any_folds_x4(
         &self,

@@ -21,7 +21,7 @@ pub(crate) struct ProjectionX4 {
 }
 
 impl OffsetSurface<'_> {
-    /// Returns true if [`OffsetSurface::four_feet`] supports this surface: one patch, and the curved distance at the
+    /// Returns true if [`OffsetSurface::project_x4`] supports this surface: one patch, and the curved distance at the
     /// foot.
     pub(crate) fn supports_project_x4(&self) -> bool {
         self.nominal().patches().len() == 1 && self.distance_model() == DistanceModel::Curved && self.lookup() == Lookup::ContainingFacet

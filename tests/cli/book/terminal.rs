@@ -196,7 +196,7 @@ fn fits(line: &str, expected: &str) -> bool {
 fn dots_of_a_screen_stand_for_anything() {
     for (line, expected, so) in [
         ("record in runs/a-1", "record in runs/...", true),
-        ("cycle 1: PV 3.6 of 7.00 um", "cycle 1: PV ... of ... um", true),
+        ("cycle 1: PV 3.6 of 7.00 µm", "cycle 1: PV ... of ... µm", true),
         ("cycle 1", "cycle 2", false),
         ("cycle 12", "cycle 1", false),
         ("a b c", "...b...", true),

@@ -55,7 +55,7 @@ const COVERAGE_FACTOR: f64 = 2.0;
 /// Mean square effect below which a column is rounding.
 const MIN_EFFECT_MM2: f64 = 1e-18;
 /// Number of trial strengths of the prior of values without a tolerance, from the rms of the deviations down to
-/// [`LEAST_STRENGTH`] of it.
+/// [`MIN_STRENGTH_SHARE`] of it.
 const PRIOR_STRENGTHS: i32 = 25;
 /// Minimum trial strength, as a share of the rms of the deviations.
 const MIN_STRENGTH_SHARE: f64 = 1e-3;

@@ -73,7 +73,7 @@ pub enum PathError {
     )]
     Rate { letter: char, found_deg_min: f64, x_mm: f64, y_mm: f64, limit_deg_min: f64, feed_mm_min: f64 },
     #[error(
-        "the path reaches {axis} {found_mm:.3} mm, outside the travel of {least_mm} to {most_mm} mm; move the part \
+        "the path reaches {axis} {found_mm:.3} mm, outside the travel of {min_mm} to {max_mm} mm; move the part \
          or its work offset, or shorten the overrun"
     )]
     Travel { axis: char, found_mm: f64, min_mm: f64, max_mm: f64 },

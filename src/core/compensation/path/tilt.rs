@@ -237,7 +237,7 @@ impl PathOptions {
 /// Adds the necessary tilt to the error of an upright wheel that cannot reach a place.
 ///
 /// Tries constant tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns
-/// [`PathError::Upright`] with the first tilt for which `would_do` is true; otherwise returns the error unchanged.
+/// [`PathError::NeedsTilt`] with the first tilt for which `would_do` is true; otherwise returns the error unchanged.
 pub(super) fn suggest_tilt(
     refused: PathError,
     options: &PathOptions,

@@ -26,12 +26,12 @@ impl ToolPath {
     /// Lays tracks over a part.
     ///
     /// Checks the options and the fit of the wheel: slope of the surface, hollows in every direction, and contact of
-    /// the wheel's body with the part away from the contact point. [`super::Summary::check`] checks travel, speed and
+    /// the wheel's body with the part away from the contact point. [`super::PathSummary::check`] checks travel, speed and
     /// acceleration.
     ///
     /// # Errors
     /// Returns an error for invalid options and for a wheel that does not fit. Each error gives place, value, limit
-    /// and remedy. If a constant tilt of the head solves the problem, the error is [`PathError::Upright`] with that
+    /// and remedy. If a constant tilt of the head solves the problem, the error is [`PathError::NeedsTilt`] with that
     /// angle.
     pub fn new(wanted: TargetSurface, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
