@@ -9,10 +9,10 @@ use std::sync::LazyLock;
 use divan::{Bencher, black_box};
 use rand::RngExt;
 use regrind::compensation::{
-    SurfacePoint, Correction, CorrectionLimits, GainRule, LearningState, MapOptions, ParameterOptions, PassObservation, Smoothing,
-    error_map, parameters, point_spacing_mm,
+    Correction, CorrectionLimits, GainRule, LearningState, MapOptions, ParameterOptions, PassObservation, Smoothing,
+    SurfacePoint, error_map, estimate_parameters, point_spacing_mm,
 };
-use regrind::geometry::{Point, DeviationSample, Vector};
+use regrind::geometry::{DeviationSample, Point, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 

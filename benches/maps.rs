@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 
 use divan::{Bencher, black_box};
 use regrind::compensation::ErrorMap;
-use regrind::form::{FormOptions, figures};
+use regrind::form::{FormOptions, compute_figures};
 use regrind::formats::{parse_x3p, write_error_map_x3p};
-use regrind::geometry::{Aperture, Grid, DeviationSample};
+use regrind::geometry::{Aperture, DeviationSample, Grid};
 use regrind::report::HeatMap;
 
 fn main() {
@@ -28,7 +28,10 @@ fn samples(points: usize) -> Vec<DeviationSample> {
         ]
     };
     let rough = |[x, y]: [f64; 2]| 1e-3 * (0.2 * x).sin() * (0.3 * y).cos() + 1e-4 * (5.0 * x + 7.0 * y).sin();
-    (0..columns * rows).map(place).map(|at_mm| DeviationSample { place_mm: at_mm, deviation_mm: rough(at_mm) }).collect()
+    (0..columns * rows)
+        .map(place)
+        .map(|at_mm| DeviationSample { place_mm: at_mm, deviation_mm: rough(at_mm) })
+        .collect()
 }
 
 fn error_map(nodes: usize) -> ErrorMap {

@@ -7,11 +7,15 @@ use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use regrind::compensation::path::{HeightField, Move, PathMode, PathOptions, PathSummary, ToolPath, TargetSurface, Wheel};
-use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, PassObservation, error_map};
+use regrind::compensation::path::{
+    HeightField, Move, PathMode, PathOptions, PathSummary, TargetSurface, ToolPath, Wheel,
+};
+use regrind::compensation::{
+    Correction, CorrectionLimits, GainRule, LearningState, MapOptions, PassObservation, error_map,
+};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::{Exactness, ProgramHeader, write_program};
-use regrind::geometry::{Aperture, Grid, DeviationSample};
+use regrind::geometry::{Aperture, DeviationSample, Grid};
 
 fn main() {
     divan::main();
@@ -78,7 +82,7 @@ fn points(bencher: Bencher, points: u64) {
     let path = path(points);
     bencher.counter(ItemsCount::new(points)).bench(|| {
         path.moves().fold(0.0, |sum, one| match one {
-            Move::Feed { to, .. } => sum + at.z,
+            Move::Feed { to, .. } => sum + to.z,
             _ => sum,
         })
     });
@@ -128,7 +132,10 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let file = folder.path().join("part.ngc");
     let readings: Vec<DeviationSample> = (0..226 * 126)
         .map(|k| [(k % 226) as f64 * 100.0 / 225.0 - 50.0, (k / 226) as f64 * 60.0 / 125.0 - 30.0])
-        .map(|at_mm| DeviationSample { place_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
+        .map(|at_mm| DeviationSample {
+            place_mm: at_mm,
+            deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin(),
+        })
         .collect();
     let options = MapOptions::new(5.0, 1.0);
     let limits = CorrectionLimits {
@@ -143,7 +150,8 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
         let now = Correction::zero(error.grid, 0.06);
-        let known = begin.updated(&PassObservation { correction: &now, error: &error, response: None, explained: None });
+        let known =
+            begin.updated(&PassObservation { correction: &now, error: &error, response: None, explained: None });
         let step = now.next_pass(&error, &known, None, &limits).expect("a correction");
         let path = path_of(nominal(), &step.correction, 1_000_000);
         write(&path, &path.summary().expect("a path"), &file);

@@ -25,7 +25,7 @@ use regrind::registration::{
     Deviation, Method, Options, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
 };
 use regrind::report::{Axis, ColourMap, HeatMap, Plot, Scale, Series};
-use regrind::surface::{DistanceModel, Nominal, OffsetSurface, FacetIndex, PlaneProjection, Side};
+use regrind::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, PlaneProjection, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -393,7 +393,8 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     let (mut pose, mut before, mut turns) = (Pose::identity(), f64::INFINITY, 0);
     loop {
         let inverse = pose.inverse();
-        let nearest = |y: &Point| tree.knn(1, &Entry::from(&inverse.transform_point(y))).pop().expect("the cloud has points");
+        let nearest =
+            |y: &Point| tree.knn(1, &Entry::from(&inverse.transform_point(y))).pop().expect("the cloud has points");
         let nearest: Vec<(Point, f64)> =
             measured.centres.par_iter().map(nearest).map(|n| (cloud[n.index as usize], *n.dist2)).collect();
         let objective = nearest.iter().map(|n| n.1).sum::<f64>();
@@ -414,7 +415,8 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?;
     let inverse = pose.inverse();
     let map_off = measured.centres.iter().zip(&after.deviations);
-    let map_off = map_off.map(|(y, d)| surface.project(&inverse.transform_point(y), FacetIndex::UNKNOWN).distance_mm - d.deviation_mm);
+    let map_off = map_off
+        .map(|(y, d)| surface.project(&inverse.transform_point(y), FacetIndex::UNKNOWN).distance_mm - d.deviation_mm);
     row("map against the right one, PV / um", "-", format!("{:.3}", 1e3 * pv(map_off)));
     Ok(())
 }

@@ -13,7 +13,7 @@
 mod study;
 
 use rayon::prelude::*;
-use study::told_apart::{Compared, Machine, Told, corrections};
+use study::told_apart::{Compared, Machine, ParameterResult, corrections};
 use study::{After, Bench};
 
 const PASSES: u16 = 4;
@@ -43,10 +43,12 @@ fn tell_parameters(made: &[Compared]) {
     println!(
         "| parameter | within U | U | error over its sigma, rms | off by, rms | taken back | asked for |\n|---|---|---|---|---|---|---|"
     );
-    for kind in made[0].told.iter().map(|told| told.kind) {
-        let told: Vec<&Told> = made.iter().flat_map(|world| &world.told).filter(|told| told.kind == kind).collect();
-        let count = |of: &dyn Fn(&Told) -> bool| told.iter().filter(|told| of(told)).count();
-        let mean = |of: &dyn Fn(&Told) -> f64| told.iter().map(|told| of(told)).sum::<f64>() / told.len() as f64;
+    for kind in made[0].parameters.iter().map(|told| told.kind) {
+        let told: Vec<&ParameterResult> =
+            made.iter().flat_map(|world| &world.parameters).filter(|told| told.kind == kind).collect();
+        let count = |of: &dyn Fn(&ParameterResult) -> bool| told.iter().filter(|told| of(told)).count();
+        let mean =
+            |of: &dyn Fn(&ParameterResult) -> f64| told.iter().map(|told| of(told)).sum::<f64>() / told.len() as f64;
         println!(
             "| {} | {:.1} % | {:.1} {} | {:.2} | {:.1} | {} | {} |",
             kind.name(),

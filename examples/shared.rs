@@ -12,7 +12,7 @@
 mod study;
 
 use rayon::prelude::*;
-use study::others::{Differ, Pair, TAUGHT_BY, Taught};
+use study::others::{Differ, Pair, TAUGHT_BY, TransferResult};
 use study::{After, Bench, RECIPES};
 
 /// Maximum ratio of the first pass to the floor.
@@ -43,7 +43,7 @@ fn main() {
             let k = seed as usize % benches.len();
             Pair { taught: &benches[k], in_common: &benches[(k + 1) % benches.len()] }.world(seed, differ, parts, 3)
         };
-        let all: Vec<Taught> = (first..first + worlds).into_par_iter().map(world).collect();
+        let all: Vec<TransferResult> = (first..first + worlds).into_par_iter().map(world).collect();
         print_line(name, &all);
         for (k, bench) in benches.iter().enumerate() {
             let of = all.iter().zip(first..).filter(|(_, seed)| *seed as usize % benches.len() == k);
@@ -56,8 +56,8 @@ fn ratio(after: &After) -> f64 {
     after.rms_um / after.floor_um
 }
 
-fn print_line(name: &str, all: &[Taught]) {
-    let sorted = |of: &dyn Fn(&Taught) -> f64| {
+fn print_line(name: &str, all: &[TransferResult]) {
+    let sorted = |of: &dyn Fn(&TransferResult) -> f64| {
         let mut values: Vec<f64> = all.iter().map(of).collect();
         values.sort_by(f64::total_cmp);
         values
@@ -92,14 +92,14 @@ fn print_line(name: &str, all: &[Taught]) {
 }
 
 /// Returns the root mean square over all worlds, divided by that of the floor.
-fn together(all: &[Taught], after: impl Fn(&Taught) -> &After) -> f64 {
+fn together(all: &[TransferResult], after: impl Fn(&TransferResult) -> &After) -> f64 {
     let sum = |of: fn(&After) -> f64| all.iter().map(|world| of(after(world)).powi(2)).sum::<f64>();
     (sum(|a| a.rms_um) / sum(|a| a.floor_um)).sqrt()
 }
 
 /// Returns the ratio that the first pass would have if everything about the first machine were known and used for the
 /// second.
-fn apart(all: &[Taught]) -> f64 {
+fn apart(all: &[TransferResult]) -> f64 {
     let floor2: f64 = all.iter().map(|world| world.with[0].floor_um.powi(2)).sum();
     let apart2: f64 = all.iter().map(|world| world.apart_um.powi(2)).sum();
     (1.0 + apart2 / floor2).sqrt()

@@ -152,8 +152,11 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         pv_of: PvPoints::MostPoints,
     };
     let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles: 5 };
-    let given =
-        ModelInputs { decision_risk: adaptive.decision_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
+    let given = ModelInputs {
+        decision_risk: adaptive.decision_risk(),
+        probe_noise_mm: [SCATTER_MM, 0.15],
+        ..ModelInputs::default()
+    };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
     // As in a run: ten for the gates, then enough for a first stopping decision.

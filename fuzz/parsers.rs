@@ -12,7 +12,7 @@ use std::path::Path;
 
 use regrind::cell::{Command, Ending, Event, Judgement};
 use regrind::compensation::Correction;
-use regrind::compensation::path::{Field, Wanted};
+use regrind::compensation::path::{HeightField, TargetSurface};
 use regrind::config::CellConfig;
 use regrind::device::exchange::ResultRequirements;
 use regrind::document::Problems;
@@ -219,9 +219,9 @@ pub fn program(bytes: &[u8]) -> bool {
     fs::write(&base, bytes).expect("a folder for temporary files");
     let grid = Grid { columns: 5, rows: 4, first_mm: [-20.0, -15.0], spacing_mm: [10.0, 10.0] };
     let values: Vec<f64> = (0..grid.len()).map(|k| 1e-3 * (k as f64).sin()).collect();
-    let shift = Field::spline(grid, &values);
-    let plane = Field::spline(grid, &vec![0.0; grid.len()]);
-    let nominal = Wanted::new(plane, &Correction::none(grid, 0.0), 1.0).expect("finite values");
+    let shift = HeightField::spline(grid, &values);
+    let plane = HeightField::spline(grid, &vec![0.0; grid.len()]);
+    let nominal = TargetSurface::new(plane, &Correction::zero(grid, 0.0), 1.0).expect("finite values");
     let map = ProgramMap {
         grid,
         values_mm: values,
@@ -235,7 +235,7 @@ pub fn program(bytes: &[u8]) -> bool {
     let mut is_read = false;
     for along_normals in [None, Some(AlongNormals { nominal: &nominal, centre_above_mm: 5.0 })] {
         let amendment =
-            Amendment { shift: &shift, along_normals, tolerance_mm: 1e-3, map: &map, gain: 1.0, largest_mm: 0.5 };
+            Amendment { shift: &shift, along_normals, tolerance_mm: 1e-3, map: &map, gain: 1.0, max_shift_mm: 0.5 };
         let amended = correct_program(&base, &out, &amendment);
         // The two interpreters agree on whatever is not refused.
         assert!(!amended.as_ref().is_err_and(|error| error.to_string().contains("report it with")), "{amended:?}");
@@ -260,7 +260,7 @@ pub fn program_map(bytes: &[u8]) -> bool {
         assert!(nodes.iter().flat_map(|node| [node.error(), node.sigma()]).flatten().all(f64::is_finite));
     }
     let Ok(map) = read_program_map(&file) else { return false };
-    assert!(map.grid.is_sound() && map.grid.len() == map.values_mm.len());
+    assert!(map.grid.is_valid() && map.grid.len() == map.values_mm.len());
     assert!(map.values_mm.iter().all(|v| v.is_finite()));
     true
 }
@@ -350,10 +350,10 @@ fn comes_back<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> bool {
 
 /// What a run leaves to the next part.
 pub fn learned(bytes: &[u8]) -> bool {
-    let Ok(learned) = Learned::of(Path::new("learned.json"), bytes) else { return false };
-    assert!(learned.correction.grid.is_sound());
+    let Ok(learned) = Learned::from_saved(Path::new("learned.json"), bytes) else { return false };
+    assert!(learned.correction.grid.is_valid());
     let grid = Grid { columns: 3, rows: 3, first_mm: [-1.0, -1.0], spacing_mm: [1.0, 1.0] };
-    let first = learned.first_correction(Correction::none(grid, 0.05));
+    let first = learned.first_correction(Correction::zero(grid, 0.05));
     assert!(first.values_mm.iter().all(|v| v.is_finite()));
     true
 }

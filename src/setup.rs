@@ -11,20 +11,23 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{CellPlan, Deadlines, Device, HoldOrStop, GateLimits, Tolerance};
+use crate::cell::{CellPlan, Deadlines, Device, GateLimits, HoldOrStop, Tolerance};
 use crate::compensation::path::{
-    Contact as PathContact, HeightField, TiltMode, MachineLimits, PathError, PathOptions, RotaryAxis, Scallops, TrackSpacing, RotationAxis,
-    TargetSurface, Wheel as PathWheel,
+    Contact as PathContact, HeightField, MachineLimits, PathError, PathOptions, RotaryAxis, RotationAxis, Scallops,
+    TargetSurface, TiltMode, TrackSpacing, Wheel as PathWheel,
 };
-use crate::compensation::{SurfacePoint, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
+use crate::compensation::{Correction, CorrectionLimits, MapOptions, SurfacePoint, WheelTerm, contact_width_mm};
 use crate::config::{CellConfig, LinkConfig, RotaryLetter};
 use crate::device::{AnyCmm, AnyGrinder, DriverContext, DriverError, LineAddress, ModbusSettings, Pass, hex};
-use crate::drive::{AdaptiveOptions, Probing, Programs, ReferenceSphere, ParameterCompensation, Task, correction_grid};
+use crate::drive::{AdaptiveOptions, ParameterCompensation, Probing, Programs, ReferenceSphere, Task, correction_grid};
 use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
-use crate::measuring::{ThermalExpansion, Layout, PatternError, Target, targets};
-use crate::recipe::{TiltKind, SelectionMode, NominalSource, MeasuringPattern, Recipe, SpindleAxis, RegistrationStart, TableSettings, Tilt, Micrometres, WheelDimensions};
+use crate::measuring::{Layout, PatternError, Target, ThermalExpansion, targets};
+use crate::recipe::{
+    MeasuringPattern, Micrometres, NominalSource, Recipe, RegistrationStart, SelectionMode, SpindleAxis, TableSettings,
+    Tilt, TiltKind, WheelDimensions,
+};
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, PlaneProjection, Side, SurfaceError};
 
@@ -200,7 +203,11 @@ fn parameter_compensation(
     // A program moves the centre of the wheel along the normals. A grinder with its own path is guided in height.
     let is_program = cell.grinder.link.wire.reads_run_folder();
     let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
-    Ok(Some(ParameterCompensation { tolerances: parameters.tolerances(), wheel_term, node_points: SurfacePoint::under_nodes(field, &grid) }))
+    Ok(Some(ParameterCompensation {
+        tolerances: parameters.tolerances(),
+        wheel_term,
+        node_points: SurfacePoint::under_nodes(field, &grid),
+    }))
 }
 
 /// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad. The rotation moves the
@@ -215,13 +222,18 @@ fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
 /// Returns the settings of a measurement with chosen touches.
 fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == SelectionMode::Adaptive)?;
-    Some(AdaptiveOptions { tolerance: tolerance(recipe), accepted_risk, max_cycles: u32::from(recipe.cycle.max_cycles) })
+    Some(AdaptiveOptions {
+        tolerance: tolerance(recipe),
+        accepted_risk,
+        max_cycles: u32::from(recipe.cycle.max_cycles),
+    })
 }
 
 /// Returns the minimum share of a plan's targets that must be found.
 fn min_found_share(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
-    let share = if recipe.measure.mode == SelectionMode::Adaptive { AdaptiveOptions::FIRST_BATCH_MIN_SHARE } else { 1.0 };
+    let share =
+        if recipe.measure.mode == SelectionMode::Adaptive { AdaptiveOptions::FIRST_BATCH_MIN_SHARE } else { 1.0 };
     share * recipe.measure.min_coverage
 }
 
@@ -303,7 +315,7 @@ fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize
 fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
-            let nominal = sample_surface(recipe.path(), nominal_from_file)?;
+            let nominal = sample_surface(recipe.path(), surface)?;
             let identity = surface_identity(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
@@ -363,7 +375,7 @@ pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjec
             Ok(nominal)
         }
         NominalFile::Definition(text) => match DefinedSurface::from_toml(&text) {
-            Ok(surface) => sample_surface(path, &nominal_from_file),
+            Ok(surface) => sample_surface(path, &surface),
             Err(source) => Err(SetupError::Definition { path: path.to_owned(), source }),
         },
     }
@@ -371,10 +383,10 @@ pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjec
 
 /// Samples a defined surface at its spacing, within its outline.
 fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
-    let grid = nominal_from_file.spacing_mm().and_then(|spacing_mm| nominal_from_file.sample(spacing_mm));
+    let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm));
     let grid = grid.map_err(|source| SetupError::Definition { path: path.to_owned(), source })?;
     Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
-        .map(|nominal| nominal.with_outline(nominal_from_file.aperture().clone()))
+        .map(|nominal| nominal.with_outline(surface.aperture().clone()))
         .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
@@ -410,16 +422,23 @@ fn lay_targets(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Tar
 fn reference_sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<ReferenceSphere>, SetupError> {
     match (recipe.measure.qualify, &cell.cmm.reference_sphere) {
         (false, _) => Ok(None),
-        (true, Some(sphere)) => {
-            Ok(Some(ReferenceSphere { centre: sphere.centre, radius_mm: sphere.radius_mm, points: usize::from(sphere.points) }))
-        }
+        (true, Some(sphere)) => Ok(Some(ReferenceSphere {
+            centre: sphere.centre,
+            radius_mm: sphere.radius_mm,
+            points: usize::from(sphere.points),
+        })),
         (true, None) => Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() }),
     }
 }
 
 /// Checks that the probe does not search for the reference sphere inside the part. The part fills the box under its
 /// surface, in the pose of the fixture.
-fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &ReferenceSphere) -> Result<(), SetupError> {
+fn check_sphere(
+    recipe: &Recipe,
+    cell: &CellConfig,
+    nominal: &Nominal,
+    sphere: &ReferenceSphere,
+) -> Result<(), SetupError> {
     let centre = cell.cmm.fixture_cmm_from_model.inverse().transform_point(&sphere.centre);
     let mut nearest = Point::from([f64::INFINITY; 3]);
     let mut farthest = -nearest;
@@ -465,7 +484,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
         ("measure.temperature_c", recipe.measure.temperature_c.is_some()),
     ];
     // Checked here, because the first measurement comes after the first grinding.
-    if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *check_machine)
+    if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *is_there)
         && !cell.cmm.link.wire.reports_temperature()
     {
         return Err(SetupError::NoTemperature { recipe: recipe.path().into(), cell: cell.path().into(), key });
@@ -478,7 +497,11 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let reach = recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
     let pose = &cell.cmm.fixture_cmm_from_model;
     let outside = |p: &Point| (0..3).any(|k| !(travel.min_mm[k]..=travel.max_mm[k]).contains(&p[k]));
-    let found = targets.iter().map(|t| pose.transform_point(&(t.point + reach * t.normal))).enumerate().find(|(_, p)| outside(p));
+    let found = targets
+        .iter()
+        .map(|t| pose.transform_point(&(t.point + reach * t.normal)))
+        .enumerate()
+        .find(|(_, p)| outside(p));
     match found {
         None => Ok(()),
         Some((k, at)) => Err(SetupError::Travel {
@@ -734,7 +757,9 @@ pub fn create_drivers(
         cell_folder: cell.path().parent().unwrap_or(Path::new("")),
         run_folder: folder,
         min_free_points: match &recipe.pattern {
-            MeasuringPattern::Free { min_points: least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
+            MeasuringPattern::Free { min_points: least_points } => {
+                Some(usize::try_from(*least_points).unwrap_or(usize::MAX))
+            }
             _ => None,
         },
         min_coverage: min_found_share(recipe),
@@ -743,9 +768,9 @@ pub fn create_drivers(
         ..driver_context(link, cell.simulated, [owner, epoch])
     };
     let cmm = cell.cmm.link.wire.create_cmm(&making(&cell.cmm.link)).map_err(failed)?;
-    let beside = DriverContext { shared_link: create_cmm.link(), ..making(&cell.grinder.link) };
+    let beside = DriverContext { shared_link: cmm.link(), ..making(&cell.grinder.link) };
     let grinder = cell.grinder.link.wire.create_grinder(&beside).map_err(failed)?;
-    Ok((create_cmm, create_grinder))
+    Ok((cmm, grinder))
 }
 
 /// Returns the settings of a machine on Modbus; `None` for any other.
@@ -766,7 +791,8 @@ pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverErro
         Device::Grinder => &cell.grinder.link,
     };
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
-    let making = DriverContext { cell_folder, volume_mm: probe_travel_mm(cell), ..driver_context(link, cell.simulated, [1, 1]) };
+    let making =
+        DriverContext { cell_folder, volume_mm: probe_travel_mm(cell), ..driver_context(link, cell.simulated, [1, 1]) };
     match device {
         Device::Cmm => link.wire.create_cmm(&making).map(drop),
         Device::Grinder => link.wire.create_grinder(&making).map(drop),

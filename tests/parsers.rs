@@ -303,6 +303,7 @@ fn what_was_learned() -> Learned {
     let correction = Correction::zero(grid, 0.05);
     let error = ErrorMap::exact(grid, (0..grid.len()).map(|k| 1e-3 * k as f64).collect(), vec![true; grid.len()]);
     let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-    let known = begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
+    let known =
+        begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
     Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
 }

@@ -161,7 +161,10 @@ impl Cell {
 
     pub(super) fn unconfirmed_aborts(&self) -> Vec<Device> {
         let known = |device: Device| self.machines[device as usize];
-        Device::BOTH.into_iter().filter(|device| known(*device).was_connected && !known(*device).abort_confirmed).collect()
+        Device::BOTH
+            .into_iter()
+            .filter(|device| known(*device).was_connected && !known(*device).abort_confirmed)
+            .collect()
     }
 
     /// Returns the number of the cycle; 0 before the first one.
@@ -209,7 +212,10 @@ impl Cell {
 
     /// Returns the machine for which a person is being asked whether it is clear of the part.
     pub fn clear_confirmation_device(&self) -> Option<Device> {
-        self.state.phase().filter(|phase| self.is_asking_whether_clear(*phase)).and_then(super::transitions::device_awaited_clear)
+        self.state
+            .phase()
+            .filter(|phase| self.is_asking_whether_clear(*phase))
+            .and_then(super::transitions::device_awaited_clear)
     }
 
     /// Returns the time at which `Event::Deadline` is due, as time since the run began.

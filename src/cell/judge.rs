@@ -101,7 +101,8 @@ pub struct ComparedFigure {
 impl ComparedFigure {
     /// Describes the probability that the figure is within its limit, for people. Returns `None` if it is not limited.
     pub fn probability_in_words(&self) -> Option<String> {
-        let [least, most] = [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
+        let [least, most] =
+            [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
         self.probability_within.map(|within| match within {
             _ if within <= least => format!("P(in tolerance) < {}", format_percent(least)),
             _ if within >= most => format!("P(in tolerance) > {}", format_percent(most)),
@@ -128,7 +129,16 @@ impl Tolerance {
             };
             let within = limit_mm.is_finite().then(|| of.probability_within(limit_mm));
             let (conformity, expanded_mm) = (Conformity::from_interval(held_mm, limit_mm), of.expanded_mm());
-            ComparedFigure { name, median_mm: of.median_mm, expanded_mm, interval_mm: between_mm, limit_mm, probability_within: within, compared_mm: held_mm, conformity }
+            ComparedFigure {
+                name,
+                median_mm: of.median_mm,
+                expanded_mm,
+                interval_mm: between_mm,
+                limit_mm,
+                probability_within: within,
+                compared_mm: held_mm,
+                conformity,
+            }
         };
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
@@ -208,7 +218,12 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
 }
 
 /// Returns the verdict on another pass: continue if the expected gain is worth its material.
-fn judge_next_pass(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> ReasonedVerdict {
+fn judge_next_pass(
+    plan: &CellPlan,
+    before: Option<&Figures>,
+    now: &Figures,
+    conformity: Conformity,
+) -> ReasonedVerdict {
     let (tell, figures) = (|verdict, reason| ReasonedVerdict { verdict, reason }, figures_in_words(plan, now));
     let undecided = conformity == Conformity::Undecided;
     let so_far = if undecided { "not proven in or out of tolerance" } else { "not yet in tolerance" };
@@ -243,7 +258,8 @@ fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
     let still = |was: f64, is: f64, least: f64| was - is < least.max(plan.stall_share * was);
     let [pv, rms] = plan.tolerance.compare(now);
     let [pv_before, rms_before] = judged_medians_mm(plan, before);
-    still(pv_before, pv.median_mm, pv.expanded_mm) && still(rms_before, rms.median_mm, rms.expanded_mm.max(plan.stall_mm))
+    still(pv_before, pv.median_mm, pv.expanded_mm)
+        && still(rms_before, rms.median_mm, rms.expanded_mm.max(plan.stall_mm))
 }
 
 /// Returns how far the figures are from acceptance: the larger ratio of a figure to its limit. Returns the RMS if there
@@ -257,7 +273,11 @@ pub(super) fn distance_to_acceptance(plan: &CellPlan, figures: &Figures) -> f64 
 /// Describes a cycle that was better than the last one.
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
     let [pv, rms] = judged_medians_mm(plan, figures);
-    format!("; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}", format_um(pv), format_um(rms))
+    format!(
+        "; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}",
+        format_um(pv),
+        format_um(rms)
+    )
 }
 
 /// Describes a wrong response. Returns `None` if the response is not wrong.

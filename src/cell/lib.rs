@@ -19,29 +19,29 @@
 //! The cell starts a machine at most once for a cycle. Only the machine's own proof that START was not taken allows
 //! another START. A measurement that failed its gate is repeated under the next cycle number. A pass is never repeated.
 
-mod transitions;
 mod alarm;
+mod cell;
 mod command;
 mod event;
 mod interval;
 mod judge;
-mod state_machine;
-mod cell;
 mod number;
 mod plan;
 mod state;
+mod state_machine;
 mod table;
+mod transitions;
 
 pub use alarm::{Alarm, AlarmId, Role};
+pub use cell::Cell;
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, MachineRequest, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, RecordedFormFigures, GateResult,
-    GateFailure, JobResult, OutlierFigures, ConnectionRefusal, Occupation, RecordedParameter, Reconciliation, RecordFailure, PartResponse,
-    FurtherTouches,
+    Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, Forecast,
+    FurtherTouches, GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, PartResponse,
+    Reconciliation, RecordFailure, RecordedFormFigures, RecordedParameter,
 };
 pub use interval::RecordedInterval;
 pub use judge::{ComparedFigure, Conformity};
-pub use cell::Cell;
-pub use plan::{FirstStep, CellPlan, Deadlines, HoldOrStop, GateLimits, PvPoints, Tolerance};
+pub use plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};
 pub use table::{Answer, Row, TABLE_VERSION, sample_events, transition_table};

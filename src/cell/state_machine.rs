@@ -2,12 +2,15 @@
 
 use std::time::Duration;
 
-use super::transitions::{awaits_answer, device_awaiting_acknowledge, device_awaited_clear, reason_clause, reconciling_device, restart_phase, running_device};
 use super::alarm::AlarmId;
+use super::cell::{Cell, SuspensionCause};
 use super::command::Command;
-use super::event::{MachineRequest, Event, JobResult};
-use super::cell::{SuspensionCause, Cell};
+use super::event::{Event, JobResult, MachineRequest};
 use super::state::{Device, JobStep, Phase, State};
+use super::transitions::{
+    awaits_answer, device_awaited_clear, device_awaiting_acknowledge, reason_clause, reconciling_device, restart_phase,
+    running_device,
+};
 
 use Phase::{Compensate, Grind, Load, Measure, Register};
 use State::{
@@ -54,7 +57,8 @@ impl Cell {
     fn foreign_reason(&self, event: &Event) -> Option<String> {
         // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
         // machine then still has the job of the cycle before.
-        if matches!((self.state, event), (Stopping, Event::Ended { device, .. }) if self.stopping_machine == Some(*device)) {
+        if matches!((self.state, event), (Stopping, Event::Ended { device, .. }) if self.stopping_machine == Some(*device))
+        {
             return None;
         }
         let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);

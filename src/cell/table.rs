@@ -5,13 +5,14 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
 use std::time::Duration;
 
+use super::cell::Cell;
 use super::command::{Command, format_label};
 use super::event::{
-    Actor, MachineRequest, CompensationRefusal, CompensationSummary, Condition, Event, Figures, GateResult, GateFailure, JobResult,
-    OutlierFigures, ConnectionRefusal, Occupation, Reconciliation, RecordFailure, PartResponse, FurtherTouches,
+    Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, FurtherTouches,
+    GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, PartResponse, Reconciliation,
+    RecordFailure,
 };
-use super::cell::Cell;
-use super::plan::{FirstStep, CellPlan, Deadlines, HoldOrStop, GateLimits, PvPoints, Tolerance};
+use super::plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 use super::state::{Device, JobStep, Phase, State};
 
 /// Version of the table. Only a program of the version that began a run can continue it. Any change of a reaction is a
@@ -58,7 +59,8 @@ impl Answer {
 /// Returns the table, sorted by state and event.
 pub fn transition_table() -> Vec<Row> {
     let mut answers: HashMap<State, Vec<Vec<LabelledAnswer>>> = HashMap::new();
-    let mut open: VecDeque<Cell> = [HoldOrStop::Hold, HoldOrStop::Stop].into_iter().map(|d| Cell::new(sample_plan(d))).collect();
+    let mut open: VecDeque<Cell> =
+        [HoldOrStop::Hold, HoldOrStop::Stop].into_iter().map(|d| Cell::new(sample_plan(d))).collect();
     let (mut seen, mut sampled) = (HashSet::new(), HashMap::new());
     while let Some(cell) = open.pop_front() {
         let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| sample_events(cell.cycle()));
@@ -98,15 +100,29 @@ pub fn transition_table() -> Vec<Row> {
 fn behaviour_key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.machines.map(|known| (known.ready, known.was_connected && known.abort_confirmed));
     let clear = cell.machines.map(|known| (known.clear, known.clear_confirmed, known.clear_requested));
-    let memory = (cell.diverging_cycles.min(1), cell.abort_repeated, cell.previous.is_some(), cell.pass_count >= cell.plan.max_cycles);
+    let memory = (
+        cell.diverging_cycles.min(1),
+        cell.abort_repeated,
+        cell.previous.is_some(),
+        cell.pass_count >= cell.plan.max_cycles,
+    );
     let grinds = cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
     let by_hand = cell.machines.iter().any(|known| known.manual);
     // Only a reconciliation reads it.
     let asked = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Reconcile);
-    let begun = asked.map(|(device, _)| (cell.job_observed[device as usize], cell.failure_series[device as usize].reported));
+    let begun =
+        asked.map(|(device, _)| (cell.job_observed[device as usize], cell.failure_series[device as usize].reported));
     let discarded = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Discard);
     let keeps = discarded.is_some_and(|(device, _)| cell.acknowledge_refused[device as usize]);
-    let memory = (memory, cell.hold_deadline.is_some(), grinds && cell.pass_record_doubted, cell.stall_notified, by_hand, begun, keeps);
+    let memory = (
+        memory,
+        cell.hold_deadline.is_some(),
+        grinds && cell.pass_record_doubted,
+        cell.stall_notified,
+        by_hand,
+        begun,
+        keeps,
+    );
     (cell.state, known, clear, cell.suspension_causes.is_empty(), memory, cell.plan.on_stall == HoldOrStop::Hold)
 }
 
@@ -217,7 +233,11 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }
-    let unlike = [ConnectionRefusal::Unreachable(text()), ConnectionRefusal::WrongDevice(text()), ConnectionRefusal::WordOrder(text())];
+    let unlike = [
+        ConnectionRefusal::Unreachable(text()),
+        ConnectionRefusal::WrongDevice(text()),
+        ConnectionRefusal::WordOrder(text()),
+    ];
     let more = [ConnectionRefusal::Inches, ConnectionRefusal::Owned(text()), ConnectionRefusal::AtAnotherJob(text())];
     for why in unlike.into_iter().chain(more) {
         events.push(Event::NotConnected { device, why });
@@ -300,13 +320,23 @@ fn sample_figures() -> Vec<Figures> {
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(OutlierFigures { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: false })),
+            left_out: Some(Box::new(OutlierFigures {
+                pv_mm: 0.050,
+                rms_mm: 0.002,
+                places: String::new(),
+                again: false,
+            })),
             ..plain.clone()
         },
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(OutlierFigures { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: true })),
+            left_out: Some(Box::new(OutlierFigures {
+                pv_mm: 0.050,
+                rms_mm: 0.002,
+                places: String::new(),
+                again: true,
+            })),
             ..plain.clone()
         },
         Figures { coverage: 0.5, ..plain.clone() },
@@ -320,9 +350,13 @@ fn sample_figures() -> Vec<Figures> {
         },
         Figures { pv_mm: f64::NAN, ..plain.clone() },
     ];
-    for response in
-        [PartResponse::Expected, PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled]
-    {
+    for response in [
+        PartResponse::Expected,
+        PartResponse::SignFlipped,
+        PartResponse::Mirrored,
+        PartResponse::NoEffect,
+        PartResponse::Doubled,
+    ] {
         all.push(Figures { response: Some(response), ..plain.clone() });
     }
     all

@@ -4,14 +4,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::alarm::{Alarm, AlarmId};
+use super::cell::{Cell, FailureSeries, MachineStatus, SuspensionCause};
 use super::command::{Command, Ending, Judgement, Verdict};
 use super::event::{
-    MachineRequest, CompensationRefusal, Condition, Figures, GateResult, GateFailure, JobResult, ConnectionRefusal, Occupation, Reconciliation,
-    RecordFailure, PartResponse,
+    CompensationRefusal, Condition, ConnectionRefusal, Figures, GateFailure, GateResult, JobResult, MachineRequest,
+    Occupation, PartResponse, Reconciliation, RecordFailure,
 };
 use super::judge::{self, ReasonedVerdict, format_um};
-use super::cell::{SuspensionCause, Cell, MachineStatus, FailureSeries};
-use super::plan::{FirstStep, Deadlines, HoldOrStop};
+use super::plan::{Deadlines, FirstStep, HoldOrStop};
 use super::state::{Device, JobStep, Phase, State};
 
 use Phase::{Compensate, Grind, Judge, Load, Measure, Register, Transfer};
@@ -157,7 +157,8 @@ impl Cell {
     /// is held.
     fn progress_limit(&self, device: Device) -> Duration {
         let limit = self.plan.deadlines.progress[device as usize];
-        let notice = self.plan.deadlines.progress_notice[device as usize].map(|least| least.max(3 * self.max_progress_interval));
+        let notice =
+            self.plan.deadlines.progress_notice[device as usize].map(|least| least.max(3 * self.max_progress_interval));
         match notice.filter(|notice| *notice < limit) {
             Some(notice) if self.stall_notified => limit - notice,
             Some(notice) => notice,
@@ -371,7 +372,11 @@ impl Cell {
         self.acknowledge_refused[device as usize] = what == MachineRequest::Acknowledge;
         // The machine still has the job that a person declared over: ask it once more.
         let still_there = what == MachineRequest::Discard && phase == Phase::from_job(device, JobStep::Discard);
-        self.enter_state(Held(if still_there { Phase::from_job(device, JobStep::Reconcile) } else { restart_phase(phase) }));
+        self.enter_state(Held(if still_there {
+            Phase::from_job(device, JobStep::Reconcile)
+        } else {
+            restart_phase(phase)
+        }));
     }
 
     pub(super) fn on_ended(&mut self, device: Device, result: JobResult) {
@@ -497,7 +502,8 @@ impl Cell {
 
     fn judge_cycle(&mut self) {
         let Some(figures) = self.figures.take() else { return self.enter_state(Held(Register)) };
-        let ReasonedVerdict { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_deref(), &figures, self.pass_count);
+        let ReasonedVerdict { verdict, mut reason } =
+            judge::judge(&self.plan, self.previous.as_deref(), &figures, self.pass_count);
         let response = figures.response;
         if verdict == Verdict::LeftOut {
             // The figures of the part are not known yet, so nothing is compared with them.
@@ -530,7 +536,11 @@ impl Cell {
             Verdict::BudgetSpent => self.stop_not_accepted(AlarmId::BudgetSpent, &reason),
             Verdict::Diverging => {
                 self.raise(AlarmId::Diverging, &reason);
-                if self.diverging_cycles < 2 { self.advance(Compensate) } else { self.hold_or_stop(self.plan.on_divergence, &reason) }
+                if self.diverging_cycles < 2 {
+                    self.advance(Compensate)
+                } else {
+                    self.hold_or_stop(self.plan.on_divergence, &reason)
+                }
             }
             Verdict::Stalled => {
                 self.raise(AlarmId::Stalled, &reason);
@@ -656,7 +666,9 @@ impl Cell {
     /// Handles a machine that left automatic mode: no machine moves meanwhile, and no waiting job continues by itself.
     pub(super) fn on_manual_mode(&mut self, device: Device, message: &str) {
         self.machine_mut(device).manual = true;
-        let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving_device()?))) else { return };
+        let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving_device()?))) else {
+            return;
+        };
         if matches!(self.state, Held(_)) {
             return;
         }
@@ -754,7 +766,8 @@ impl Cell {
         }
         // While the link failed again and again, not every loss raised the alarm.
         if !self.active_alarms.contains_key(&AlarmId::LinkLost)
-            && let Some(SuspensionCause::Link(device)) = self.suspension_causes.iter().find(|cause| matches!(cause, SuspensionCause::Link(_))).copied()
+            && let Some(SuspensionCause::Link(device)) =
+                self.suspension_causes.iter().find(|cause| matches!(cause, SuspensionCause::Link(_))).copied()
         {
             self.raise(AlarmId::LinkLost, &format!("{device}, it is still lost"));
         }
@@ -823,7 +836,8 @@ impl Cell {
         // The cell continues without a machine that it does not need.
         let is_vain = fails_again && needed;
         // A failure that was already reported as recurring is not reported each time.
-        let was_told = self.failure_series[device as usize].reported && (!needed || self.active_alarms.contains_key(&AlarmId::FailsAgain));
+        let was_told = self.failure_series[device as usize].reported
+            && (!needed || self.active_alarms.contains_key(&AlarmId::FailsAgain));
         if !(fails_again && was_told) {
             self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             if is_vain {
@@ -856,7 +870,8 @@ impl Cell {
             Starting => self.stop(&case, false),
             state => {
                 let Some(phase) = state.phase() else { return };
-                let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
+                let needed =
+                    phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
                 if needed {
                     self.enter_state(Held(phase_after_link_loss(phase)));
                 } else if let Execute(_) | Unholding(_) | Unsuspending(_) = state {
@@ -989,7 +1004,8 @@ impl Cell {
         if !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_)) {
             self.withdraw(AlarmId::JobVanished);
         }
-        self.job_observed[device as usize] |= !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_));
+        self.job_observed[device as usize] |=
+            !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_));
         match (outcome, self.state) {
             (Reconciliation::Running, Holding(_) | Suspending(_)) => {
                 self.enter_state(self.state_with_phase(run));
@@ -1283,7 +1299,11 @@ pub(super) fn awaits_answer(phase: Phase, device: Device, what: MachineRequest) 
         MachineRequest::Start => &[JobStep::Start],
         MachineRequest::Collect => &[JobStep::Collect],
         MachineRequest::Acknowledge | MachineRequest::Discard => &[JobStep::Acknowledge, JobStep::Discard],
-        MachineRequest::Hold | MachineRequest::Resume | MachineRequest::Stop | MachineRequest::Abort | MachineRequest::Clear => &[],
+        MachineRequest::Hold
+        | MachineRequest::Resume
+        | MachineRequest::Stop
+        | MachineRequest::Abort
+        | MachineRequest::Clear => &[],
     };
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
 }

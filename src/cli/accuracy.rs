@@ -5,7 +5,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
-use regrind::surface::accuracy::{Accuracy, ErrorEstimate, ErrorFigures, NominalPoints, Reliability, estimate_accuracy};
+use regrind::surface::accuracy::{
+    Accuracy, ErrorEstimate, ErrorFigures, NominalPoints, Reliability, estimate_accuracy,
+};
 use regrind::surface::{Nominal, PlaneProjection};
 use serde::Serialize;
 

@@ -12,7 +12,7 @@ use jiff::Timestamp;
 use regrind::drive::Request;
 use regrind::journal::{DATABASE, Reader, Stamp, is_driven, stamp};
 use regrind::report::{RunResult, RunSummary, run_summary};
-use regrind_live::{EndedRun, RunStatus, CellStatus};
+use regrind_live::{CellStatus, EndedRun, RunStatus};
 
 use super::control;
 
@@ -34,7 +34,13 @@ pub(super) struct CellMonitor {
 
 impl CellMonitor {
     pub(super) fn new(runs: &Path) -> Self {
-        Self { runs: runs.to_owned(), status: CellStatus::default(), silent: None, known: HashMap::new(), settled: None }
+        Self {
+            runs: runs.to_owned(),
+            status: CellStatus::default(),
+            silent: None,
+            known: HashMap::new(),
+            settled: None,
+        }
     }
 
     /// Returns the current status of the cell, or the last known status if the current one cannot be read.
@@ -102,7 +108,8 @@ impl CellMonitor {
             match folders.iter().find(|run| run.join(DATABASE).is_file() && !self.known.contains_key(*run)) {
                 Some(run) if is_driven(run) => self.does_not_answer(run.clone()),
                 Some(run) => {
-                    (self.status.run_status, self.silent) = (RunStatus::ProgramGone { run: name(run), machines_within: false }, None)
+                    (self.status.run_status, self.silent) =
+                        (RunStatus::ProgramGone { run: name(run), machines_within: false }, None)
                 }
                 None => (self.status.run_status, self.silent) = (RunStatus::NoRun, None),
             }
@@ -117,10 +124,15 @@ impl CellMonitor {
         match run_summary(run) {
             Ok(RunSummary { ended: Some(_), result, verdict, .. }) => {
                 let accepted = result == RunResult::Accepted;
-                self.status = CellStatus { run_status: RunStatus::NoRun, last_run: Some(EndedRun { run: name(run), verdict, accepted }) };
+                self.status = CellStatus {
+                    run_status: RunStatus::NoRun,
+                    last_run: Some(EndedRun { run: name(run), verdict, accepted }),
+                };
             }
             Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
-            Ok(RunSummary { machines_within, .. }) => self.status.run_status = RunStatus::ProgramGone { run: name(run), machines_within },
+            Ok(RunSummary { machines_within, .. }) => {
+                self.status.run_status = RunStatus::ProgramGone { run: name(run), machines_within }
+            }
             // The record cannot be read at the moment.
             Err(_) => return,
         }

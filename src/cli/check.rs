@@ -10,7 +10,7 @@ use clap::Args;
 use console::Term;
 use regrind::config::{CellConfig, read_dialect};
 use regrind::document::{Problem, Problems};
-use regrind::recipe::{NominalSource, MeasuringPattern, Recipe};
+use regrind::recipe::{MeasuringPattern, NominalSource, Recipe};
 use regrind::setup::{nominal_table_format, plan_table_format};
 use regrind::surface::PlaneProjection;
 use regrind_sim::spec::WorldSpec;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::compensation::Correction;
-use regrind::compensation::path::{TargetSurface, nominal_height_field, correction_spline};
+use regrind::compensation::path::{TargetSurface, correction_spline, nominal_height_field};
 use regrind::formats::gcode::{
     AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, read_program_map,
 };
@@ -107,7 +107,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
     let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
-    let shift = correction_spline(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
+    let shift =
+        correction_spline(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
     let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;
     let amendment = Amendment {
         shift: &shift,

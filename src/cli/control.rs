@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
-use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, send_request, is_live};
+use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, is_live, send_request};
 use regrind::journal::{Kind, MachineLock, Reader};
-use regrind_control::{send_request_at, is_live_at};
+use regrind_control::{is_live_at, send_request_at};
 
 use super::Outcome;
 use super::choice::word_of;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name, preview_text};
+use super::show::{how_far, limits, preview_text, pv_name};
 use super::words::time_left;
 
 /// Returns the text after the help of each order.

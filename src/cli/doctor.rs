@@ -83,7 +83,8 @@ impl Finding {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let Arguments { cell: path, recipe, runs, json } = arguments;
     let cell = check::or_show(CellConfig::read(path))?;
-    let mut findings = vec![Finding::new("cell", FindingLevel::Good, format!("{} is a good cell file", path.display()))];
+    let mut findings =
+        vec![Finding::new("cell", FindingLevel::Good, format!("{} is a good cell file", path.display()))];
     findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", FindingLevel::Notice, note)));
     findings.extend([folder(runs), clock(runs), signing()]);
     findings.extend(open_runs(runs));
@@ -163,9 +164,11 @@ fn clock(runs: &Path) -> Finding {
 
 fn signing() -> Finding {
     match key::of_this_user() {
-        Ok(Some(key)) => {
-            Finding::new("audit key", FindingLevel::Good, format!("records are signed with {}", key.public().fingerprint()))
-        }
+        Ok(Some(key)) => Finding::new(
+            "audit key",
+            FindingLevel::Good,
+            format!("records are signed with {}", key.public().fingerprint()),
+        ),
         Ok(None) => Finding::new(
             "audit key",
             FindingLevel::Notice,

@@ -53,8 +53,10 @@ impl RunContext<'_> {
     /// Locks the machines and opens their wires. Sends nothing to them. `now` is the time as an epoch.
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
-        let taken =
-            [lock_machine(&cell.cmm.link, MachineKind::Cmm, folder)?, lock_machine(&cell.grinder.link, MachineKind::Grinder, folder)?];
+        let taken = [
+            lock_machine(&cell.cmm.link, MachineKind::Cmm, folder)?,
+            lock_machine(&cell.grinder.link, MachineKind::Grinder, folder)?,
+        ];
         let client = [owner(&self.actor, folder), MachineLock::epoch(taken.iter().flatten(), now)];
         let (cmm, grinder) = setup::create_drivers(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
         Ok(Machines { cmm, grinder, taken })
@@ -65,14 +67,25 @@ impl RunContext<'_> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
         let showing = tokio::spawn(
-            Show::new(self.json, cell.is_marked_simulation(), self.recipe, work.plan.tolerance, self.folder).follow(shown),
+            Show::new(self.json, cell.is_marked_simulation(), self.recipe, work.plan.tolerance, self.folder)
+                .follow(shown),
         );
         let poll = [setup::poll_interval(&cell.cmm.link), setup::poll_interval(&cell.grinder.link)];
         let PreparedRun { task, plan, journal, loaded, interrupted } = work;
         let (journal, beside): (Box<dyn JournalSink>, _) = (Box::new(journal), BlockingExecutor::Threads);
         let actor_of_run = actor.clone();
-        let run =
-            RunInputs { plan, task, journal, job: self.job, actor: actor_of_run, load_confirmed: loaded, poll_intervals: poll, notices, interrupted, executor: beside };
+        let run = RunInputs {
+            plan,
+            task,
+            journal,
+            job: self.job,
+            actor: actor_of_run,
+            load_confirmed: loaded,
+            poll_intervals: poll,
+            notices,
+            interrupted,
+            executor: beside,
+        };
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
         // The record is closed. A failed report or a closed terminal must not change the result of the run.

@@ -20,29 +20,29 @@ mod outside;
 mod plan;
 #[cfg(feature = "plant")]
 mod plant;
+#[cfg(feature = "plant")]
+mod publish;
 mod recover;
 mod register;
+#[cfg(feature = "plant")]
+mod replicate;
 mod report;
 mod resume;
 mod run;
+#[cfg(feature = "plant")]
+mod run_queue;
 mod runs;
 mod schema;
 mod serve;
 mod shell;
-#[cfg(feature = "plant")]
-mod replicate;
 mod show;
 mod simulate;
 mod simulated;
 mod states;
 mod succession;
-#[cfg(feature = "plant")]
-mod publish;
 mod users;
 mod watch;
 mod words;
-#[cfg(feature = "plant")]
-mod run_queue;
 
 use std::io::{self, Write};
 use std::process::ExitCode;

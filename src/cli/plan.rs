@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::cell::FirstStep;
-use regrind::compensation::path::{ArcSummary, Peak, Scallops, PathSummary, ToolPath};
+use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::gcode::GcodeError;

@@ -7,7 +7,9 @@ use clap::Args;
 use regrind::config::PlantConfig;
 use regrind::drive::Request;
 use regrind_control::OnBehalf;
-use regrind_live::{LiveError, PublisherEvent, Node, EventSender, RunStatus, CellStatus, PublisherLock, UaServer, event_queue};
+use regrind_live::{
+    CellStatus, EventSender, LiveError, Node, PublisherEvent, PublisherLock, RunStatus, UaServer, event_queue,
+};
 use serde_json::json;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -115,9 +117,9 @@ async fn publish(
     let mut look = CellMonitor::new(&arguments.runs);
     let (to, told) = watch::channel(look.poll().clone());
     let (notes, news) = event_queue();
-    let mut telling = begin(config, cell, turn, &told, &event_queue)?;
+    let mut telling = begin(config, cell, turn, &told, &notes)?;
     // Only the publishers keep the senders and receivers of events.
-    drop((told, event_queue));
+    drop((told, notes));
     let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
     let over = tokio::select! {
         Some(over) = telling.join_next() => Some(over),
@@ -153,10 +155,10 @@ fn begin(
 ) -> Result<JoinSet<Result<(), LiveError>>, Failure> {
     let mut telling = JoinSet::new();
     if let Some(settings) = &config.sparkplug {
-        telling.spawn(Node::new(settings, cell, turn, told.clone(), event_queue.clone())?.run());
+        telling.spawn(Node::new(settings, cell, turn, told.clone(), notes.clone())?.run());
     }
     if let Some(settings) = &config.opcua {
-        telling.spawn(UaServer::new(settings, cell, turn, told.clone(), event_queue.clone())?.run());
+        telling.spawn(UaServer::new(settings, cell, turn, told.clone(), notes.clone())?.run());
     }
     Ok(telling)
 }
@@ -208,13 +210,17 @@ async fn hear(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: boo
         };
         for news in some.drain(..) {
             match news {
-                PublisherEvent::Connected { place } => say(json, &json!({ "tells": place }), &format!("{place} is told from now on")),
+                PublisherEvent::Connected { place } => {
+                    say(json, &json!({ "tells": place }), &format!("{place} is told from now on"))
+                }
                 PublisherEvent::Retrying { place, why } => say(
                     json,
                     &json!({ "waits": place, "why": why }),
                     &format!("{place} is not told for now: {why}; the cell goes on, and it is tried again"),
                 ),
-                PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => refuse(&runs, json, &by, &what).await,
+                PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => {
+                    refuse(&runs, json, &by, &what).await
+                }
                 PublisherEvent::Refused { .. } => quota.unreported += 1,
                 PublisherEvent::RefusedMore { times } => quota.unreported += u64::from(times),
             }

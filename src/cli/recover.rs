@@ -14,7 +14,7 @@ use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::live::{owner, lock_machine};
+use super::live::{lock_machine, owner};
 use super::run::{epoch, free_folder, operator};
 use super::succession::Place;
 use super::{Outcome, check, control, key};
@@ -47,8 +47,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let actor = operator(arguments.operator.as_deref());
     let began = SystemTime::now();
     let folder = free_folder(&arguments.runs, "recover", began, cell.simulated);
-    let taken =
-        [lock_machine(&cell.cmm.link, MachineKind::Cmm, &folder)?, lock_machine(&cell.grinder.link, MachineKind::Grinder, &folder)?];
+    let taken = [
+        lock_machine(&cell.cmm.link, MachineKind::Cmm, &folder)?,
+        lock_machine(&cell.grinder.link, MachineKind::Grinder, &folder)?,
+    ];
     let epoch = MachineLock::epoch(taken.iter().flatten(), epoch(began));
     let settings = |link| setup::modbus_settings(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
@@ -140,7 +142,8 @@ impl Recovery {
                 super::print("it is left as it is\n")?;
                 return Ok(false);
             }
-            match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
+            match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await
+            {
                 // A new state is shown. Without a change the same question would repeat for ever.
                 Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
                 Ok(_) | Err(RecoveryError::Changed { .. }) => {}

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::config::PlantConfig;
-use regrind_live::{RunStatus, CellStatus};
+use regrind_live::{CellStatus, RunStatus};
 use regrind_plant::{Link, PlantError, ReplicationResult, Replicator};
 use serde_json::json;
 
@@ -142,7 +142,12 @@ impl Shipping<'_> {
         let shipped = self.shipper.round(link).await;
         let told = match &shipped {
             Ok(_) => {
-                let look = self.monitor.take().unwrap_or_else(|| CellMonitor::new(&self.arguments.runs)).poll_in_background().await;
+                let look = self
+                    .monitor
+                    .take()
+                    .unwrap_or_else(|| CellMonitor::new(&self.arguments.runs))
+                    .poll_in_background()
+                    .await;
                 send_status(link, self.monitor.insert(look).status()).await
             }
             Err(_) => Ok(()),

@@ -19,7 +19,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::failure::Failure;
-use super::live::{RunContext, PreparedRun, outcome};
+use super::live::{PreparedRun, RunContext, outcome};
 use super::run::{LEARNED_FROM, epoch, operator, within};
 use super::{Outcome, check, control, key};
 

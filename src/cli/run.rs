@@ -6,18 +6,18 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
-use regrind::cell::{Actor, FirstStep, CellPlan, Ending, TABLE_VERSION};
+use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
 use regrind::device::{LineAddress, Wire};
 use regrind::drive::Task;
-use regrind::formats::{LEARNED, Learned, LearnedError, KnowledgeOrigin};
+use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::live::{RunContext, PreparedRun, outcome};
+use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::Place;
 use super::{Outcome, check, key, outside, plan, serve, simulated};
 
@@ -155,8 +155,11 @@ async fn carry_out(
     let page = arguments.serve.map(|at| serve::PageProcess::begin(&arguments.runs, at, arguments.json));
     let _page = page.transpose()?;
     #[cfg(feature = "plant")]
-    let _plant =
-        arguments.plant.as_ref().map(|plant| super::plant::PlantProcesses::begin(&arguments.runs, plant)).transpose()?;
+    let _plant = arguments
+        .plant
+        .as_ref()
+        .map(|plant| super::plant::PlantProcesses::begin(&arguments.runs, plant))
+        .transpose()?;
     let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
@@ -301,14 +304,20 @@ pub(super) fn within(cell: &CellConfig) -> bool {
 }
 
 /// Returns the header of the record: everything that a program needs to resume the run.
-fn header(arguments: &Arguments, live: &RunContext, (task, plan): (&Task, &CellPlan), earlier: Option<&Earlier>) -> Header {
+fn header(
+    arguments: &Arguments,
+    live: &RunContext,
+    (task, plan): (&Task, &CellPlan),
+    earlier: Option<&Earlier>,
+) -> Header {
     let RunContext { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
     let taught_by =
         earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
-    let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.messages.clone())).collect();
+    let left_alone: Vec<String> =
+        left_alone.chain(earlier.iter().flat_map(|earlier| earlier.messages.clone())).collect();
     // The open ports are assigned by now. The text of the file shows whether they were open.
     let machines_within = CellConfig::parse(cell.path(), cell.text()).is_ok_and(|cell| within(&cell));
     Header {

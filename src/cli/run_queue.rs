@@ -10,7 +10,7 @@ use regrind::drive::is_live;
 use regrind::formats::{ResultFolder, write_atomic};
 use regrind::journal::{DATABASE, Kind, Reader};
 use regrind::recipe::Recipe;
-use regrind_plant::{StartedPart, LEASE, Lease, Link, PlantError, PlantRecipe};
+use regrind_plant::{LEASE, Lease, Link, PlantError, PlantRecipe, StartedPart};
 
 use super::failure::Failure;
 use super::{Outcome, check, plant, recover, run as making};

@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvPoints, Tolerance, FurtherTouches};
+use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, FurtherTouches, Judgement, PvPoints, Tolerance};
 use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice, PreviewStatistics};
 use regrind::formats::read_error_map;
 use regrind::model::FIRST_BATCH;
-use regrind::recipe::{SelectionMode, Recipe};
+use regrind::recipe::{Recipe, SelectionMode};
 use regrind::report::in_air;
 use tokio::sync::mpsc;
 

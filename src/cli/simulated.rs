@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use regrind::compensation::path::TrackPattern;
 use regrind::config::{CellConfig, LinkConfig, RotaryLetter};
 use regrind::device::{Coordinates, HitLinesWire, HitSource, IppdmeWire, LineAddress, RegisterMap, Wire};
-use regrind::formats::{JsonlAppender, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
+use regrind::formats::{FormatError, JsonlAppender, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::journal::utc;
 use regrind::recipe::{Recipe, WheelDimensions};
 use regrind_sim::cmm::TouchProbe;

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::cell::{Answer, Row, table};
+use regrind::cell::{Answer, Row, transition_table};
 use regrind::report::{save_text, state_picture};
 use serde_json::{Value, json};
 

@@ -9,7 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use regrind::formats::ResultFolder;
-use regrind::journal::{ExternalEvidence, Anchor, JournalError, PublicKey, Reader, anchor_of, verify_against};
+use regrind::journal::{Anchor, ExternalEvidence, JournalError, PublicKey, Reader, anchor_of, verify_against};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 

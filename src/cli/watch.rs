@@ -21,7 +21,7 @@ use super::Outcome;
 use super::blocks::{Blocks, sparkline};
 use super::control;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name, preview_text};
+use super::show::{how_far, limits, preview_text, pv_name};
 use super::words::time_left;
 
 /// Time between two checks for a new map on record.
@@ -52,8 +52,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         if !io::stdout().is_terminal() {
             return in_lines(first, &mut watch, &folder).await;
         }
-        let mut view =
-            View { snapshot: first, folder: folder.clone(), map: None, as_sigma: false, looked: None, said: String::new() };
+        let mut view = View {
+            snapshot: first,
+            folder: folder.clone(),
+            map: None,
+            as_sigma: false,
+            looked: None,
+            said: String::new(),
+        };
         let mut terminal = ratatui::init();
         let ended = view.follow(&mut terminal, &mut watch).await;
         ratatui::restore();
@@ -64,7 +70,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 /// Prints one line per new state, for a file or a pipe.
-async fn in_lines(first: Snapshot, watch: &mut regrind_control::StatusStream, folder: &Path) -> Result<Outcome, Failure> {
+async fn in_lines(
+    first: Snapshot,
+    watch: &mut regrind_control::StatusStream,
+    folder: &Path,
+) -> Result<Outcome, Failure> {
     let mut told = String::new();
     let mut seen = Ok(Some(first));
     while let Ok(Some(now)) = &seen {
@@ -133,8 +143,9 @@ impl View {
 
     async fn hold(&mut self) {
         let folder = self.folder.clone();
-        let asked =
-            tokio::task::spawn_blocking(move || send_request(&folder, &Request::Hold { reason: "regrind watch".into() }));
+        let asked = tokio::task::spawn_blocking(move || {
+            send_request(&folder, &Request::Hold { reason: "regrind watch".into() })
+        });
         self.said = match asked.await {
             Ok(Ok(reply)) => format!("hold: {}", reply.message),
             Ok(Err(error)) => format!("hold: {error}"),
@@ -236,7 +247,8 @@ impl View {
         };
         let falls = sparkline(self.snapshot.cycles.iter().map(|row| row.judged_um()[1]));
         let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS µm"));
-        let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
+        let lines =
+            [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
         Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })
     }
 

@@ -4,9 +4,13 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::tables::{
-    CellFile, FixtureTable, GrinderTable, RotaryTable, SphereTable, TimingTable, TravelTable, RotatedElement, UncertaintyTable,
+    CellFile, FixtureTable, GrinderTable, RotaryTable, RotatedElement, SphereTable, TimingTable, TravelTable,
+    UncertaintyTable,
 };
-use super::{CellConfig, CmmConfig, GrinderConfig, GrinderLimits, LinkConfig, ProgramConfig, ReferenceSphere, RotaryConfig, TravelLimits, dialect};
+use super::{
+    CellConfig, CmmConfig, GrinderConfig, GrinderLimits, LinkConfig, ProgramConfig, ReferenceSphere, RotaryConfig,
+    TravelLimits, dialect,
+};
 use crate::device::{MachineTable, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::{Document, sha256};
 use crate::formats::gcode::{DialectError, LINUXCNC};

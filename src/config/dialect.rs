@@ -79,7 +79,8 @@ mod tests {
     #[test]
     fn what_ships_is_read_by_its_name() {
         for name in dialects() {
-            let dialect = read_named_dialect(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
+            let dialect =
+                read_named_dialect(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
             assert_eq!(dialect.dialect.name, name);
         }
     }

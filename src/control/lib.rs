@@ -15,5 +15,8 @@ mod snapshot;
 mod socket;
 
 pub use request::{OnBehalf, Reply, Request};
-pub use snapshot::{CycleRow, JobProgress, NextStep, PartVerdict, Snapshot, PreviewStatistics};
-pub use socket::{Control, EndpointChange, ReceivedOrder, StatusStream, send_request, send_request_at, send_request_on_behalf, is_live, is_live_at, watch};
+pub use snapshot::{CycleRow, JobProgress, NextStep, PartVerdict, PreviewStatistics, Snapshot};
+pub use socket::{
+    Control, EndpointChange, ReceivedOrder, StatusStream, is_live, is_live_at, send_request, send_request_at,
+    send_request_on_behalf, watch,
+};

@@ -14,8 +14,8 @@ use regrind_cell::Actor;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 
-use super::endpoint::{self, Client, CellReader, Endpoint, ClientWriter, CellWriter};
-use super::request::{RequestLine, OnBehalf, Reply, Request};
+use super::endpoint::{self, CellReader, CellWriter, Client, ClientWriter, Endpoint};
+use super::request::{OnBehalf, Reply, Request, RequestLine};
 use super::snapshot::Snapshot;
 
 /// Maximum length of a line from a client, in bytes.
@@ -158,7 +158,11 @@ async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpo
 
 /// Checks periodically that a door still exists, and makes it again if not. Disk access runs on a thread of its own: a
 /// disk that does not answer blocks no order.
-async fn restore_if_removed(mut mark: endpoint::EndpointIdentity, tell: mpsc::UnboundedSender<EndpointChange>, hand_over: mpsc::Sender<Endpoint>) {
+async fn restore_if_removed(
+    mut mark: endpoint::EndpointIdentity,
+    tell: mpsc::UnboundedSender<EndpointChange>,
+    hand_over: mpsc::Sender<Endpoint>,
+) {
     let mut looks = tokio::time::interval(CHECK_INTERVAL);
     let mut is_lost = false;
     loop {

@@ -1,6 +1,6 @@
 //! Adaptive measurement, in which the touches are chosen: evaluation after a batch, and choice of the next targets.
 
-use super::task::{AdaptiveOptions, RepeatedTouches, ControlPoint, CycleState, UsablePoints, Task};
+use super::task::{AdaptiveOptions, ControlPoint, CycleState, RepeatedTouches, Task, UsablePoints};
 use crate::compensation::{ErrorMap, map_from_model};
 use crate::device::BatchId;
 use crate::geometry::{DeviationSample, Vector};
@@ -9,7 +9,7 @@ use crate::model::{
     self, Form, MAX_BATCHES, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, farthest_points, short_tour,
 };
 use crate::registration::{Deviation, PointStatus, Registration};
-use crate::surface::{OffsetSurface, FacetIndex, Side};
+use crate::surface::{FacetIndex, OffsetSurface, Side};
 
 // After the maximum number of batches follows one with all remaining targets. The batch numbers must be unique.
 const _: () = assert!(MAX_BATCHES < BatchId::MAX_BATCHES - 1);
@@ -44,7 +44,11 @@ pub(super) fn evaluate_touches(
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.point_targets };
     let purpose = adaptive.stopping_criteria(u32::from(cycle.correction.cycle) < adaptive.max_cycles);
-    let given = ModelInputs { decision_risk: adaptive.decision_risk(), acceptance_probability: adaptive.tolerance.probability, ..given };
+    let given = ModelInputs {
+        decision_risk: adaptive.decision_risk(),
+        acceptance_probability: adaptive.tolerance.probability,
+        ..given
+    };
     match model::decide(found, &given, &so_far, &purpose, u64::from(number)) {
         Ok(look) => {
             let next = (!look.next.is_empty()).then(|| (look.next, reason_message(look.reason)));
@@ -64,7 +68,12 @@ pub(super) fn evaluate_touches(
 ///
 /// The targets around lie on the way to the nearest other touched points: if the probe can touch two points, it can
 /// also reach the places between them. The control points are good touches as far apart as possible.
-pub(super) fn plan_repeated_touches(task: &Task, found: &Registration, points: &UsablePoints, noise_sigma_mm: f64) -> Option<RepeatedTouches> {
+pub(super) fn plan_repeated_touches(
+    task: &Task,
+    found: &Registration,
+    points: &UsablePoints,
+    noise_sigma_mm: f64,
+) -> Option<RepeatedTouches> {
     const MAX_OUTLIERS: usize = 20;
     const CONTROL_POINTS: usize = 6;
     /// Limit of the change of a control point, in standard deviations of the difference of two touches.
@@ -77,7 +86,11 @@ pub(super) fn plan_repeated_touches(task: &Task, found: &Registration, points: &
     /// Cosine of the angle between two directions, above which a neighbour is in the same direction as another one.
     const SAME_DIRECTION_COSINE: f64 = 0.7;
     let alone: Vec<usize> = found.outliers().map(|(k, _)| k).collect();
-    if task.targets.is_empty() || alone.is_empty() || alone.len() > MAX_OUTLIERS || points.repeat_rounds + 2 >= BatchId::MAX_BATCHES {
+    if task.targets.is_empty()
+        || alone.is_empty()
+        || alone.len() > MAX_OUTLIERS
+        || points.repeat_rounds + 2 >= BatchId::MAX_BATCHES
+    {
         return None;
     }
     let on_part: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
@@ -144,7 +157,9 @@ fn reason_message(why: Reason) -> &'static str {
 
 /// Interpolates the form on the grid of the error map.
 pub(super) fn interpolate_form(task: &Task, form: &Form) -> Option<ErrorMap> {
-    let of = |p: &model::FormPoint| (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+    let of = |p: &model::FormPoint| {
+        (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm)
+    };
     let told: Vec<_> = form.points.iter().map(of).collect();
     map_from_model(&told, &task.map_options, form.hyperparameters.noise_sigma_mm).ok()
 }

@@ -4,10 +4,13 @@ use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
-use super::recorder::{OutputFiles, ComputationError, classify_error};
+use super::recorder::{ComputationError, OutputFiles, classify_error};
 use super::task::{CycleState, Task, deviation_samples, used_deviations};
-use crate::compensation::{self, SurfacePoint, ErrorMap, EstimatedParameter, ParameterKind, ParameterEstimation, ParameterCorrections, Smoothing};
-use crate::form::{FormOptions, RemovedParts, figures, slope};
+use crate::compensation::{
+    self, ErrorMap, EstimatedParameter, ParameterCorrections, ParameterEstimation, ParameterKind, Smoothing,
+    SurfacePoint,
+};
+use crate::form::{FormOptions, RemovedParts, compute_figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
@@ -34,7 +37,12 @@ pub(super) fn save_figures(
     let integration_mm = slope_length_mm.unwrap_or(SLOPE_LENGTH_SHARE * task.map_options.cutoff_mm);
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
-    write_figures(&files.add_file("figures.json"), (made.as_ref(), slopes, form), &removed_components(task), task.simulation)
+    write_figures(
+        &files.add_file("figures.json"),
+        (made.as_ref(), slopes, form),
+        &removed_components(task),
+        task.simulation,
+    )
 }
 
 /// Returns the options for the figures of an area: the middle of the aperture, and the length over which slopes are
@@ -106,7 +114,12 @@ fn parameter_document(task: &Task, told: &ParameterEstimation) -> Value {
 }
 
 /// Returns the parameter corrections of the next pass: those of this pass plus those now compensated.
-pub(super) fn next_parameter_corrections(task: &Task, cycle: &CycleState, contacts: &[SurfacePoint], told: &ParameterEstimation) -> Option<ParameterCorrections> {
+pub(super) fn next_parameter_corrections(
+    task: &Task,
+    cycle: &CycleState,
+    contacts: &[SurfacePoint],
+    told: &ParameterEstimation,
+) -> Option<ParameterCorrections> {
     let taken = task.parameter_compensation.as_ref()?;
     let before = cycle.correction.set.as_ref();
     let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
@@ -114,7 +127,12 @@ pub(super) fn next_parameter_corrections(task: &Task, cycle: &CycleState, contac
     if before.is_some_and(|before| before.values == values) {
         return before.cloned();
     }
-    ParameterCorrections::from_values(values, cycle.correction.cycle + 1, [contacts, &taken.node_points], &task.parameter_options(before))
+    ParameterCorrections::from_values(
+        values,
+        cycle.correction.cycle + 1,
+        [contacts, &taken.node_points],
+        &task.parameter_options(before),
+    )
 }
 
 /// Returns a function that extracts, from values at the nodes of the correction, the part that parameters and slides
@@ -127,7 +145,9 @@ pub(super) fn parameter_explainer<'t>(
     let taken = task.parameter_compensation.as_ref()?;
     let options = task.parameter_options(cycle.correction.set.as_ref());
     let grid = cycle.correction.grid;
-    Some(move |values_mm: &[f64]| compensation::explained_by_parameters(values_mm, &grid, [contacts, &taken.node_points], &options))
+    Some(move |values_mm: &[f64]| {
+        compensation::explained_by_parameters(values_mm, &grid, [contacts, &taken.node_points], &options)
+    })
 }
 
 /// Writes the error map of a cycle and the points from which it was computed.
@@ -163,7 +183,8 @@ fn save_pictures(task: &Task, files: &mut OutputFiles, map: &ErrorMap) -> Result
 }
 
 fn save_deviations(task: &Task, files: &mut OutputFiles, found: &Registration) -> Result<(), ReportError> {
-    let rows: Vec<[f64; 4]> = used_deviations(found).map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
+    let rows: Vec<[f64; 4]> =
+        used_deviations(found).map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
     let remarks: &[&str] = if task.simulation { &["SIMULATION", "frame: model"] } else { &["frame: model"] };
     save_coloured_ply(&files.add_file("deviations.ply"), "Deviations", &rows, &[], task.plot_tolerance_mm, remarks)
 }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::CycleRow;
-use super::task::{CycleState, UsablePoints, ComputationProduct, Task};
+use super::task::{ComputationProduct, CycleState, Task, UsablePoints};
 use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
 use crate::geometry::Pose;
@@ -108,7 +108,9 @@ impl Cycles {
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
         for is_corrected in [false, true] {
             let alike = |cycle: &&CycleState| cycle.is_judged() && cycle.correction.is_zero() != is_corrected;
-            if let Some(field) = self.0.values().filter(alike).filter_map(|cycle| cycle.field_hyperparameters).next_back() {
+            if let Some(field) =
+                self.0.values().filter(alike).filter_map(|cycle| cycle.field_hyperparameters).next_back()
+            {
                 taught.update(is_corrected, &field);
             }
         }

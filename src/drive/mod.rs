@@ -12,23 +12,23 @@
 //! once. Everything else waits in a queue until the journal has all earlier records; this includes the answer to the
 //! person who gave an order.
 
+mod adaptive_measurement;
 mod blocking_executor;
-mod cycles;
 mod cycle_output;
+mod cycles;
 mod notice;
 mod outcome;
-mod progress_estimator;
 mod pass_record;
+mod pipeline;
+mod preview;
 mod program;
+mod progress_estimator;
 mod recorder;
 pub mod recovery;
 mod replay;
 mod snapshot;
-mod preview;
 mod station;
 mod task;
-mod adaptive_measurement;
-mod pipeline;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -43,8 +43,8 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 
 use crate::cell::{
-    Actor, MachineRequest, Cell, CellPlan, Command, ComparedFigure, CompensationRefusal, Device, Ending, Event, GateResult, GateFailure,
-    Judgement, Phase, RecordFailure, State, StateName,
+    Actor, Cell, CellPlan, Command, ComparedFigure, CompensationRefusal, Device, Ending, Event, GateFailure,
+    GateResult, Judgement, MachineRequest, Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
     AnyCmm, AnyGrinder, Armed, BatchId, Cmm, Grinder, Identified, Interrupt, Job, Measurement, OperatorConfirmation,
@@ -56,22 +56,22 @@ use crate::journal::{self, Artefact, Entry, Kind};
 pub use blocking_executor::{BlockingExecutor, BlockingWork};
 use cycles::Cycles;
 pub use notice::Notice;
-use progress_estimator::ProgressEstimator;
+use preview::PreviewAccumulator;
 use program::PROGRAM_FILE;
 pub use program::{ProgramError, Programs};
+use progress_estimator::ProgressEstimator;
 pub use recorder::JournalSink;
-use recorder::{OutputFiles, Recorder, RecordReceipt, entry};
+use recorder::{OutputFiles, RecordReceipt, Recorder, entry};
 use regrind_control::{Control, EndpointChange, ReceivedOrder};
-pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, PreviewStatistics, send_request, is_live};
+pub use regrind_control::{CycleRow, JobProgress, PreviewStatistics, Reply, Request, Snapshot, is_live, send_request};
 pub use replay::{InterruptedRun, ReplayError};
-use preview::PreviewAccumulator;
 use station::{
-    AbortCounter, StationRequest, CmmDriver, FetchedResult, GrinderDriver, MachinePayload, MachineTask, MachineNotes, WATCHDOG_INTERVAL, LoopWatchdog, StationDriver,
-    StationReport,
+    AbortCounter, CmmDriver, FetchedResult, GrinderDriver, LoopWatchdog, MachineNotes, MachinePayload, MachineTask,
+    StationDriver, StationReport, StationRequest, WATCHDOG_INTERVAL,
 };
 use task::ComputationProduct;
 pub(crate) use task::correction_grid;
-pub use task::{AdaptiveOptions, Probing, ReferenceSphere, ParameterCompensation, Task};
+pub use task::{AdaptiveOptions, ParameterCompensation, Probing, ReferenceSphere, Task};
 
 /// Inputs of a run besides its machines.
 pub struct RunInputs {
@@ -294,7 +294,8 @@ impl Drive {
         let serial = run.journal.serial().to_owned();
         let recorder = Recorder::new(run.journal, &ids, &run.executor);
         let folder = recorder.folder().to_owned();
-        let control = Control::listen(&folder, orders.clone(), seen.clone(), matches!(run.executor, BlockingExecutor::Threads))?;
+        let control =
+            Control::listen(&folder, orders.clone(), seen.clone(), matches!(run.executor, BlockingExecutor::Threads))?;
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let pulse = LoopWatchdog::new();
@@ -456,7 +457,9 @@ impl Drive {
             RecordAction::Answer { answer, accepted, message } => {
                 drop(answer.send(Reply { taken: accepted, message, status: self.snapshot() }))
             }
-            RecordAction::Confirm { device, confirmation: word, answer } => self.send_request(device, StationRequest::Confirm { confirmation: word, answer }).await,
+            RecordAction::Confirm { device, confirmation: word, answer } => {
+                self.send_request(device, StationRequest::Confirm { confirmation: word, answer }).await
+            }
         }
     }
 
@@ -501,9 +504,11 @@ impl Drive {
         if self.record_failure_reason.is_none() || self.ending.is_some() {
             return;
         }
-        let leads_on = |then: &RecordAction| matches!(then, RecordAction::Execute(command) if outcome::expects_answer(command));
+        let leads_on =
+            |then: &RecordAction| matches!(then, RecordAction::Execute(command) if outcome::expects_answer(command));
         let waiting = self.backlog.iter_mut().filter(|waiting| leads_on(&waiting.action));
-        let withdrawn: Vec<RecordAction> = waiting.map(|waiting| std::mem::replace(&mut waiting.action, RecordAction::Nothing)).collect();
+        let withdrawn: Vec<RecordAction> =
+            waiting.map(|waiting| std::mem::replace(&mut waiting.action, RecordAction::Nothing)).collect();
         for then in withdrawn {
             if let RecordAction::Execute(command) = then {
                 self.report_not_recorded(*command).await;
@@ -592,7 +597,10 @@ impl Drive {
         if let Some(answer) = answer {
             let accepted = refusal.is_none();
             let message = refusal.unwrap_or_else(|| self.cell.in_words());
-            self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Answer { answer, accepted, message } });
+            self.backlog.push_back(PendingRecord {
+                receipt: ticket,
+                action: RecordAction::Answer { answer, accepted, message },
+            });
             self.answer_unrecorded_orders();
         }
     }
@@ -620,7 +628,10 @@ impl Drive {
             let origin = (actor.name.clone(), actor.station.clone());
             let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
             let (told, taken) = oneshot::channel();
-            self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Confirm { device, confirmation: word, answer: told } });
+            self.backlog.push_back(PendingRecord {
+                receipt: ticket,
+                action: RecordAction::Confirm { device, confirmation: word, answer: told },
+            });
             taken
         });
         let status = self.snapshot();
@@ -862,7 +873,8 @@ impl Drive {
         } else {
             self.recorder.append(Entry { kind: Kind::Note, ..record })
         };
-        let then = if is_immediate(&command) { RecordAction::Nothing } else { RecordAction::Execute(Box::new(command)) };
+        let then =
+            if is_immediate(&command) { RecordAction::Nothing } else { RecordAction::Execute(Box::new(command)) };
         self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
     }
 
@@ -914,7 +926,9 @@ impl Drive {
                 self.send_urgent_request(device, StationRequest::Abort).await;
             }
             Command::ClearMachine { device } => self.send_request(device, StationRequest::Clear).await,
-            Command::Reconcile { device, cycle } => self.send_request(device, StationRequest::Reconcile { cycle }).await,
+            Command::Reconcile { device, cycle } => {
+                self.send_request(device, StationRequest::Reconcile { cycle }).await
+            }
             Command::Collect { cycle } => self.send_request(Device::Cmm, StationRequest::Collect { cycle }).await,
             Command::Qualify { cycle } => self.qualify(cycle),
             Command::Acknowledge { device } => self.send_request(device, StationRequest::Acknowledge).await,
@@ -964,18 +978,20 @@ impl Drive {
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let last = self.cycles.last_with_learning().cloned();
         let fields = self.cycles.part_priors(&self.task);
-        let Some(learned) = last.and_then(|cycle| pipeline::learned_state(&self.task, run, (&cycle, fields))) else { return };
+        let Some(learned) = last.and_then(|cycle| pipeline::learned_state(&self.task, run, (&cycle, fields))) else {
+            return;
+        };
         self.write_document(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
 
-    async fn send_request(&mut self, device: Device, ask: StationRequest) {
+    async fn send_request(&mut self, device: Device, request: StationRequest) {
         // A station lives as long as the drive; its channel is large enough for the work of one cell.
-        let _ = self.requests[device as usize].send(send_request).await;
+        let _ = self.requests[device as usize].send(request).await;
     }
 
-    async fn send_urgent_request(&mut self, device: Device, ask: StationRequest) {
+    async fn send_urgent_request(&mut self, device: Device, request: StationRequest) {
         self.interrupts[device as usize].raise();
-        self.send_request(device, send_request).await;
+        self.send_request(device, request).await;
     }
 
     async fn ask_to_load(&mut self) {
@@ -1059,20 +1075,31 @@ impl Drive {
         let mut files = OutputFiles::new(folder.clone(), cycle_folder(cycle, which));
         if task.adaptive.is_some() && kind != Computation::Compensation {
             let settled = self.attempts.get(&(cycle, Computation::FinalRegistration)).map_or(1, |before| before + 1);
-            files = OutputFiles::new(folder.clone(), batch_folder(cycle, which)).with_final_subfolder(cycle_folder(cycle, settled));
+            files = OutputFiles::new(folder.clone(), batch_folder(cycle, which))
+                .with_final_subfolder(cycle_folder(cycle, settled));
         }
         let computing = self.executor.spawn_computation(&mut self.computations, move || {
             // A failure to create the folder shows as the error of the first file in it.
             let _ = create_folder(&files.folder());
             let (event, product) = work(&task, &mut files);
-            ComputationResult { cycle, event: Some(event), product, files: recorder::sync_and_hash(&folder, &files.into_existing()) }
+            ComputationResult {
+                cycle,
+                event: Some(event),
+                product,
+                files: recorder::sync_and_hash(&folder, &files.into_existing()),
+            }
         });
         self.running_computations.insert(computing.id(), (cycle, kind));
     }
 
     /// Sends an event to the cell through the queue of computations, like every other event.
     fn queue_event(&mut self, cycle: u32, event: Event) {
-        let computed = ComputationResult { cycle, event: Some(event), product: ComputationProduct::Nothing, files: Ok(Vec::new()) };
+        let computed = ComputationResult {
+            cycle,
+            event: Some(event),
+            product: ComputationProduct::Nothing,
+            files: Ok(Vec::new()),
+        };
         self.computations.spawn(std::future::ready(computed));
     }
 
@@ -1082,7 +1109,8 @@ impl Drive {
     }
 
     fn state_notice(&self, event: &Event) -> Notice {
-        let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.progress_estimator.progress().is_some());
+        let (state, cycle, at_job) =
+            (self.cell.in_words(), self.cell.cycle(), self.progress_estimator.progress().is_some());
         Notice::State { state, cycle, event: event.name().to_owned(), at_job }
     }
 

@@ -1,6 +1,6 @@
 //! Mapping of events to the commands that they answer, so that the journal shows the outcome of each command.
 
-use crate::cell::{MachineRequest, Command, Device, Event, Reconciliation};
+use crate::cell::{Command, Device, Event, MachineRequest, Reconciliation};
 
 /// Returns true if an event answers a command. All other commands are complete when they are sent.
 pub(super) fn expects_answer(command: &Command) -> bool {

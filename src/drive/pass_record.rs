@@ -76,7 +76,8 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
     let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
     // Manual reports of start and end are no measure of the duration. A machine that reports a path has a clock.
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
-    let wheel = [1.0 - MAX_WHEEL_RADIUS_DIFFERENCE, 1.0 + MAX_WHEEL_RADIUS_DIFFERENCE].map(|share| share * pass.wheel_radius_mm);
+    let wheel = [1.0 - MAX_WHEEL_RADIUS_DIFFERENCE, 1.0 + MAX_WHEEL_RADIUS_DIFFERENCE]
+        .map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
     let most_mm = MAX_DEPTH_FACTOR * max_depth_mm + DEPTH_MARGIN_MM;
     let most_mm3 = MAX_SURFACE_FACTOR * width * height * most_mm;
@@ -152,12 +153,18 @@ mod tests {
     }
 
     fn checked(record: &PassRecord) -> Option<String> {
-        checked_with_outline(Some(&Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 }), record)
+        checked_with_outline(
+            Some(&Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 }),
+            record,
+        )
     }
 
     fn checked_with_outline(outline: Option<&Aperture>, record: &PassRecord) -> Option<String> {
         let job = Job { job: 41, cycle: 2, digest: 0 };
-        implausible_figure(&CommandedPass { job, pass: &pass(), map_identity: [3; 32], max_depth_mm: 0.5, outline }, record)
+        implausible_figure(
+            &CommandedPass { job, pass: &pass(), map_identity: [3; 32], max_depth_mm: 0.5, outline },
+            record,
+        )
     }
 
     #[test]
@@ -166,7 +173,9 @@ mod tests {
         let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
         // 728.8 mm2 with tracks every 0.5 mm.
         assert_eq!(checked_with_outline(Some(&ring), &of_path(740.0)), None);
-        assert!(checked_with_outline(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("minimum 728.849 mm")));
+        assert!(
+            checked_with_outline(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("minimum 728.849 mm"))
+        );
         assert_eq!(checked_with_outline(None, &of_path(3200.0)), None);
         assert!(checked_with_outline(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("minimum 3162.000 mm")));
     }

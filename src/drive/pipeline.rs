@@ -11,10 +11,13 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::cell::{
-    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, RecordedFormFigures, GateResult, GateFailure, RecordedInterval,
-    OutlierFigures, RecordedParameter, PartResponse, FurtherTouches,
+    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FurtherTouches, GateFailure, GateResult,
+    OutlierFigures, PartResponse, RecordedFormFigures, RecordedInterval, RecordedParameter,
 };
-use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map, response};
+use crate::compensation::{
+    self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map,
+    estimate_response,
+};
 use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus, TargetKind};
 use crate::form::pv_998;
 use crate::formats::{
@@ -26,10 +29,13 @@ use crate::measuring::fit_sphere;
 use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
 use crate::registration::{Options, PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
 
-use super::cycle_output;
-use super::recorder::{OutputFiles, ComputationError, classify_error};
-use super::task::{RepeatedTouches, ControlPoint, CycleState, UsablePoints, ComputationProduct, RegistrationProduct, Task, deviation_samples, used_deviations};
 use super::adaptive_measurement;
+use super::cycle_output;
+use super::recorder::{ComputationError, OutputFiles, classify_error};
+use super::task::{
+    ComputationProduct, ControlPoint, CycleState, RegistrationProduct, RepeatedTouches, Task, UsablePoints,
+    deviation_samples, used_deviations,
+};
 
 /// Checks if the measurement of a cycle can be used, and writes its points.
 pub(super) fn gate_cycle(
@@ -79,7 +85,9 @@ pub(super) fn gate_cycle(
     let (gate, product) = match saved {
         Ok(points) => (GateResult::Passed, ComputationProduct::Points(points)),
         Err(ComputationError::Failed(failure)) => (GateResult::Failed(failure), ComputationProduct::Nothing),
-        Err(ComputationError::NotSaved(why)) => return (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => {
+            return (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing);
+        }
     };
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
@@ -92,7 +100,11 @@ pub(super) fn gate_cycle(
 /// # Errors
 /// Other coordinates than those of the first touches, or control points that have moved: the two sets of touches are
 /// not of one measurement.
-fn merge_repeated_touches(again: &RepeatedTouches, points: &UsablePoints, measurement: &Measurement) -> Result<(UsablePoints, u32), GateFailure> {
+fn merge_repeated_touches(
+    again: &RepeatedTouches,
+    points: &UsablePoints,
+    measurement: &Measurement,
+) -> Result<(UsablePoints, u32), GateFailure> {
     if measurement.coordinates != points.coordinates {
         let message = "one measurement cannot mix probe centres and contact points; measure again";
         return Err(GateFailure::Broken(message.to_owned()));
@@ -110,7 +122,8 @@ fn merge_repeated_touches(again: &RepeatedTouches, points: &UsablePoints, measur
     check_control_points(again, points, controls)?;
     let mut all = points.clone();
     all.repeat_rounds += 1;
-    for (point, &number) in repeated.iter().zip(&again.outlier_points).filter(|(p, _)| p.status == PointStatus::Touched) {
+    for (point, &number) in repeated.iter().zip(&again.outlier_points).filter(|(p, _)| p.status == PointStatus::Touched)
+    {
         all.part[number] = point.position_mm.into();
     }
     all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.position_mm)));
@@ -123,7 +136,11 @@ fn merge_repeated_touches(again: &RepeatedTouches, points: &UsablePoints, measur
 ///
 /// # Errors
 /// A change that the noise of the probe does not explain, or fewer than two control points that were touched.
-fn check_control_points(again: &RepeatedTouches, points: &UsablePoints, repeated: &[MeasuredPoint]) -> Result<(), GateFailure> {
+fn check_control_points(
+    again: &RepeatedTouches,
+    points: &UsablePoints,
+    repeated: &[MeasuredPoint],
+) -> Result<(), GateFailure> {
     let pairs = again.control_points.iter().zip(repeated).filter(|(_, p)| p.status == PointStatus::Touched);
     let change_mm = |control: &ControlPoint, now: &MeasuredPoint| {
         (Point::from(now.position_mm) - points.part[control.point_index]).dot(&control.normal).abs()
@@ -219,7 +236,8 @@ pub(super) struct TouchRecord {
 impl TouchRecord {
     /// Adds a batch to the touches so far.
     fn with_batch(so_far: Option<&UsablePoints>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
-        let (mut tried, mut of) = so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
+        let (mut tried, mut of) =
+            so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
         if !asked.is_empty() {
             let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.kind == TargetKind::Part);
             let found = pairs.zip(asked).filter(|((p, _), _)| p.status == PointStatus::Touched);
@@ -288,7 +306,11 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
 const MIN_COMPARED_TOUCHES: usize = 8;
 
 /// Returns a failure if a machine has given its earlier result again. No probe repeats every place to the last bit.
-fn repeated_result_failure(task: &Task, earlier: Option<&(u32, Arc<UsablePoints>)>, measurement: &Measurement) -> Option<GateFailure> {
+fn repeated_result_failure(
+    task: &Task,
+    earlier: Option<&(u32, Arc<UsablePoints>)>,
+    measurement: &Measurement,
+) -> Option<GateFailure> {
     let (number, points) = earlier.filter(|_| !task.rehearsal)?;
     let touched = || measurement.points.iter().filter(|point| point.status == PointStatus::Touched);
     // Ignore the order of the plan and the points of the reference sphere.
@@ -346,7 +368,9 @@ pub(super) fn register_cycle(
             let event = Event::Registered { cycle: number, figures: found.figures.clone() };
             (event, ComputationProduct::Registered(Box::new(found)))
         }
-        Err(ComputationError::Failed(why)) => (Event::RegistrationFailed { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::Failed(why)) => {
+            (Event::RegistrationFailed { cycle: number, why }, ComputationProduct::Nothing)
+        }
         Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
     }
 }
@@ -392,13 +416,18 @@ fn register_and_evaluate(
     };
     let looked = task.adaptive.as_ref().filter(|_| !points.tried_targets.is_empty());
     let looked_at = looked.is_some();
-    let looked = looked.map(|adaptive| adaptive_measurement::evaluate_touches(task, adaptive, (number, cycle), points, (&found, given)));
+    let looked = looked.map(|adaptive| {
+        adaptive_measurement::evaluate_touches(task, adaptive, (number, cycle), points, (&found, given))
+    });
     let (form, next) = match looked {
         Some(adaptive_measurement::TouchEvaluation { form, next }) => (form, next),
         None => (Form::estimate(&found, &given).map_err(|error| error.to_string()), None),
     };
     if looked_at && next.is_none() {
-        files.switch_to_final_subfolder().and_then(|()| write_measured_points(task, files, points)).map_err(classify_error)?;
+        files
+            .switch_to_final_subfolder()
+            .and_then(|()| write_measured_points(task, files, points))
+            .map_err(classify_error)?;
     }
     write_registration(task, files, &found, &options).map_err(classify_error)?;
     if let Ok(form) = &form {
@@ -442,8 +471,9 @@ fn register_and_evaluate(
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }
-    figures.touch_on =
-        next.as_ref().map(|(next, why)| Box::new(FurtherTouches { targets: next.len() as u32, why: (*why).to_owned() }));
+    figures.touch_on = next
+        .as_ref()
+        .map(|(next, why)| Box::new(FurtherTouches { targets: next.len() as u32, why: (*why).to_owned() }));
     if next.is_some() && form.is_err() {
         // The first few touches have six motions fitted: their residuals say nothing about the form.
         figures.form = None;
@@ -452,7 +482,11 @@ fn register_and_evaluate(
     // Without a model, the residuals of the fit bound the noise from above.
     let noise_sigma_mm =
         form.as_ref().map_or(found.quality.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
-    let again = if looked_at { None } else { adaptive_measurement::plan_repeated_touches(task, &found, points, noise_sigma_mm) };
+    let again = if looked_at {
+        None
+    } else {
+        adaptive_measurement::plan_repeated_touches(task, &found, points, noise_sigma_mm)
+    };
     if let Some(left_out) = figures.left_out.as_mut() {
         left_out.again = again.is_some();
     }
@@ -464,7 +498,18 @@ fn register_and_evaluate(
         figures.touch_on = Some(Box::new(FurtherTouches { targets, why }));
     }
     let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
-    Ok(RegistrationProduct { registration: found, form: form.ok(), field_hyperparameters: field, error_map: error, learning: known, parameters, parameter_corrections: set, figures, next_targets: next, repeated_touches: again })
+    Ok(RegistrationProduct {
+        registration: found,
+        form: form.ok(),
+        field_hyperparameters: field,
+        error_map: error,
+        learning: known,
+        parameters,
+        parameter_corrections: set,
+        figures,
+        next_targets: next,
+        repeated_touches: again,
+    })
 }
 
 /// Returns the messages for the offered parameters.
@@ -490,13 +535,19 @@ fn update_learning(
     error: &ErrorMap,
     (answer, contacts): (Option<compensation::Response>, &[compensation::SurfacePoint]),
 ) -> LearningState {
-    let earlier = before.and_then(|before| before.learning.as_deref().cloned()).unwrap_or_else(|| task.initial_learning());
+    let earlier =
+        before.and_then(|before| before.learning.as_deref().cloned()).unwrap_or_else(|| task.initial_learning());
     let smoother = cycle_output::parameter_explainer(task, cycle, contacts);
     let smooth = smoother.as_ref().map(|smoother| smoother as compensation::ParameterExplainer<'_>);
     earlier.updated(&PassObservation { correction: &cycle.correction, error, response: answer, explained: smooth })
 }
 
-fn write_registration(task: &Task, files: &mut OutputFiles, found: &Registration, options: &Options) -> Result<(), FormatError> {
+fn write_registration(
+    task: &Task,
+    files: &mut OutputFiles,
+    found: &Registration,
+    options: &Options,
+) -> Result<(), FormatError> {
     let nominal = NominalInput {
         file: &task.nominal_path,
         points: task.nominal.len(),
@@ -553,9 +604,9 @@ fn cell_figures(
         coverage: verdict.coverage,
         points: verdict.inliers as u32,
         outliers,
-        left_out: found
-            .figures_with_outliers()
-            .map(|of| Box::new(OutlierFigures { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.description, again: false })),
+        left_out: found.figures_with_outliers().map(|of| {
+            Box::new(OutlierFigures { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.description, again: false })
+        }),
         shift_mm: moved.translation_mm.norm(),
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
@@ -622,7 +673,12 @@ fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> Recorded
     }
 }
 
-fn part_response(before: &CycleState, cycle: &CycleState, found: &Registration, error: &ErrorMap) -> Option<compensation::Response> {
+fn part_response(
+    before: &CycleState,
+    cycle: &CycleState,
+    found: &Registration,
+    error: &ErrorMap,
+) -> Option<compensation::Response> {
     let earlier = before.error_map.as_ref()?;
     let places: Vec<(Point, Vector)> = used_deviations(found).map(|d| (d.point, d.normal)).collect();
     let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
@@ -641,10 +697,17 @@ fn cell_response(sense: ResponseKind) -> PartResponse {
 }
 
 /// Computes the correction of the next pass and writes it.
-pub(super) fn compensate_cycle(task: &Task, files: &mut OutputFiles, number: u32, cycle: &CycleState) -> (Event, ComputationProduct) {
+pub(super) fn compensate_cycle(
+    task: &Task,
+    files: &mut OutputFiles,
+    number: u32,
+    cycle: &CycleState,
+) -> (Event, ComputationProduct) {
     match compute_correction(task, files, cycle) {
         Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, ComputationProduct::Correction(next)),
-        Err(ComputationError::Failed(why)) => (Event::CompensationRefused { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::Failed(why)) => {
+            (Event::CompensationRefused { cycle: number, why }, ComputationProduct::Nothing)
+        }
         Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
     }
 }
@@ -670,9 +733,13 @@ fn compute_correction(
         Some(known) => Arc::clone(known),
         None => Arc::new(update_learning(task, cycle, None, &map, (None, &cycle_output::surface_points(found)))),
     };
-    let step =
-        cycle.correction.next_pass(&map, &known, cycle.parameter_corrections.as_deref(), &task.correction_limits).map_err(|error| match error {
-            NextPassError::BudgetSpent { .. } => ComputationError::Failed(CompensationRefusal::BudgetSpent(error.to_string())),
+    let step = cycle
+        .correction
+        .next_pass(&map, &known, cycle.parameter_corrections.as_deref(), &task.correction_limits)
+        .map_err(|error| match error {
+            NextPassError::BudgetSpent { .. } => {
+                ComputationError::Failed(CompensationRefusal::BudgetSpent(error.to_string()))
+            }
             error => failed(&error),
         })?;
     // A pass that cannot be ground must leave no correction that could be mistaken for one.
@@ -753,7 +820,7 @@ fn parameter_questions(cycle: &CycleState) -> Vec<String> {
 pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleState, PartPriors)) -> Option<Learned> {
     let known = cycle.learning.as_deref()?;
     let wrong = [PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled];
-    if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&estimate_response)) {
+    if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
         return None;
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
@@ -899,7 +966,10 @@ mod tests {
     fn without_two_control_points_the_touches_are_refused() {
         let (again, points) = first_touches();
         let missed = [Some(1.0), Some(1.0), None, None, None, Some(1.0)];
-        assert!(matches!(merge_repeated_touches(&again, &points, &repeated_measurement(missed)), Err(GateFailure::Moved(_))));
+        assert!(matches!(
+            merge_repeated_touches(&again, &points, &repeated_measurement(missed)),
+            Err(GateFailure::Moved(_))
+        ));
     }
 
     #[test]

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use crate::compensation::path::{
-    ArcSummary, HeightField, TiltMode, MachineLimits, PathError, PathMode, PathOptions, TrackPattern, PathSummary, ToolPath, TrackSpacing,
-    TargetSurface, Wheel, axis_offsets, nominal_height_field,
+    ArcSummary, HeightField, MachineLimits, PathError, PathMode, PathOptions, PathSummary, TargetSurface, TiltMode,
+    ToolPath, TrackPattern, TrackSpacing, Wheel, axis_offsets, nominal_height_field,
 };
 use crate::compensation::{Correction, ParameterKind};
 use crate::formats::gcode::{
@@ -68,7 +68,7 @@ pub enum ProgramError {
     #[error(transparent)]
     File(#[from] GcodeError),
     #[error(
-        "the program of the next pass would have {points} points, limit {MOST_POINTS}; allow a larger chord error, or write \
+        "the program of the next pass would have {points} points, limit {MAX_PROGRAM_POINTS}; allow a larger chord error, or write \
          the program with `regrind plan --program`"
     )]
     TooLong { points: u64 },
@@ -158,7 +158,12 @@ impl Programs {
     ///
     /// # Errors
     /// Those of [`Programs::path`], and a file that cannot be written.
-    pub fn write(&self, file: &Path, correction: &Correction, map_identity: [u8; 32]) -> Result<PathSummary, ProgramError> {
+    pub fn write(
+        &self,
+        file: &Path,
+        correction: &Correction,
+        map_identity: [u8; 32],
+    ) -> Result<PathSummary, ProgramError> {
         let (path, summary) = self.path(correction)?;
         self.write_program(file, correction, map_identity, &path, &summary)?;
         Ok(summary)
@@ -300,7 +305,9 @@ fn describe_tracks(path: &ToolPath) -> String {
         (TrackPattern::Spiral, _) => "spiral inwards",
     };
     let scallop = match options.spacing {
-        TrackSpacing::Scallop { max_height_mm: height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),
+        TrackSpacing::Scallop { max_height_mm: height_mm, .. } => {
+            format!(", ridges of {:.3} um at most", 1e3 * height_mm)
+        }
         TrackSpacing::Distance(_) => String::new(),
     };
     format!(

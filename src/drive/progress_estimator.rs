@@ -64,7 +64,8 @@ impl ProgressEstimator {
         let open = f64::from(self.done_and_total.1.saturating_sub(done));
         let since = |(at, from): (Duration, u32)| {
             let seconds = (now.saturating_sub(at)).as_secs_f64();
-            (done > from && seconds >= MIN_OBSERVATION_TIME.as_secs_f64()).then(|| seconds / f64::from(done - from) * open)
+            (done > from && seconds >= MIN_OBSERVATION_TIME.as_secs_f64())
+                .then(|| seconds / f64::from(done - from) * open)
         };
         let whole = since(*self.marks.front()?)?;
         let late = since(self.marks[self.marks.len() - self.marks.len().div_ceil(4)]).unwrap_or(whole);

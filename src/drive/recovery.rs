@@ -40,7 +40,7 @@ pub enum RecoveryError {
     Device(#[from] DeviceError),
     #[error(transparent)]
     Journal(#[from] JournalError),
-    #[error("the {device} was {seen} and is now {found}; no command was sent; check the machine again")]
+    #[error("the {device} was {shown} and is now {found}; no command was sent; check the machine again")]
     Changed { device: Device, shown: String, found: String },
     #[error("the {device} is still {found} after {} s; check the machine, then run the command again", .limit.as_secs())]
     TimedOut { device: Device, found: State, limit: Duration },

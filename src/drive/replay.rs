@@ -24,11 +24,11 @@ use thiserror::Error;
 
 use super::cycles::Cycles;
 use super::outcome;
+use super::pipeline;
 use super::recorder::OutputFiles;
 use super::station::StartIntent;
 use super::task::ComputationProduct;
-use super::pipeline;
-use super::{Computation, Task, batch_folder, cycle_folder, create_folder};
+use super::{Computation, Task, batch_folder, create_folder, cycle_folder};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
@@ -148,7 +148,16 @@ impl<'t> Replay<'t> {
     fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
         let found = InterruptedRun::new(plan);
         let (due, files, names) = (VecDeque::new(), BTreeMap::new(), BTreeSet::new());
-        Ok(Self { run_folder: run, task, replayed: found, due_commands: due, files, recorded_names: names, coordinates: None, last_sequence: 0 })
+        Ok(Self {
+            run_folder: run,
+            task,
+            replayed: found,
+            due_commands: due,
+            files,
+            recorded_names: names,
+            coordinates: None,
+            last_sequence: 0,
+        })
     }
 
     fn apply_record(&mut self, record: &Record) -> Result<(), ReplayError> {
@@ -171,7 +180,9 @@ impl<'t> Replay<'t> {
                 Ok(())
             }
             Kind::Event => self.apply_event(Duration::from_nanos(record.mono_ns), payload),
-            Kind::Intent | Kind::Note if payload["command"].is_string() => self.compare_command(record.command_id, payload),
+            Kind::Intent | Kind::Note if payload["command"].is_string() => {
+                self.compare_command(record.command_id, payload)
+            }
             Kind::Intent | Kind::Note => {
                 let told = &payload["transfer"]["coordinates"];
                 if !told.is_null() {
@@ -188,7 +199,9 @@ impl<'t> Replay<'t> {
         let path = Path::new(&file.name);
         let cycle = file.name.split('/').next().and_then(|folder| folder.strip_prefix("cycle-")?.parse().ok());
         let (Some(cycle), Some(name)) = (cycle, path.file_name().and_then(|name| name.to_str())) else { return };
-        if name == "result.json" && self.replayed.unannounced_judgement.as_ref().is_some_and(|(_, of)| of.cycle == cycle) {
+        if name == "result.json"
+            && self.replayed.unannounced_judgement.as_ref().is_some_and(|(_, of)| of.cycle == cycle)
+        {
             self.replayed.unannounced_judgement = None;
         }
         self.files.insert((cycle, name.to_owned()), file);
@@ -264,9 +277,13 @@ impl<'t> Replay<'t> {
         let mut files = OutputFiles::new(scratch.path().to_owned(), cycle_folder(number, 1));
         create_folder(&files.folder())?;
         let (again, product) = match kind {
-            Computation::Registration => {
-                pipeline::register_cycle(self.task, &mut files, number, &cycle, self.replayed.cycles.previous_judged(number))
-            }
+            Computation::Registration => pipeline::register_cycle(
+                self.task,
+                &mut files,
+                number,
+                &cycle,
+                self.replayed.cycles.previous_judged(number),
+            ),
             _ => pipeline::compensate_cycle(self.task, &mut files, number, &cycle),
         };
         if let Event::NotSaved { why, .. } = again {
@@ -298,8 +315,9 @@ impl<'t> Replay<'t> {
         let conditions = self.read_json::<pipeline::MeasurementConditions>(number, pipeline::CONDITIONS_FILE)?;
         let temperature_c = conditions.map(|told| told.temperature_c);
         let touches = self.read_json::<pipeline::TouchRecord>(number, pipeline::TOUCHES_FILE)?;
-        let rounds =
-            self.read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?.map_or(0, |told| told.rounds);
+        let rounds = self
+            .read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?
+            .map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
         pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches)
             .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))

@@ -16,7 +16,8 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::panic_message;
 use crate::cell::{
-    MachineRequest, Condition, Device, Event, GateResult, GateFailure, JobResult, ConnectionRefusal, Occupation, Reconciliation,
+    Condition, ConnectionRefusal, Device, Event, GateFailure, GateResult, JobResult, MachineRequest, Occupation,
+    Reconciliation,
 };
 use crate::device::{
     Armed, BatchId, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement,
@@ -85,8 +86,16 @@ pub(super) trait StationDriver: Send + 'static {
     const DEVICE: Device;
     fn machine(&mut self) -> &mut Self::Machine;
     /// Transfers the payloads and returns the digest of their identities.
-    fn load(&mut self, load: &MachinePayload, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
-    fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<FetchedResult, DeviceError>> + Send;
+    fn load(
+        &mut self,
+        load: &MachinePayload,
+        interrupt: &Interrupt,
+    ) -> impl Future<Output = Result<u32, DeviceError>> + Send;
+    fn fetch(
+        &mut self,
+        job: Job,
+        interrupt: &Interrupt,
+    ) -> impl Future<Output = Result<FetchedResult, DeviceError>> + Send;
     /// Reads new preliminary data while the job still runs; see [`Cmm::read_ahead`].
     fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<PreliminaryPoints>> + Send {
         std::future::ready(None)
@@ -184,7 +193,8 @@ impl LoopWatchdog {
     }
 
     fn is_alive(&self) -> bool {
-        self.elapsed_ms().saturating_sub(self.last_beat_ms.load(Ordering::Acquire)) < WATCHDOG_TIMEOUT.as_millis() as u64
+        self.elapsed_ms().saturating_sub(self.last_beat_ms.load(Ordering::Acquire))
+            < WATCHDOG_TIMEOUT.as_millis() as u64
     }
 
     fn elapsed_ms(&self) -> u64 {
@@ -279,7 +289,17 @@ impl<B: StationDriver> MachineTask<B> {
     ) -> Self {
         let (cycle, armed) = intent.unzip();
         let (cycle, seen, notes) = (cycle.unwrap_or(0), ObservedState::default(), Vec::new());
-        Self { driver, job, interrupt, reports, loaded_digest: None, armed, cycle, observed: seen, reported_notes: notes }
+        Self {
+            driver,
+            job,
+            interrupt,
+            reports,
+            loaded_digest: None,
+            armed,
+            cycle,
+            observed: seen,
+            reported_notes: notes,
+        }
     }
 
     /// Restores the last preparation into the driver. The machine may still run it since before this program began.
@@ -292,7 +312,13 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Serves requests until no sender is left. If the task panics, which is a fault of this program, reports that as
     /// an event. The run then continues without the machine, to which nothing talks any more.
-    pub(super) async fn serve(self, asks: mpsc::Receiver<StationRequest>, poll: Duration, aborts: AbortCounter, pulse: LoopWatchdog) {
+    pub(super) async fn serve(
+        self,
+        asks: mpsc::Receiver<StationRequest>,
+        poll: Duration,
+        aborts: AbortCounter,
+        pulse: LoopWatchdog,
+    ) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.serve_requests(asks, poll, aborts, pulse)).await else { return };
         let why = format!("a fault of the program; report it: {}", panic_message(error));
@@ -301,7 +327,13 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     /// Serves requests until no sender is left, then releases the machine.
-    async fn serve_requests(mut self, mut asks: mpsc::Receiver<StationRequest>, poll: Duration, mut aborts: AbortCounter, pulse: LoopWatchdog) {
+    async fn serve_requests(
+        mut self,
+        mut asks: mpsc::Receiver<StationRequest>,
+        poll: Duration,
+        mut aborts: AbortCounter,
+        pulse: LoopWatchdog,
+    ) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -394,7 +426,8 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match connected.await {
             Ok((_, Err(found))) => {
-                self.report(Event::NotConnected { device: B::DEVICE, why: ConnectionRefusal::AtAnotherJob(found) }).await;
+                self.report(Event::NotConnected { device: B::DEVICE, why: ConnectionRefusal::AtAnotherJob(found) })
+                    .await;
             }
             Ok((identity, Ok(status))) => {
                 self.observed.connected = true;
@@ -497,7 +530,8 @@ impl<B: StationDriver> MachineTask<B> {
         if self.observed.link_lost {
             return self.refuse_unsent(MachineRequest::Start).await;
         }
-        let ObservedState { supplies_missing, manual, signal_out_of_range: signal_out, signals_good_since, .. } = self.observed;
+        let ObservedState { supplies_missing, manual, signal_out_of_range: signal_out, signals_good_since, .. } =
+            self.observed;
         self.observed = ObservedState {
             connected: true,
             running: true,
@@ -538,10 +572,14 @@ impl<B: StationDriver> MachineTask<B> {
             Err(error) if error.is_link() => self.report_link_lost(&error).await,
             // Not in EXECUTE: the status shows if the machine holds already, has ended, or never ran.
             Err(error) => match self.driver.machine().status().await {
-                Ok(status) if status.state == State::Held => self.report(Event::MachineHeld { device: B::DEVICE }).await,
+                Ok(status) if status.state == State::Held => {
+                    self.report(Event::MachineHeld { device: B::DEVICE }).await
+                }
                 // Already on its way to HELD, by its key or a button: the next status reads see it arrive.
                 Ok(status) if status.state == State::Holding => self.report_changes(&status).await,
-                Ok(status) if status.state == State::Complete && self.observed.running => self.report_changes(&status).await,
+                Ok(status) if status.state == State::Complete && self.observed.running => {
+                    self.report_changes(&status).await
+                }
                 Ok(status) if !status.state.is_moving() => self.report(Event::MachineHeld { device: B::DEVICE }).await,
                 Ok(_) => self.report_failure(MachineRequest::Hold, error).await,
                 Err(error) => self.report_link_lost(&error).await,
@@ -746,7 +784,9 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Reads points of a running job while no other request waits: an order raises the interrupt and comes first.
     async fn read_ahead(&mut self) {
-        let Some(armed) = self.armed.as_ref().filter(|_| self.observed.running && !self.observed.end_reported) else { return };
+        let Some(armed) = self.armed.as_ref().filter(|_| self.observed.running && !self.observed.end_reported) else {
+            return;
+        };
         let preliminary = self.driver.read_ahead(armed.job, &self.interrupt).await;
         if preliminary.is_some() {
             let _ = self.reports.send(StationReport { preliminary, ..StationReport::default() }).await;
@@ -861,7 +901,10 @@ impl<B: StationDriver> MachineTask<B> {
             Some((done, total)) => {
                 let (last, _) = self.observed.progress.replace((done, total)).unwrap_or((done, total));
                 self.observed.progress_rises_at_held += u32::from(done > last);
-                if done > last && self.observed.running && self.observed.progress_rises_at_held.is_multiple_of(MOVING_AFTER_RISES) {
+                if done > last
+                    && self.observed.running
+                    && self.observed.progress_rises_at_held.is_multiple_of(MOVING_AFTER_RISES)
+                {
                     let why = format!("it reports HELD, but its progress has risen to {done} of {total}");
                     self.report(Event::Refused { device, what: MachineRequest::Hold, why }).await;
                 }

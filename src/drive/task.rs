@@ -4,15 +4,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cell::{Figures, PvPoints, Tolerance};
-use crate::compensation::path::{PathError, Scallops, PathSummary, ToolPath};
+use crate::compensation::path::{PathError, PathSummary, Scallops, ToolPath};
 use crate::compensation::{
-    MachineSimilarity, SurfacePoint, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError,
-    ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, WheelTerm,
+    Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MachineSimilarity, MapOptions, NextPassError,
+    ParameterCorrections, ParameterEstimation, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm,
 };
 use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
-use crate::geometry::{Grid, Point, Pose, DeviationSample, Vector};
+use crate::geometry::{DeviationSample, Grid, Point, Pose, Vector};
 use crate::measuring::{self, ThermalExpansion, sphere_targets};
 use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
 use crate::registration::{
@@ -147,7 +147,8 @@ impl AdaptiveOptions {
             PvPoints::All => (pv_mm, f64::INFINITY),
             PvPoints::MostPoints => (f64::INFINITY, pv_mm),
         };
-        let correction_mm = Self::MAX_FORM_UNCERTAINTY_SHARE * rms_mm.min(Self::RMS_TO_PV_RATIO * pv_mm.min(pv_most_points_mm));
+        let correction_mm =
+            Self::MAX_FORM_UNCERTAINTY_SHARE * rms_mm.min(Self::RMS_TO_PV_RATIO * pv_mm.min(pv_most_points_mm));
         StoppingCriteria { pv_mm, pv_998_mm: pv_most_points_mm, rms_mm, correction_sigma_mm: correction_mm, may_grind }
     }
 }
@@ -233,8 +234,18 @@ impl CycleState {
         match product {
             ComputationProduct::Points(points) => self.points = Some(Arc::new(points)),
             ComputationProduct::Registered(found) => {
-                let RegistrationProduct { registration, form, field_hyperparameters: field, error_map: error, learning: known, parameters, parameter_corrections: set, figures, next_targets: next, repeated_touches: again } =
-                    *found;
+                let RegistrationProduct {
+                    registration,
+                    form,
+                    field_hyperparameters: field,
+                    error_map: error,
+                    learning: known,
+                    parameters,
+                    parameter_corrections: set,
+                    figures,
+                    next_targets: next,
+                    repeated_touches: again,
+                } = *found;
                 self.next_targets = next.map(Arc::new);
                 self.repeated_touches = again.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
@@ -463,7 +474,10 @@ impl Task {
         ParameterOptions {
             free_motions: self.registration_options.locked.map(|locked| !locked),
             locked_sigmas: self.locked_sigmas,
-            tolerances: self.parameter_compensation.as_ref().map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
+            tolerances: self
+                .parameter_compensation
+                .as_ref()
+                .map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
             wheel_term: self.parameter_compensation.as_ref().map_or(WheelTerm::default(), |taken| taken.wheel_term),
             ..ParameterOptions::new(self.wheel_radius_mm(told))
         }
@@ -605,5 +619,7 @@ pub(super) fn used_deviations(found: &Registration) -> impl Iterator<Item = &Dev
 
 /// Returns their deviations at x and y of the model frame.
 pub(super) fn deviation_samples(found: &Registration) -> Vec<DeviationSample> {
-    used_deviations(found).map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+    used_deviations(found)
+        .map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm })
+        .collect()
 }

@@ -553,7 +553,8 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         }
     }
     let word = |k: usize| words.get(k).map_or("", |word| &text[word.clone()]);
-    let is_other = |word: &str| OTHER.contains(&word) || (NON_COORDINATE_WORDS.contains(&word) && word.chars().count() > 1);
+    let is_other =
+        |word: &str| OTHER.contains(&word) || (NON_COORDINATE_WORDS.contains(&word) && word.chars().count() > 1);
     let unit_behind = |height: usize| {
         let mut at = height + 1;
         // "heights are in um"; a lone "in" at the end is the inch.

@@ -5,11 +5,11 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::error::FormatError;
+use super::form_figures::{FormFigureRow, form_figure_rows, notation};
 use super::registration::write_json_atomic;
-use super::form_figures::{FormFigureRow, notation, form_figure_rows};
 use regrind_core::form::{
-    PolynomialBasis, DIRECTION, NO_CUT_OFF, DeviationFigures, PolynomialFit, FormError, FormOptions, Iso10110, LabelledFigure, Slope, RemovedParts, label_figures,
-    label_slope,
+    DIRECTION, DeviationFigures, FormError, FormOptions, Iso10110, LabelledFigure, NO_CUT_OFF, PolynomialBasis,
+    PolynomialFit, RemovedParts, Slope, label_figures, label_slope,
 };
 use regrind_core::model::Form;
 
@@ -68,7 +68,8 @@ struct TermDocument {
 
 /// Results of a cycle: the figures of the points, the slopes of the map, and the form; `None` if there is no map or no
 /// form.
-pub type CycleFigures<'a> = (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
+pub type CycleFigures<'a> =
+    (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
 /// Writes `figures.json`: the figures of the form, those of the points and the slopes of the map, all with the terms
 /// that were removed before.
@@ -122,8 +123,12 @@ fn of_points<T>(removed: &str, what: T) -> OfPoints<T> {
 
 fn series(fit: &PolynomialFit) -> SeriesDocument {
     let (normalisation, centre_mm, half_size_mm) = match fit.basis {
-        PolynomialBasis::Zernike { centre_mm, radius_mm, .. } => ("mean square 1 over the full disc", centre_mm, [radius_mm; 2]),
-        PolynomialBasis::Legendre { centre_mm, half_mm } => ("mean square 1 over the full rectangle", centre_mm, half_mm),
+        PolynomialBasis::Zernike { centre_mm, radius_mm, .. } => {
+            ("mean square 1 over the full disc", centre_mm, [radius_mm; 2])
+        }
+        PolynomialBasis::Legendre { centre_mm, half_mm } => {
+            ("mean square 1 over the full rectangle", centre_mm, half_mm)
+        }
     };
     let pairs = fit.coefficients_mm.iter().zip(&fit.orthogonal_mm).enumerate();
     let term = |(k, (coefficient, orthogonal)): (usize, (&f64, &f64))| TermDocument {

@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use regrind_core::form::{DeviationFigures, Iso10110, Slope, RemovedParts, iso_10110_notation};
+use regrind_core::form::{DeviationFigures, Iso10110, RemovedParts, Slope, iso_10110_notation};
 use regrind_core::model::{AngleInterval, Form, Interval, IsoFigures};
 
 /// Figure of the form.
@@ -37,7 +37,12 @@ const RMS_VARYING: &str = "of the part of that which is not symmetric about the 
 
 /// Returns the figures of a form, in the order of a report: in micrometres, those of ISO 10110-5 in nanometres, slopes
 /// in microradians.
-pub(super) fn form_figure_rows(form: &Form, raw: Option<&DeviationFigures>, slope: Option<&Slope>, taken_out: &RemovedParts) -> Vec<FormFigureRow> {
+pub(super) fn form_figure_rows(
+    form: &Form,
+    raw: Option<&DeviationFigures>,
+    slope: Option<&Slope>,
+    taken_out: &RemovedParts,
+) -> Vec<FormFigureRow> {
     let removed = taken_out.describe(raw.map_or(&[], |raw| &raw.removed));
     let row = |name, [median, low, high]: [f64; 3], raw, unit, made: &str| FormFigureRow {
         name,

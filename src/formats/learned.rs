@@ -7,7 +7,9 @@ use thiserror::Error;
 
 use super::FormatError;
 use super::whole::read_whole;
-use regrind_core::compensation::{MachineSimilarity, Correction, LearningState, ParameterCorrections, TransferredState};
+use regrind_core::compensation::{
+    Correction, LearningState, MachineSimilarity, ParameterCorrections, TransferredState,
+};
 use regrind_core::model::PartPriors;
 
 /// Name of the file in a run folder.
@@ -237,7 +239,8 @@ mod tests {
         let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
         let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
         let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-        let known = begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
+        let known =
+            begin.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
         Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
     }
 

@@ -28,8 +28,8 @@ mod canonical;
 mod clock;
 mod copy;
 mod error;
-mod locked_file;
 mod key;
+mod locked_file;
 mod lost;
 mod machine;
 mod open;
@@ -50,7 +50,7 @@ pub use machine::MachineLock;
 pub use open::{free_bytes, is_open_to_all};
 pub use record::{Entry, Kind, Record, Records};
 pub use seal::SEALED_EVERY;
-pub use verify::{ExternalEvidence, Anchor, Verified, anchor_of, is_driven, verify, verify_against};
+pub use verify::{Anchor, ExternalEvidence, Verified, anchor_of, is_driven, verify, verify_against};
 pub use write::{Header, Journal, RunLock};
 
 use std::path::Path;

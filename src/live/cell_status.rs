@@ -48,7 +48,9 @@ impl CellStatus {
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.run_status {
             RunStatus::NoRun => None,
-            RunStatus::Unresponsive { run } | RunStatus::ProgramGone { run, .. } | RunStatus::Active { run, .. } => Some(run),
+            RunStatus::Unresponsive { run } | RunStatus::ProgramGone { run, .. } | RunStatus::Active { run, .. } => {
+                Some(run)
+            }
         }
     }
 

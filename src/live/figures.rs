@@ -4,8 +4,8 @@
 
 use regrind_control::{CycleRow, JobProgress};
 
+use crate::cell_status::{CellStatus, RunStatus};
 use crate::packml::{PRODUCTION, SIMULATION, state_number};
-use crate::cell_status::{RunStatus, CellStatus};
 
 /// Figure that is published.
 #[derive(Clone, Copy, Debug)]
@@ -195,7 +195,10 @@ mod tests {
     use regrind_control::Snapshot;
 
     fn on(snapshot: Snapshot) -> CellStatus {
-        CellStatus { run_status: RunStatus::Active { run: "a run".into(), snapshot: Box::new(snapshot) }, last_run: None }
+        CellStatus {
+            run_status: RunStatus::Active { run: "a run".into(), snapshot: Box::new(snapshot) },
+            last_run: None,
+        }
     }
 
     fn value(name: &str, told: &CellStatus) -> Option<FigureValue> {
@@ -239,7 +242,10 @@ mod tests {
 
     #[test]
     fn a_run_that_was_left_is_not_called_idle() {
-        let gone = CellStatus { run_status: RunStatus::ProgramGone { run: "a run".into(), machines_within: false }, last_run: None };
+        let gone = CellStatus {
+            run_status: RunStatus::ProgramGone { run: "a run".into(), machines_within: false },
+            last_run: None,
+        };
         assert_eq!((value("Status/StateCurrent", &gone), value("Status/StateName", &gone)), (None, None));
         assert_eq!(value("Status/StateCurrent", &CellStatus::default()), Some(FigureValue::Whole(4)));
         assert_eq!(value("Run", &gone), Some(FigureValue::Text("a run".into())));

@@ -8,21 +8,21 @@
 //! ```
 #![cfg(feature = "plant")]
 
+mod cell_status;
 mod error;
 mod figures;
-mod publisher_event;
 mod opcua;
 mod packml;
+mod publisher_event;
+mod publisher_lock;
 mod settings;
 mod sparkplug;
-mod cell_status;
-mod publisher_lock;
 
+pub use cell_status::{CellStatus, EndedRun, RunStatus};
 pub use error::LiveError;
 pub use figures::{FIGURES, Figure, FigureKind, FigureValue};
-pub use publisher_event::{PublisherEvent, EventSender, event_queue};
 pub use opcua::UaServer;
+pub use publisher_event::{EventSender, PublisherEvent, event_queue};
+pub use publisher_lock::PublisherLock;
 pub use settings::{OpcUaSettings, SparkplugSettings};
 pub use sparkplug::Node;
-pub use cell_status::{EndedRun, RunStatus, CellStatus};
-pub use publisher_lock::PublisherLock;

@@ -402,7 +402,10 @@ mod tests {
             assert_eq!(alarm_texts(&alarm, Language::En).what, alarm.what);
             let older = id.head().replace(|letter: char| letter.is_alphabetic(), "#");
             let older = Alarm { what: format!("{older}: grinder at 12 mm."), ..alarm };
-            assert!(alarm_texts(&older, Language::De).what.ends_with(": grinder at 12 mm."), "{id:?}: its older wording");
+            assert!(
+                alarm_texts(&older, Language::De).what.ends_with(": grinder at 12 mm."),
+                "{id:?}: its older wording"
+            );
             assert!(!alarm_texts(&older, Language::De).what.contains('#'), "{id:?}: its older wording");
         }
     }

@@ -239,7 +239,8 @@ impl Guard {
     pub(crate) fn refused(&self, what: &str) -> bool {
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
-            let untold = if refusals.is_over() { refusals.current_count().saturating_sub(MAX_LOGGED_REFUSALS) } else { 0 };
+            let untold =
+                if refusals.is_over() { refusals.current_count().saturating_sub(MAX_LOGGED_REFUSALS) } else { 0 };
             (refusals.count(), untold)
         };
         if untold > 0 {

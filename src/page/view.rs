@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
-use regrind_control::{JobProgress, NextStep, Snapshot, PreviewStatistics};
+use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
 use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -551,7 +551,11 @@ pub(crate) async fn runs(
             }
         }
     };
-    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), kind: Kind::Plain(PageSubject::Cell) }, main)
+    document(
+        say(Text::Runs),
+        &Frame { language, person: session.person.as_ref(), kind: Kind::Plain(PageSubject::Cell) },
+        main,
+    )
 }
 
 fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> Markup {
@@ -685,7 +689,8 @@ pub(crate) fn sign_in(status: StatusCode, of: PageSubject, headers: &HeaderMap, 
             p .quiet { (say(Text::WhoMakesUsers)) }
         }
     };
-    (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Plain(of) }, main)).into_response()
+    (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Plain(of) }, main))
+        .into_response()
 }
 
 /// Frame around every page.

@@ -5,7 +5,8 @@ use std::fs;
 use std::path::Path;
 
 use regrind_journal::{
-    ExternalEvidence, Anchor, JournalError, Kind, PublicKey, Reader, Record, Verified, restore, restore_file, verify_against,
+    Anchor, ExternalEvidence, JournalError, Kind, PublicKey, Reader, Record, Verified, restore, restore_file,
+    verify_against,
 };
 use serde_json::Value;
 

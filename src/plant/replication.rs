@@ -115,7 +115,12 @@ impl Replicator {
     }
 
     /// Replicates one run; returns true if the plant then has all of it.
-    async fn replicate_run(&mut self, link: &Link, name: &str, shipped: &mut ReplicationResult) -> Result<bool, PlantError> {
+    async fn replicate_run(
+        &mut self,
+        link: &Link,
+        name: &str,
+        shipped: &mut ReplicationResult,
+    ) -> Result<bool, PlantError> {
         let folder = self.runs.join(name);
         let Some(last) = Reader::open(&folder)?.last()? else { return Ok(false) };
         let mut there = open_run(link, name).await?;

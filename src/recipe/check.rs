@@ -6,12 +6,12 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::tables::{
-    Acceptance, Compensation, Grinding, TiltKind, MeasurementSettings, SelectionMode, NominalTable, PatternKind, RecipeFile,
-    RegistrationSettings, RegistrationStart, Micrometres, WheelDimensions,
+    Acceptance, Compensation, Grinding, MeasurementSettings, Micrometres, NominalTable, PatternKind, RecipeFile,
+    RegistrationSettings, RegistrationStart, SelectionMode, TiltKind, WheelDimensions,
 };
-use super::{NominalSource, MeasuringPattern, TableSettings};
+use super::{MeasuringPattern, NominalSource, TableSettings};
 use crate::cell::FirstStep;
-use crate::compensation::path::TrackPattern as TrackPattern;
+use crate::compensation::path::TrackPattern;
 use crate::document::Document;
 use crate::geometry::Aperture;
 use crate::measuring::Layout;
@@ -254,11 +254,15 @@ fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document
         );
     }
     let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
-        (PatternKind::Grid, Some(spacing), (None, None), _) => Some(MeasuringPattern::Generated(Layout::GridSpacing(spacing))),
+        (PatternKind::Grid, Some(spacing), (None, None), _) => {
+            Some(MeasuringPattern::Generated(Layout::GridSpacing(spacing)))
+        }
         (PatternKind::Grid, None, (Some(columns), Some(rows)), _) => {
             Some(MeasuringPattern::Generated(Layout::GridPoints([columns, rows])))
         }
-        (PatternKind::Spiral, Some(spacing), _, None) => Some(MeasuringPattern::Generated(Layout::SpiralSpacing(spacing))),
+        (PatternKind::Spiral, Some(spacing), _, None) => {
+            Some(MeasuringPattern::Generated(Layout::SpiralSpacing(spacing)))
+        }
         (PatternKind::Spiral, None, _, Some(points)) => Some(MeasuringPattern::Generated(Layout::SpiralPoints(points))),
         (PatternKind::File, ..) => written.file.as_ref().map(|file| MeasuringPattern::File {
             path: resolve_path(folder, file),
@@ -433,7 +437,8 @@ const MIN_LEAD_DEG: f64 = 2.01;
 
 fn grinding(written: &Grinding, document: &mut Document) {
     let wheel = written.wheel;
-    if let WheelDimensions::Torus { radius_mm, minor_radius_mm, .. } | WheelDimensions::Cup { radius_mm, minor_radius_mm, .. } = wheel
+    if let WheelDimensions::Torus { radius_mm, minor_radius_mm, .. }
+    | WheelDimensions::Cup { radius_mm, minor_radius_mm, .. } = wheel
         && minor_radius_mm > radius_mm
     {
         document.report(
@@ -493,7 +498,8 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
             "remove one of the two",
         );
     }
-    let (Micrometres(allowance), Micrometres(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
+    let (Micrometres(allowance), Micrometres(depth)) =
+        (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
     let cycles = written.cycle.max_cycles;
     if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(

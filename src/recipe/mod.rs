@@ -26,8 +26,8 @@ use crate::surface::{DefinedSurface, PlaneProjection};
 
 use tables::RecipeFile;
 pub use tables::{
-    Acceptance, Compensation, CycleSettings, Grinding, TiltKind, ParameterTolerances, MeasurementSettings, SelectionMode, Part, RegistrationSettings,
-    SpindleAxis, RegistrationStart, Tilt, Micrometres, WheelDimensions,
+    Acceptance, Compensation, CycleSettings, Grinding, MeasurementSettings, Micrometres, ParameterTolerances, Part,
+    RegistrationSettings, RegistrationStart, SelectionMode, SpindleAxis, Tilt, TiltKind, WheelDimensions,
 };
 
 /// Checked recipe.
@@ -220,7 +220,9 @@ impl Recipe {
     /// wrong acceptance is at most the accepted risk of a measurement with chosen touches.
     pub fn required_probability(&self) -> f64 {
         let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == SelectionMode::Adaptive);
-        let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::DEFAULT_PROBABILITY).map_or(Tolerance::DEFAULT_PROBABILITY, |risk| 1.0 - risk);
+        let usual = risk
+            .filter(|risk| *risk < 1.0 - Tolerance::DEFAULT_PROBABILITY)
+            .map_or(Tolerance::DEFAULT_PROBABILITY, |risk| 1.0 - risk);
         self.acceptance.probability.unwrap_or(usual)
     }
 

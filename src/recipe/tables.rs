@@ -8,8 +8,8 @@ use schemars::{JsonSchema, Schema, json_schema};
 use serde::{Deserialize, Serialize};
 
 use crate::cell::{FirstStep, HoldOrStop, PvPoints};
-use crate::compensation::path::{PathMode, TrackPattern as TrackPattern};
-use crate::compensation::{GainRule, FilterOrder, SplineSmoothness, Smoothing};
+use crate::compensation::path::{PathMode, TrackPattern};
+use crate::compensation::{FilterOrder, GainRule, Smoothing, SplineSmoothness};
 use crate::geometry::Aperture;
 use crate::registration::{Coordinate, Loss, ProbeSide};
 use crate::surface::analytic::{Formula, SamplingDefinition};

@@ -10,9 +10,9 @@ use serde_json::Value;
 
 use super::ReportError;
 use super::convergence::convergence;
+use super::equipment::{equipment, last_model, last_registration, registered, signatures};
 use super::form::form;
 use super::maps::{maps, within_html};
-use super::equipment::{last_model, last_registration, equipment, registered, signatures};
 use super::run_history::{Measurement, PassHistory, RunHistory};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{ComparedFigure, Conformity, Ending, Figures, JobResult, RecordedParameter, Tolerance};
@@ -143,7 +143,8 @@ fn judged(story: &RunHistory) -> String {
          <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
     );
     for compared in tolerance.compare(figures) {
-        let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } = compared;
+        let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } =
+            compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
         let within = escaped(&compared.probability_in_words().unwrap_or_default());
         let _ = writeln!(

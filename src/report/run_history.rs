@@ -9,8 +9,8 @@ use super::ReportError;
 use super::record_content::RecordContent;
 use super::words::{gate_words, words};
 use regrind_cell::{
-    Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, RecordedParameter, Reconciliation,
-    Tolerance,
+    Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
+    RecordedParameter, Tolerance,
 };
 use regrind_journal::{Reader, Record, Verified, verify};
 
@@ -136,7 +136,9 @@ impl RunHistory {
             RecordContent::Begun(_) => self.begin = Some(record),
             RecordContent::Command(command) => self.add_command(record, *command),
             RecordContent::Event(event) => self.add_event(record, *event),
-            RecordContent::Confirmation(..) | RecordContent::Step(..) => self.orders.push(Order { record, event: None, refused: None }),
+            RecordContent::Confirmation(..) | RecordContent::Step(..) => {
+                self.orders.push(Order { record, event: None, refused: None })
+            }
             RecordContent::File(file) => self.add_file(&record, file["name"].as_str().unwrap_or_default()),
             RecordContent::End(ending, cycles) => {
                 self.add_levels(&cycles);

@@ -6,8 +6,8 @@ use serde_json::Value;
 
 use super::record_content::RecordContent;
 use regrind_cell::{
-    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, GateResult, GateFailure, RecordedInterval, Judgement,
-    ConnectionRefusal, Occupation, Reconciliation, RecordFailure, Role,
+    Alarm, Command, CompensationRefusal, ConnectionRefusal, Device, Ending, Event, Figures, GateFailure, GateResult,
+    Judgement, Occupation, Reconciliation, RecordFailure, RecordedInterval, Role,
 };
 use regrind_journal::Record;
 
@@ -304,8 +304,9 @@ fn figures_words(figures: &Figures) -> String {
         figures.outliers
     );
     if let Some(form) = &figures.form {
-        let um =
-            |of: &RecordedInterval| format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
+        let um = |of: &RecordedInterval| {
+            format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm)
+        };
         let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
         let _ = write!(line, "; form without the noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }

@@ -45,7 +45,11 @@ pub enum TrustError {
 ///
 /// # Errors
 /// The certificates cannot be read, or a server on another computer has none.
-pub fn tls_config(host: &str, certificates: Option<&Path>, table: &'static str) -> Result<Option<ClientConfig>, TrustError> {
+pub fn tls_config(
+    host: &str,
+    certificates: Option<&Path>,
+    table: &'static str,
+) -> Result<Option<ClientConfig>, TrustError> {
     let is_here = host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback());
     match certificates {
         Some(path) => {

@@ -14,7 +14,7 @@ use regrind::document::Problems;
 use regrind::formats::read_points;
 use regrind::geometry::{Point, Pose};
 use regrind::measuring::Layout;
-use regrind::recipe::{NominalSource, MeasuringPattern, Recipe, RegistrationStart, Micrometres, WheelDimensions};
+use regrind::recipe::{MeasuringPattern, Micrometres, NominalSource, Recipe, RegistrationStart, WheelDimensions};
 use regrind::registration::{Coordinate, ProbeSide, Start};
 use regrind::setup::SetupError;
 use regrind::surface::DefinedSurface;

@@ -15,7 +15,7 @@ use crate::program::{PATIENCE, Running, changed, regrind};
 pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines: usize) -> Option<i32> {
     let began = std::time::Instant::now();
     loop {
-        if running.has_said() >= lines {
+        if running.line_count() >= lines {
             running.signal("KILL");
             running.end();
             return None;
@@ -30,7 +30,7 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
             // The program may have been killed meanwhile, or may still wait for a machine.
             let _ = send_request(&folder().unwrap(), &resume);
         }
-        assert!(began.elapsed() < PATIENCE, "it comes to no end: {:#?}", running.said);
+        assert!(began.elapsed() < PATIENCE, "it comes to no end: {:#?}", running.output_lines);
         std::thread::park_timeout(std::time::Duration::from_millis(5));
     }
 }

@@ -62,7 +62,7 @@ pub struct Running {
     lines: Receiver<String>,
     errors: Option<std::thread::JoinHandle<String>>,
     folder: Option<PathBuf>,
-    pub said: Vec<String>,
+    pub output_lines: Vec<String>,
     /// Text of the error stream, once the process has ended.
     pub error_text: String,
 }
@@ -81,41 +81,41 @@ impl Running {
             let _ = errors.read_to_string(&mut text);
             text
         });
-        Self { child, lines, errors: Some(errors), folder, said: Vec::new(), error_text: String::new() }
+        Self { child, lines, errors: Some(errors), folder, output_lines: Vec::new(), error_text: String::new() }
     }
 
     /// Waits for a line that satisfies a condition.
     pub fn line(&mut self, what: &str, will_do: impl Fn(&str) -> bool) -> String {
         let began = Instant::now();
         while let Ok(line) = self.lines.recv_timeout(PATIENCE.saturating_sub(began.elapsed())) {
-            self.said.push(line.clone());
+            self.output_lines.push(line.clone());
             if will_do(&line) {
                 return line;
             }
         }
         let _ = self.child.kill();
-        panic!("no {what}:\n{}\n{}", self.said.join("\n"), self.errors.take().unwrap().join().unwrap());
+        panic!("no {what}:\n{}\n{}", self.output_lines.join("\n"), self.errors.take().unwrap().join().unwrap());
     }
 
     /// Waits until a condition is true, while the program runs.
     pub fn until<T>(&mut self, what: &str, mut is_so: impl FnMut(&[String]) -> Option<T>) -> T {
         let began = Instant::now();
         loop {
-            self.said.extend(self.lines.try_iter());
-            if let Some(found) = is_so(&self.said) {
+            self.output_lines.extend(self.lines.try_iter());
+            if let Some(found) = is_so(&self.output_lines) {
                 return found;
             }
             let ended = self.child.try_wait().unwrap();
-            assert!(ended.is_none(), "the program ended with {ended:?} before {what}: {:#?}", self.said);
-            assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.said);
+            assert!(ended.is_none(), "the program ended with {ended:?} before {what}: {:#?}", self.output_lines);
+            assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.output_lines);
             std::thread::park_timeout(Duration::from_millis(20));
         }
     }
 
     /// Returns the number of lines that the program has printed so far.
-    pub fn has_said(&mut self) -> usize {
-        self.said.extend(self.lines.try_iter());
-        self.said.len()
+    pub fn line_count(&mut self) -> usize {
+        self.output_lines.extend(self.lines.try_iter());
+        self.output_lines.len()
     }
 
     pub fn is_over(&mut self) -> bool {
@@ -147,18 +147,18 @@ impl Running {
         let began = Instant::now();
         let code = loop {
             while let Ok(line) = self.lines.recv_timeout(Duration::from_millis(20)) {
-                self.said.push(line);
+                self.output_lines.push(line);
             }
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status.code().unwrap_or(-1);
             }
             if began.elapsed() > PATIENCE {
                 let _ = self.child.kill();
-                panic!("it does not end:\n{}", self.said.join("\n"));
+                panic!("it does not end:\n{}", self.output_lines.join("\n"));
             }
         };
         while let Ok(line) = self.lines.recv() {
-            self.said.push(line);
+            self.output_lines.push(line);
         }
         self.error_text = self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default();
         (code, self.error_text.clone())

@@ -4,7 +4,7 @@ use serde_json::json;
 
 use crate::browser::{Browser, Tab};
 use crate::program::{Running, changed, only_run, regrind, root, small_recipe};
-use crate::{SPEED, CellPage, serve_with, users};
+use crate::{CellPage, SPEED, serve_with, users};
 
 const SCREEN: [u32; 2] = [1024, 768];
 

@@ -113,9 +113,9 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
         assert!(program.comments.iter().any(|comment| comment.to_ascii_lowercase() == counted), "{name}");
         let step_mm = half_a_step_mm(name) * 2.0;
         // The points in their order: each block passes some of them and ends at the last.
-        let mut points = path
-            .moves()
-            .filter_map(|one| if let Move::Feed { to: at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None });
+        let mut points = path.moves().filter_map(|one| {
+            if let Move::Feed { to: at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None }
+        });
         let mut last = [f64::NAN; 3];
         for stop in &program.waypoints {
             let mut ended = stop.feed_mm_min.is_none();

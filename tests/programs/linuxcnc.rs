@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use crate::compensate::Shop;
 use crate::generated::Move;
 use crate::path::{correction, error_mm, part, read, wheels, with};
-use regrind::compensation::path::{TiltMode, PathMode, PathOptions, TrackPattern, RotaryAxis, RotationAxis};
+use regrind::compensation::path::{PathMode, PathOptions, RotaryAxis, RotationAxis, TiltMode, TrackPattern};
 use regrind::geometry::Vector;
 use regrind_sim::program::Control;
 
@@ -52,7 +52,9 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
         let mut part = part(name);
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
-            for (pattern, one_way) in [(TrackPattern::Raster, false), (TrackPattern::Raster, true), (TrackPattern::Spiral, false)] {
+            for (pattern, one_way) in
+                [(TrackPattern::Raster, false), (TrackPattern::Raster, true), (TrackPattern::Spiral, false)]
+            {
                 let spaced = if pattern == TrackPattern::Spiral { 3.0 } else { 6.0 };
                 part.programs.options =
                     regrind::compensation::path::PathOptions { pattern, one_way, ..with(&plain, wheel, spaced) };

@@ -252,7 +252,8 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
 fn no_spiral_cuts_deeper_anywhere() {
     for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
-        part.programs.options = PathOptions { pattern: TrackPattern::Spiral, ..with(&part.programs.options, wheel, 3.0) };
+        part.programs.options =
+            PathOptions { pattern: TrackPattern::Spiral, ..with(&part.programs.options, wheel, 3.0) };
         let (swept, _) = program(&part);
         let [a, b] = part.half_mm;
         for k in 0..150 {

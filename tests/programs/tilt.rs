@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::path::{Part, correction, error_mm, part, truth, wheels, with};
 use crate::sweep::{distance, places};
-use regrind::compensation::path::{HeightField, TiltMode, PathOptions, RotaryAxis, RotationAxis, Wheel};
+use regrind::compensation::path::{HeightField, PathOptions, RotaryAxis, RotationAxis, TiltMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::geometry::{Aperture, Grid, Vector};
 use regrind_sim::program::{Control, Program, Waypoint};
@@ -270,7 +270,11 @@ fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
     let (_, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
     // The header has the time without the descent, a millimetre for each track.
     let down = part.programs.path(&correction(part.half_mm)).unwrap().0.track_count() as f64 / summary.feed_mm_min;
-    assert!((minutes - down - summary.duration_s / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.duration_s / 60.0);
+    assert!(
+        (minutes - down - summary.duration_s / 60.0).abs() < 1e-6 * minutes,
+        "{minutes} {}",
+        summary.duration_s / 60.0
+    );
     // The slides themselves travel far while the head turns.
     assert!(
         program.waypoints.iter().filter_map(|stop| stop.feed_mm_min).fold(0.0, f64::max) > 1.2 * summary.feed_mm_min

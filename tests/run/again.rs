@@ -95,7 +95,7 @@ fn a_run_that_is_killed_while_it_touches_again_goes_on_with_what_it_had() {
     running.signal("KILL");
     running.end();
     let mut resumed = Running::new(regrind(&["resume", &folder.display().to_string(), "--json"], home.path()));
-    assert_eq!(follow(&mut resumed, &|| Some(folder.clone()), usize::MAX), Some(0), "{}", resumed.told);
+    assert_eq!(follow(&mut resumed, &|| Some(folder.clone()), usize::MAX), Some(0), "{}", resumed.error_text);
     // Each job that started was commanded, and no job was commanded twice.
     let commands = records_with(&folder, "command");
     let starts = commands.iter().filter(|of| of["command"] == "start_machine").count();

@@ -15,7 +15,7 @@ fn run_against(home: &Path, recipe: &str, cell: &str, serving: &mut Running) -> 
     let line = running.line("time per point", |line| line.contains("ms per point"));
     println!("{line}");
     let (code, errors) = running.end();
-    let said = running.said.join("\n");
+    let said = running.output_lines.join("\n");
     assert_eq!(code, 0, "{said}\n{errors}");
     assert!(said.contains("SIMULATION  ACCEPTED") && errors.is_empty(), "{said}\n{errors}");
     let verified = verify(&folder).unwrap();
@@ -58,7 +58,7 @@ fn over_modbus_rtu_on_pseudo_terminals() {
     fs::write(home.path().join("cell.toml"), text).unwrap();
     let mut serving = Running::new(regrind(&["simulate", recipe, "--cell", "cell.toml"], home.path()));
     serving.line("its last word", |line| line.starts_with("Ctrl-C"));
-    assert!(serving.said.iter().any(|line| line.contains("115200 baud") && line.starts_with("SIMULATION")));
+    assert!(serving.output_lines.iter().any(|line| line.contains("115200 baud") && line.starts_with("SIMULATION")));
     let ms = run_against(home.path(), recipe, "cell.toml", &mut serving);
     println!("Modbus RTU, 115,200 baud: {ms:.3} ms a point");
     // The three coordinates alone are 24 bytes of 10 bits. A line of this speed cannot transfer them in less time.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::program::{only_run, regrind, root, run, run_folders, small_recipe};
 use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
-    table,
+    transition_table,
 };
 use regrind::journal::{AuditKey, Entry, Header, Journal, Kind, PublicKey, Reader, sha256_hex, verify};
 use regrind::report::state_picture;

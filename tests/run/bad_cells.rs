@@ -104,7 +104,7 @@ fn fills_up(command: Command, home: &Path, named: &str, fill: impl FnOnce()) {
     let is_said = errors.contains("carried out") && errors.contains("not recorded");
     assert!(code == 0 || code == 3 && is_said, "{code} {errors}");
     let (code, words) = running.end();
-    println!("{}\n{words}", running.said.join("\n"));
+    println!("{}\n{words}", running.output_lines.join("\n"));
     assert_eq!(code, 3, "{words}");
     let verified = verify(&folder).unwrap();
     assert!(verified.records > 1, "{verified:?}");
@@ -183,7 +183,7 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
         said.contains("Held").then_some(())
     });
     assert_eq!(run(&["resume", folder.to_str().unwrap()], home.path()).0, 0);
-    assert_eq!(running.end().0, 0, "{:#?}", running.said);
+    assert_eq!(running.end().0, 0, "{:#?}", running.output_lines);
     assert!(verify(&folder).unwrap().closed);
 }
 
@@ -433,7 +433,7 @@ fn ctrl_c_holds_once_and_aborts_twice() {
     running.line("abort", |line| line.starts_with("ABORT"));
     let (code, errors) = running.end();
     assert_eq!(code, 3, "{errors}");
-    assert!(running.said.iter().any(|line| line.contains("ABORTED")), "{}", running.said.join("\n"));
+    assert!(running.output_lines.iter().any(|line| line.contains("ABORTED")), "{}", running.output_lines.join("\n"));
     let verified = verify(&folder).unwrap();
     assert!(verified.closed, "{verified:?}");
     let causes = records_with(&folder, "event");

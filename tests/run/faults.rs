@@ -66,7 +66,11 @@ fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
     ];
     for (what, setup, alarm, words) in cases {
         let ran = caught(what, setup, alarm, words, 0);
-        assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, ordered: false, .. }), "{what}: {}", ran.failure_text());
+        assert!(
+            matches!(ran.ending, Ending::Stopped { cycle: 0, ordered: false, .. }),
+            "{what}: {}",
+            ran.failure_text()
+        );
         assert_eq!(ran.world.measurements_begun(), 0, "{what}");
     }
 }

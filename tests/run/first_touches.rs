@@ -48,11 +48,11 @@ fn recipe([from, to]: [&str; 2]) -> String {
 fn touched_until(running: &mut Running, folder: &Path, alarm: &str, what: &str) -> u64 {
     let name = format!("\"{alarm}\"");
     running.line("alarm", |line| line.contains("\"clears\""));
-    let said = running.said.last().unwrap().clone();
+    let said = running.output_lines.last().unwrap().clone();
     assert!(said.contains(&name), "{what}: {said}");
     let home = folder.parent().unwrap().parent().unwrap();
     let (code, _, told) = run(&["stop", &folder.display().to_string()], home);
-    assert_eq!(code, 0, "{what}: {told}\n{}", running.said.join("\n"));
+    assert_eq!(code, 0, "{what}: {told}\n{}", running.output_lines.join("\n"));
     running.end();
     let collected = records_with(folder, "targets").into_iter().filter(|event| event["event"] == "collected");
     collected.map(|event| event["targets"].as_u64().unwrap()).sum()

@@ -37,7 +37,7 @@ fn a_record_that_is_moved_away_holds_what_moves_and_is_gone_on_with_when_it_is_b
             (!is_held).then_some(())
         });
         let (code, errors) = running.end();
-        assert_eq!(code, 0, "{name}: {errors}{:?}", running.said);
+        assert_eq!(code, 0, "{name}: {errors}{:?}", running.output_lines);
         let starts = records_with(&folder, "intent").into_iter().filter(|intent| intent["command"] == "start_machine");
         let passes: Vec<_> =
             starts.filter(|start| start["device"] == "grinder").map(|start| start["cycle"].clone()).collect();
@@ -63,7 +63,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     assert!(code == 3 && told.contains("not recorded"), "{told}");
     let (code, errors) = running.end();
     assert!(code != 0, "{errors}");
-    let said = running.said.join("\n");
+    let said = running.output_lines.join("\n");
     assert!(!said.contains("ACCEPTED") && !said.contains("cycle 1: PV"), "{said}");
 }
 
@@ -90,7 +90,7 @@ fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_me
     let (code, told, errors) = run(&["resume", &path], home.path());
     assert_eq!(code, 0, "{told}{errors}");
     let (code, errors) = running.end();
-    assert_eq!(code, 0, "{errors}{:?}", running.said);
+    assert_eq!(code, 0, "{errors}{:?}", running.output_lines);
     let orders = records_with(&folder, "event").into_iter().filter(|event| event["event"] == "hold");
     assert_eq!(orders.map(|hold| hold["reason"].clone()).collect::<Vec<_>>(), ["the socket is gone"]);
 }
@@ -106,7 +106,7 @@ fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
     let (code, told, errors) = run(&["abort"], home.path());
     assert!(code == 3 && errors.contains("not recorded"), "{code} {told}{errors}");
     let (code, errors) = running.end();
-    assert!(code != 0 && !running.said.join("\n").contains("ACCEPTED"), "{errors}");
+    assert!(code != 0 && !running.output_lines.join("\n").contains("ACCEPTED"), "{errors}");
     let (code, told, errors) = run(&["status", &folder.display().to_string()], home.path());
     assert_eq!(code, 2, "{told}{errors}");
 }

@@ -20,8 +20,12 @@ fn a_part_is_made_by_the_lines_of_a_machine_that_hears_nothing() {
     let folder = program.folder(home.path());
     program.line("the end", |line| line.contains("ACCEPTED"));
     let (code, errors) = program.end();
-    assert_eq!(code, 0, "{}\n{errors}", program.said.join("\n"));
-    assert!(program.said.iter().any(|line| line.contains("cycle-1/plan.csv")), "{}", program.said.join("\n"));
+    assert_eq!(code, 0, "{}\n{errors}", program.output_lines.join("\n"));
+    assert!(
+        program.output_lines.iter().any(|line| line.contains("cycle-1/plan.csv")),
+        "{}",
+        program.output_lines.join("\n")
+    );
     // Each line is stored as it arrived, with the target that it was assigned to.
     let lines = fs::read_to_string(folder.join("cycle-1/hits.jsonl")).unwrap();
     let targets = fs::read_to_string(folder.join("cycle-1/plan.csv")).unwrap();

@@ -49,8 +49,10 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
         match ended {
             Some(0) => return (folder().unwrap(), kills),
             // Killed between the last record and its report.
-            Some(_) if running.has_been_told("the run is over") => return (folder().unwrap(), kills),
-            Some(code) => assert!(running.has_been_told("begin a new run"), "seed {seed}, {code}: {:#?}", running.told),
+            Some(_) if running.has_error_text("the run is over") => return (folder().unwrap(), kills),
+            Some(code) => {
+                assert!(running.has_error_text("begin a new run"), "seed {seed}, {code}: {:#?}", running.error_text)
+            }
             None => kills += 1,
         }
         // The program may have been killed before it started its record, or before it sent anything to a machine.
@@ -154,7 +156,7 @@ async fn a_file_that_is_on_no_record_decides_nothing() {
         let path = folder.to_str().unwrap();
         let mut running = Running::new(regrind(&["resume", path, "--json"], &home));
         let found = || Some(folder.clone());
-        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.told);
+        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.error_text);
         let verified = verify(&folder).unwrap();
         assert!(verified.closed && verified.unrecorded.contains(&"learned_from.json".to_owned()), "{verified:?}");
     })
@@ -185,7 +187,7 @@ async fn a_record_whose_last_lines_are_lost_is_not_gone_on_with_unasked() {
         assert!(code == 1 && told.contains("files of cycle 7"), "{told}");
         let mut running = Running::new(regrind(&["resume", &path, "--despite-loss", "--json"], &home));
         let found = || Some(folder.clone());
-        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.told);
+        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.error_text);
         let remarks = records_with(&folder, "remark");
         let said = remarks.iter().filter_map(|record| record["remark"].as_str());
         assert_eq!(

@@ -128,7 +128,7 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
         std::thread::park_timeout(Duration::from_millis(50));
     }
     let (code, error) = running.end();
-    let told = running.said.join("\n");
+    let told = running.output_lines.join("\n");
     println!("{told}");
     assert_eq!(code, 0, "{told}\n{error}");
     told
@@ -204,7 +204,7 @@ fn stands_after(home: &Path, go_wrong: impl FnOnce()) -> (StateName, Vec<AlarmId
     }
     let (_, told, error) = run(&["abort", folder.to_str().unwrap(), "--reason", "seen"], home);
     let (code, errors) = running.end();
-    println!("{seen:?}\n{}\n{errors}\n{code} {told}{error}\n{:?}", running.said.join("\n"), records());
+    println!("{seen:?}\n{}\n{errors}\n{code} {told}{error}\n{:?}", running.output_lines.join("\n"), records());
     seen
 }
 
@@ -277,7 +277,7 @@ fn a_program_that_the_controller_cannot_open_is_never_begun() {
         let folder = only_run(&home.join("runs"));
         run(&["abort", folder.to_str().unwrap(), "--reason", "seen"], home);
         let (code, errors) = running.end();
-        println!("{code} {}\n{errors}", running.said.join("\n"));
+        println!("{code} {}\n{errors}", running.output_lines.join("\n"));
         assert_ne!(code, 0);
         assert_eq!(records().iter().map(|record| begun(record)).sum::<usize>(), 0);
     });

@@ -146,7 +146,7 @@ fn another_user_neither_sees_nor_orders_nor_holds_up_a_run() {
         let (code, _, errors) = run(&cell.arguments(), home);
         assert!(code == 3 && errors.contains("another run uses this machine"), "{code} {errors}");
         let (code, errors) = running.end();
-        assert_eq!(code, 0, "{}\n{errors}", running.said.join("\n"));
+        assert_eq!(code, 0, "{}\n{errors}", running.output_lines.join("\n"));
         let states = records_with(&folder, "command");
         assert!(!states.iter().any(|record| ["hold", "abort"].iter().any(|order| record["command"] == *order)));
         assert!(regrind::journal::verify(&folder).unwrap().closed);

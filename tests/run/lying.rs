@@ -119,7 +119,8 @@ async fn resume(folder: &std::path::Path) {
 async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
-    let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder { lost: 2, ..ScriptedGrinder::saying(grinder, |_| ()) }).unwrap();
+    let (drive, _orders) =
+        Drive::new(run, cmm, ScriptedGrinder { lost: 2, ..ScriptedGrinder::saying(grinder, |_| ()) }).unwrap();
     let ending = tokio::time::timeout(PATIENCE, tokio::spawn(drive.run())).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
     let mut alarms = Vec::new();

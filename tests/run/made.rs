@@ -4,7 +4,7 @@
 use regrind::cell::PvPoints;
 use regrind::compensation::map_from_model;
 use regrind::drive::AdaptiveOptions;
-use regrind::geometry::{Point, DeviationSample, Vector};
+use regrind::geometry::{DeviationSample, Point, Vector};
 use regrind::model::{self, FIRST_BATCH, Form, FormFigures, FormPoint, MIN_TOUCHES, ModelInputs, PartialMeasurement};
 use regrind::registration::Registration;
 use regrind_sim::body::Physics;
@@ -178,9 +178,12 @@ impl Line<'_> {
             path.push(format!("{}{:?}", all.len(), look.reason));
             if look.next.is_empty() {
                 let form = &look.form;
-                let of = |p: &FormPoint| (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+                let of = |p: &FormPoint| {
+                    (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm)
+                };
                 let told: Vec<_> = form.points.iter().map(of).collect();
-                let error = map_from_model(&told, &self.bench.task.map_options, form.hyperparameters.noise_sigma_mm).unwrap();
+                let error =
+                    map_from_model(&told, &self.bench.task.map_options, form.hyperparameters.noise_sigma_mm).unwrap();
                 let why = path.join(" ");
                 return Took { touches: all.len(), seconds, why, figures: form.figures, found, error };
             }

@@ -169,7 +169,7 @@ fn a_rehearsal_is_marked_and_takes_the_plan_for_the_measurement() {
     fs::write(home.path().join("rehearsal.csv"), format!("index,x,y,z\n{given_back}")).unwrap();
     let (code, _, refused) = run(&["confirm", "done", "--file", "rehearsal.csv"], home.path());
     assert_eq!(code, 0, "{refused}");
-    assert_eq!(program.end(), (0, String::new()), "{:?}", program.said);
+    assert_eq!(program.end(), (0, String::new()), "{:?}", program.output_lines);
     let begun = Reader::open(&folder).unwrap().records(1).next().unwrap().unwrap().value();
     assert_eq!((&begun["simulation"], &begun["content"]["rehearsal"]), (&Value::Bool(true), &Value::Bool(true)));
     assert!(folder.to_str().unwrap().ends_with("-SIMULATION"));
@@ -191,7 +191,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
         let line = program.line("prompt", |line| line.contains("then: regrind ") || line.starts_with("ACCEPTED"));
         let Some(command) = line.split("then: regrind ").nth(1) else { break };
         let asks = |line: &&String| line.contains("GRIND SN-7") || line.contains("MEASURE SN-7");
-        let asked = program.said.iter().rev().find(asks).cloned().unwrap_or_default();
+        let asked = program.output_lines.iter().rev().find(asks).cloned().unwrap_or_default();
         // The file that the prompt names.
         let file = |before: &str, after: &str| {
             let rest = asked.split(before).nth(1).unwrap_or_else(|| panic!("no {before:?} in {asked:?}"));
@@ -249,7 +249,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
     }
     let (code, errors) = program.end();
     assert_eq!(code, 0, "{errors}");
-    println!("{}", program.said.join("\n"));
+    println!("{}", program.output_lines.join("\n"));
     assert!(cycle > 2 && said[0] == "confirm loaded", "{said:?}");
 
     // The record contains the person and the time of each step.

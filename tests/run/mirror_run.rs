@@ -104,7 +104,7 @@ impl Shop {
 
 /// Returns the notices that a program with `--json` has printed.
 fn notices_of(program: &Running) -> Vec<Value> {
-    program.said.iter().map(|line| serde_json::from_str(line).unwrap()).collect()
+    program.output_lines.iter().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
 fn notices<'s>(said: &'s [Value], kind: &str) -> Vec<&'s Value> {

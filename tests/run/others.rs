@@ -1,7 +1,7 @@
 //! Two machines that differ: the state that the first one learned for a recipe, and its benefit for the second
 //! machine's first part of that recipe.
 
-use regrind::compensation::{MachineSimilarity, Correction, GainRule, LearningState};
+use regrind::compensation::{Correction, GainRule, LearningState, MachineSimilarity};
 use regrind::formats::{CellRun, Learned};
 use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;

@@ -66,8 +66,8 @@ fn a_running_cell_is_watched_line_by_line_in_a_pipe_and_listed_with_what_became_
     assert!(code == 0 && said.contains(&name) && said.contains("on now"), "{said}{errors}");
     assert_eq!(run(&["stop"], home.path()).0, 0);
     assert_eq!(running.end().0, 1);
-    assert_eq!(watch.end().0, 0, "{:?}", watch.said);
-    assert!(watch.said.last().unwrap().starts_with("STOPPED"), "{:?}", watch.said);
+    assert_eq!(watch.end().0, 0, "{:?}", watch.output_lines);
+    assert!(watch.output_lines.last().unwrap().starts_with("STOPPED"), "{:?}", watch.output_lines);
     let (code, said, _) = run(&["runs", "--json"], home.path());
     let listed: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert_eq!(
@@ -230,7 +230,7 @@ fn a_second_run_does_not_take_the_machines_of_the_first() {
     let (code, _, errors) = run(&["abort"], home.path());
     assert_eq!(code, 0, "{errors}");
     assert_eq!(first.end().0, 3);
-    assert!(first.said.iter().any(|line| line.contains("ABORTED")), "{}", first.said.join("\n"));
+    assert!(first.output_lines.iter().any(|line| line.contains("ABORTED")), "{}", first.output_lines.join("\n"));
     serving.interrupt();
     serving.end();
 }
@@ -295,7 +295,7 @@ fn at_a_terminal_a_new_folder_is_asked_for_until_the_answers_will_do() {
     let mut keys = running.keys();
     keys.write_all(b"shop\nseven\n2\nlens 7\n").unwrap();
     let code = running.end().0;
-    let said = running.said.join("\n");
+    let said = running.output_lines.join("\n");
     assert!(code == 0 && said.contains("made shop:"), "{said}");
     let texts =
         ["recipe.toml", "cell.toml"].map(|file| fs::read_to_string(home.path().join("shop").join(file)).unwrap());

@@ -91,7 +91,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
     let folder = only_run(&home.path().join("runs"));
     assert_eq!(run(&["resume", folder.to_str().unwrap(), "--reason", "measured"], home.path()).0, 0);
     let (code, errors) = program.end();
-    assert_eq!(code, 0, "{errors}\n{}", program.said.join("\n"));
+    assert_eq!(code, 0, "{errors}\n{}", program.output_lines.join("\n"));
 }
 
 /// Draws a few worlds; `cargo run --release --example parameters` draws two hundred.
@@ -100,7 +100,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
 fn what_is_told_of_a_few_worlds_holds_and_saves() {
     let bench = Bench::new("freeform-mirror").held([false; 6]);
     let made: Vec<Compared> = (1..=seeds(4)).into_par_iter().map(|seed| bench.told_apart(seed, 2)).collect();
-    let within = made.iter().flat_map(|world| &world.told).filter(|told| told.off.abs() <= 1.0).count();
+    let within = made.iter().flat_map(|world| &world.parameters).filter(|told| told.off.abs() <= 1.0).count();
     let over = |of: fn(&Compared) -> &Vec<After>| {
         let sum = |f: fn(&After) -> f64| made.iter().map(|world| f(&of(world)[1]).powi(2)).sum::<f64>();
         (sum(|a| a.rms_um) / sum(|a| a.floor_um)).sqrt()

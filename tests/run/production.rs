@@ -85,10 +85,10 @@ fn in_processes_of_their_own() {
         }
     }
     let (code, told) = making.end();
-    making.said.iter().skip_while(|line| !line.contains(OVER)).skip(1).for_each(|line| println!("{line}"));
+    making.output_lines.iter().skip_while(|line| !line.contains(OVER)).skip(1).for_each(|line| println!("{line}"));
     assert_eq!(code, 0, "{told}");
     serving.interrupt();
-    assert_eq!(serving.end().0, 0, "{}", serving.told);
+    assert_eq!(serving.end().0, 0, "{}", serving.error_text);
 }
 
 /// Makes the allocator of a program return freed memory at once. The test measures the memory that the program uses,
@@ -269,7 +269,18 @@ impl Production {
         let (notices, mut shown) = mpsc::unbounded_channel();
         let showing = tokio::spawn(async move { while shown.recv().await.is_some() {} });
         let (journal, beside) = (Box::new(journal), BlockingExecutor::Threads);
-        let run = RunInputs { plan, task, journal, job, actor, load_confirmed: true, poll_intervals: poll, notices, interrupted: None, executor: beside };
+        let run = RunInputs {
+            plan,
+            task,
+            journal,
+            job,
+            actor,
+            load_confirmed: true,
+            poll_intervals: poll,
+            notices,
+            interrupted: None,
+            executor: beside,
+        };
         let (drive, orders) = Drive::with_cell(run, cmm, grinder).unwrap();
         let ending = drive.run().await;
         drop(orders);

@@ -36,7 +36,11 @@ fn never_content(plan: &mut CellPlan) {
 }
 
 /// Reads the record as the program that wrote it would.
-fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)) -> Result<InterruptedRun, ReplayError> {
+fn again(
+    rig: &Rig,
+    folder: &Path,
+    change: impl FnOnce(&mut Task, &mut CellPlan),
+) -> Result<InterruptedRun, ReplayError> {
     let (mut task, mut plan) = setup::prepare(&rig.recipe, &rig.cell).unwrap();
     never_content(&mut plan);
     change(&mut task, &mut plan);

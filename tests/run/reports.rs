@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::program::{Running, only_run, records_with, regrind, root, run, small_recipe};
 use regrind::cell::{
-    Actor, AlarmId, Command, Ending, Event, Figures, GateResult, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
-    sample_events,
+    Actor, AlarmId, Command, Ending, Event, Figures, GateFailure, GateResult, Judgement, Phase, State, Tolerance,
+    Verdict, sample_events,
 };
 use regrind::journal::{Entry, Header, Journal, Kind, Reader};
 use regrind::report::{run_report, write_run_report};
@@ -282,7 +282,7 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     assert_eq!(code, 0, "{out}{errors}");
     assert_eq!(running.end().0, 3);
     // The terminal of the run shows the refusal, and does not show that the cell went on.
-    let said = running.said.join("\n");
+    let said = running.output_lines.join("\n");
     assert!(said.contains("refused: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
     let page = Page::read(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();

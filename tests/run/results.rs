@@ -8,7 +8,7 @@ use std::process::Command;
 use crate::data::data;
 use crate::program::{root, run, small_recipe};
 use crate::reports::{Written, aborted, ada, arguments, figures, json_in, the_run, tolerance};
-use regrind::cell::{Command as CellCommand, Event, Figures, GateResult, GateFailure, Judgement, Verdict};
+use regrind::cell::{Command as CellCommand, Event, Figures, GateFailure, GateResult, Judgement, Verdict};
 use regrind::report::{ResultsFormat, run_results};
 use serde_json::{Value, json};
 use tempfile::TempDir;

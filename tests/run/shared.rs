@@ -3,18 +3,18 @@
 
 use rayon::prelude::*;
 
-use crate::study::others::{Differ, Pair, TAUGHT_BY, Taught};
+use crate::study::others::{Differ, Pair, TAUGHT_BY, TransferResult};
 use crate::study::{After, Bench, RECIPES};
 
 /// Computes one world of each recipe.
-fn worlds(differ: Differ) -> Vec<Taught> {
+fn worlds(differ: Differ) -> Vec<TransferResult> {
     let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name).commissioned()).collect();
     let pair = |k: usize| Pair { taught: &benches[k], in_common: &benches[(k + 1) % benches.len()] };
     (0..benches.len()).into_par_iter().map(|k| pair(k).world(k as u64 + 1, differ, TAUGHT_BY, 2)).collect()
 }
 
 /// Returns the root mean square error over all worlds, divided by the RMS of what the passes add by themselves.
-fn together(worlds: &[Taught], after: impl Fn(&Taught) -> After) -> f64 {
+fn together(worlds: &[TransferResult], after: impl Fn(&TransferResult) -> After) -> f64 {
     let [rms, floor] =
         worlds.iter().map(after).fold([0.0; 2], |[rms, floor], a| [rms + a.rms_um.powi(2), floor + a.floor_um.powi(2)]);
     (rms / floor).sqrt()

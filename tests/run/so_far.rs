@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use crate::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
 use regrind::cell::Ending;
-use regrind::drive::{Drive, Request, Snapshot, PreviewStatistics};
+use regrind::drive::{Drive, PreviewStatistics, Request, Snapshot};
 use regrind_sim::registers::SimulatedMachine;
 
 fn cmm(rig: &Rig, what: impl FnOnce(&mut SimulatedMachine)) {

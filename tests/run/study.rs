@@ -13,12 +13,13 @@ use std::path::Path;
 
 use regrind::cell::CellPlan;
 use regrind::compensation::{
-    SurfacePoint, Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind, ParameterEstimation, PassObservation,
-    ParameterCorrections, ParameterExplainer, error_map, parameters, response, explained_by_parameters,
+    Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterCorrections,
+    ParameterEstimation, ParameterExplainer, ParameterKind, PassObservation, SurfacePoint, error_map,
+    estimate_parameters, estimate_response, explained_by_parameters,
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
-use regrind::geometry::{Grid, Point, DeviationSample, Vector};
+use regrind::geometry::{DeviationSample, Grid, Point, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
@@ -253,8 +254,9 @@ impl<'a> Line<'a> {
     fn error(&self, found: &Registration) -> ErrorMap {
         let task = &self.bench.task;
         let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
-        let readings: Vec<DeviationSample> =
-            used().map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+        let readings: Vec<DeviationSample> = used()
+            .map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm })
+            .collect();
         match self.way {
             Way::Regrind(_) => error_map(&readings, &task.map_options).unwrap(),
             Way::Plain => unfiltered(&readings, &task.map_options),
@@ -273,10 +275,9 @@ impl<'a> Line<'a> {
         let (contacts, set) = self.estimate_parameters(found);
         let options = task.parameter_options(self.correction.set.as_ref());
         let grid = self.correction.grid;
-        let smoother = task
-            .parameter_compensation
-            .as_ref()
-            .map(|taken| move |values: &[f64]| explained_by_parameters(values, &grid, [&contacts, &taken.node_points], &options));
+        let smoother = task.parameter_compensation.as_ref().map(|taken| {
+            move |values: &[f64]| explained_by_parameters(values, &grid, [&contacts, &taken.node_points], &options)
+        });
         let smooth = smoother.as_ref().map(|smoother| smoother as ParameterExplainer<'_>);
         let seen = PassObservation { correction: &self.correction, error: &error, response: answer, explained: smooth };
         self.known = self.known.updated(&seen);
@@ -306,12 +307,19 @@ impl<'a> Line<'a> {
         let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
         let contacts: Vec<SurfacePoint> = used.map(contact).collect();
         let before = self.correction.set.clone();
-        let Some(taken) = task.parameter_compensation.as_ref().filter(|_| self.before.is_none()) else { return (contacts, before) };
+        let Some(taken) = task.parameter_compensation.as_ref().filter(|_| self.before.is_none()) else {
+            return (contacts, before);
+        };
         let options = task.parameter_options(before.as_ref());
         let told = estimate_parameters(&contacts, None, &options).unwrap();
         let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
         values.iter_mut().zip(&told.estimates).for_each(|(value, of)| *value += of.compensated);
-        let set = ParameterCorrections::from_values(values, self.correction.cycle + 1, [&contacts, &taken.node_points], &options);
+        let set = ParameterCorrections::from_values(
+            values,
+            self.correction.cycle + 1,
+            [&contacts, &taken.node_points],
+            &options,
+        );
         self.told = Some(told);
         (contacts, set)
     }

@@ -1,7 +1,7 @@
 //! Machine parameters in many worlds: estimated, compensated, and compared with the map alone, by the truth.
 
 use regrind::compensation::path::nominal_height_field;
-use regrind::compensation::{SurfacePoint, GainRule, ParameterKind, WheelTerm};
+use regrind::compensation::{GainRule, ParameterKind, SurfacePoint, WheelTerm};
 use regrind::drive::ParameterCompensation;
 use regrind::geometry::Grid;
 use regrind_sim::spec::WorldSpec;

@@ -15,7 +15,7 @@ use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{BlockingExecutor, CycleRow, Drive, JournalSink, Notice, Request, RunInputs, send_request};
 use regrind::journal::{Header, Journal};
-use regrind::recipe::{SelectionMode, Recipe};
+use regrind::recipe::{Recipe, SelectionMode};
 use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
@@ -277,7 +277,7 @@ pub fn run(setup: Setup) -> Ran {
 
 async fn go(setup: Setup) -> Ran {
     let home = tempfile::tempdir().unwrap();
-    let _kept = crate::keep::Kept(home.path().to_owned());
+    let _kept = crate::keep::KeepRunFolders(home.path().to_owned());
     let folder = home.path().join("run");
     let file = format!("recipes/{}.toml", setup.recipe);
     let text = if setup.coarse { changed(&file, &COARSE) } else { changed(&file, &[]) };

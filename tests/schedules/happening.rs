@@ -175,7 +175,8 @@ impl<'s> Happening<'s> {
         } else {
             let lock = RunLock::acquire(folder).unwrap();
             verify(folder).unwrap();
-            let interrupted = InterruptedRun::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
+            let interrupted =
+                InterruptedRun::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
             (Journal::open_locked(lock, None).unwrap(), Some(interrupted))
         };
         let kept = Kept::new(journal, &self.disk, life, &self.written, &self.cues);

@@ -326,7 +326,10 @@ fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
     let most = Tolerance { pv_of: PvPoints::MostPoints, ..plan().tolerance };
     let found = Figures { pv_robust_mm: Some(0.0069), ..figures(8.0, 0.5) };
     let [pv, rms] = most.compare(&found);
-    assert_eq!((pv.name, pv.median_mm, pv.limit_mm, pv.conformity), ("PV 99.8 %", 0.0069, 0.007, Conformity::Undecided));
+    assert_eq!(
+        (pv.name, pv.median_mm, pv.limit_mm, pv.conformity),
+        ("PV 99.8 %", 0.0069, 0.007, Conformity::Undecided)
+    );
     assert_eq!((rms.name, rms.conformity), ("RMS", Conformity::Within));
     assert!((rms.expanded_mm - 0.00005).abs() < 1e-15, "{rms:?}");
     let [alone, _] = Tolerance { with_uncertainty: false, ..most }.compare(&found);
@@ -391,8 +394,9 @@ fn figures_with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
 #[test]
 fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
     // Nine micrometres of points, of which the probe made two.
-    let judged =
-        |pv_um: [f64; 3], rms_um: [f64; 3]| plan().tolerance.compare(&figures_with_form(pv_um, rms_um)).map(|of| of.conformity);
+    let judged = |pv_um: [f64; 3], rms_um: [f64; 3]| {
+        plan().tolerance.compare(&figures_with_form(pv_um, rms_um)).map(|of| of.conformity)
+    };
     let good = [0.4, 0.5, 0.6];
     assert_eq!(judged([6.0, 6.4, 7.0], good), [Conformity::Within; 2], "the most that it may be is the limit");
     assert_eq!(judged([6.0, 6.4, 7.01], good)[0], Conformity::Undecided);
@@ -669,7 +673,8 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
     assert_eq!(run.cell.state(), State::Aborted);
     assert_eq!(run.cell.in_words(), "Aborted: neither machine has confirmed that it is at rest");
     assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: false, .. })));
-    let alarm = run.commands.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
+    let alarm =
+        run.commands.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
     assert!(alarm.remedy[0].contains("the machine's own emergency circuit"), "{alarm:?}");
     // One of them has.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));

@@ -68,5 +68,8 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilari
 }
 
 fn without(why: &str) -> PlantKnowledge {
-    PlantKnowledge { learned: None, words: vec![format!("the plant does not tell what other cells have learned: {why}")] }
+    PlantKnowledge {
+        learned: None,
+        words: vec![format!("the plant does not tell what other cells have learned: {why}")],
+    }
 }

@@ -50,8 +50,8 @@ pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         let (listener, entrance) = door.open(*listen).await?;
         let log = Box::new(|what: &str| eprintln!("page: {what}"));
-        let door =
-            PageDoor::new(entrance, PageSubject::Plant, log).map_err(|source| Failure::Page { address: *listen, source })?;
+        let door = PageDoor::new(entrance, PageSubject::Plant, log)
+            .map_err(|source| Failure::Page { address: *listen, source })?;
         super::super::print(&format!("page     {}\n", door.url()))?;
         tokio::select! {
             () = door.serve(listener, PlantPage::new(settings, config.artefacts.clone()).routes()) => {}

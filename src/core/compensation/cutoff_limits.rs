@@ -110,7 +110,9 @@ mod tests {
         assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
         assert_eq!(point_spacing_mm(&grid(1, 1, [1.0, 1.0])), 0.0);
         assert_eq!(point_spacing_mm(&[]), 0.0);
-        let again = |r: DeviationSample| [0.0, 0.3, 0.6].map(|beside| DeviationSample { place_mm: r.place_mm.map(|x| x + beside), ..r });
+        let again = |r: DeviationSample| {
+            [0.0, 0.3, 0.6].map(|beside| DeviationSample { place_mm: r.place_mm.map(|x| x + beside), ..r })
+        };
         let thrice: Vec<DeviationSample> = grid(20, 20, [260.0, 260.0]).into_iter().flat_map(again).collect();
         assert!((point_spacing_mm(&thrice) - 260.0).abs() < 1.0, "{}", point_spacing_mm(&thrice));
     }
@@ -119,7 +121,9 @@ mod tests {
     fn the_cutoff_must_suit_wheel_and_points() {
         let contact = contact_width_mm(12.5, 0.02);
         assert!(check_cutoff(5.0, contact, 2.14).is_ok());
-        let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
+        let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else {
+            panic!()
+        };
         assert_eq!(least_mm, 4.28);
         assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
     }

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use super::filter::{MIN_READINGS, MAX_FILTER_NODES};
+use super::filter::{MAX_FILTER_NODES, MIN_READINGS};
 use super::spline::SplineError;
 use crate::geometry::GridError;
 
@@ -32,7 +32,7 @@ pub enum MapError {
     )]
     CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
     #[error(
-        "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the contact width of the wheel, \
+        "the cut-off of {cutoff_mm:.3} mm is below {min_mm:.3} mm, twice the contact width of the wheel, \
          {contact_width_mm:.3} mm: the wheel cannot grind shorter waves; choose a longer cut-off or a smaller wheel"
     )]
     CutoffBelowContact { cutoff_mm: f64, min_mm: f64, contact_width_mm: f64 },

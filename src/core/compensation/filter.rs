@@ -142,7 +142,13 @@ impl GaussianFilter {
 
     /// Filters values at arbitrary places and returns the result on a grid; `weights` holds a factor from 0 to 1 for
     /// each value.
-    pub fn filter_scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> FilterResult {
+    pub fn filter_scattered(
+        &self,
+        places: &[[f64; 2]],
+        values: &[f64],
+        weights: Option<&[f64]>,
+        grid: &Grid,
+    ) -> FilterResult {
         let degree = self.order.degree();
         let trend = Trend::fit(places, values, degree);
         let sigma_mm = self.sigma_mm();
@@ -185,7 +191,14 @@ impl GaussianFilter {
         })
     }
 
-    fn solve(&self, channels: &GridSums, spread: [f64; 2], taps: [usize; 2], grid: &Grid, counts: &ReadingCounts) -> FilterResult {
+    fn solve(
+        &self,
+        channels: &GridSums,
+        spread: [f64; 2],
+        taps: [usize; 2],
+        grid: &Grid,
+        counts: &ReadingCounts,
+    ) -> FilterResult {
         let degree = self.order.degree();
         let sigma_mm = self.sigma_mm();
         let kernels = |scale: f64, most: usize| {

@@ -174,7 +174,9 @@ impl LearningState {
         // Its division between several bands is unknown, so in each band it weighs as one of the many values of a
         // pass.
         let stated = |from_mm: f64| match rule {
-            GainRule::Wavelength => (VALUES_PER_INDEPENDENT_VALUE * independent_values(size_mm[0] * size_mm[1], from_mm)).recip(),
+            GainRule::Wavelength => {
+                (VALUES_PER_INDEPENDENT_VALUE * independent_values(size_mm[0] * size_mm[1], from_mm)).recip()
+            }
             GainRule::Fixed(_) | GainRule::Adaptive => 1.0,
         };
         let bands = edges.into_iter().map(|from_mm| band(from_mm, 1.0 / count, stated(from_mm)));
@@ -194,7 +196,10 @@ impl LearningState {
     /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
-        if seen.response.is_some_and(|answer| !matches!(answer.sense, ResponseKind::AsCommanded | ResponseKind::Unclear)) {
+        if seen
+            .response
+            .is_some_and(|answer| !matches!(answer.sense, ResponseKind::AsCommanded | ResponseKind::Unclear))
+        {
             known.wanted_mm = Some(seen.correction.apparent_mm().into_owned());
             return known;
         }
@@ -260,7 +265,9 @@ impl LearningState {
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
         let told = ResampledError::resampled(error, error.grid);
         let noise = self.band_noise_mm2(told.noise_mm2);
-        for ((band, values), noise_mm2) in self.bands.iter().zip(self.split_bands(&told, told.error_mm.clone())).zip(noise) {
+        for ((band, values), noise_mm2) in
+            self.bands.iter().zip(self.split_bands(&told, told.error_mm.clone())).zip(noise)
+        {
             let seen2 = told.mean_square(&values);
             let [n2, taken] = [band.noise_mm2().unwrap_or(noise_mm2), self.compensated_share(band)];
             // Sum of: the repeatable error that is not compensated, the noise that the correction grinds in, the
@@ -619,9 +626,19 @@ mod tests {
     #[test]
     fn a_response_below_one_is_made_up_for() {
         let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
-        let answer =
-            Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: ResponseKind::AsCommanded };
-        let known = known.updated(&PassObservation { correction: &none(), error: &form, response: Some(answer), explained: None });
+        let answer = Response {
+            slope: 0.9,
+            correlation: 1.0,
+            asked_mm: 1e-3,
+            unexplained_mm: 0.0,
+            sense: ResponseKind::AsCommanded,
+        };
+        let known = known.updated(&PassObservation {
+            correction: &none(),
+            error: &form,
+            response: Some(answer),
+            explained: None,
+        });
         assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
         for (u, e) in known.next_correction_mm().unwrap().iter().zip(&form.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
@@ -642,11 +659,21 @@ mod tests {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
         let asked = none().compensating(&first, None);
-        for sense in
-            [ResponseKind::NoEffect, ResponseKind::Flipped, ResponseKind::MirroredX, ResponseKind::MirroredY, ResponseKind::Turned, ResponseKind::Doubled]
-        {
+        for sense in [
+            ResponseKind::NoEffect,
+            ResponseKind::Flipped,
+            ResponseKind::MirroredX,
+            ResponseKind::MirroredY,
+            ResponseKind::Turned,
+            ResponseKind::Doubled,
+        ] {
             let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
-            let twice = first.updated(&PassObservation { correction: &asked, error: &form, response: Some(answer), explained: None });
+            let twice = first.updated(&PassObservation {
+                correction: &asked,
+                error: &form,
+                response: Some(answer),
+                explained: None,
+            });
             assert_eq!((twice.next_correction_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
             assert_eq!(twice.repeatability_mm(), None);
         }
@@ -681,7 +708,12 @@ mod tests {
                 unexplained_mm: 0.0,
                 sense: ResponseKind::AsCommanded,
             });
-            known = known.updated(&PassObservation { correction: &correction, error: &error, response: answer, explained: None });
+            known = known.updated(&PassObservation {
+                correction: &correction,
+                error: &error,
+                response: answer,
+                explained: None,
+            });
             correction = correction.compensating(&known, None);
         }
         for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.5525, 0.634]) {
@@ -712,7 +744,8 @@ mod tests {
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split_bands(&ResampledError::resampled(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+            rms(&known.split_bands(&ResampledError::resampled(&wave, GRID), wave.values_mm.clone())[band])
+                / rms(&wave.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -758,12 +791,18 @@ mod tests {
                     known = after(&known, &none(), &error);
                     assert!(known.is_valid(), "{known:?}");
                     let forecast = known.forecast(&error, 0.0);
-                    assert!(forecast.rms_mm.is_finite() && known.next_correction_mm().unwrap().iter().all(|v| v.is_finite()));
+                    assert!(
+                        forecast.rms_mm.is_finite()
+                            && known.next_correction_mm().unwrap().iter().all(|v| v.is_finite())
+                    );
                 }
             }
         }
         let all = after(&begin(GainRule::Adaptive, None), &none(), &map(|_| 0.0));
-        assert!(all.next_correction_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0), 0.0).rms_mm == 0.0);
+        assert!(
+            all.next_correction_mm().unwrap().iter().all(|v| *v == 0.0)
+                && all.forecast(&map(|_| 0.0), 0.0).rms_mm == 0.0
+        );
     }
 
     #[test]

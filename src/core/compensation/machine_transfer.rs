@@ -25,7 +25,7 @@
 //! Its remaining share of a mean is stored with the mean: a machine passes on only what its own passes showed.
 //! Otherwise the finding of one machine would come back as that of all.
 
-use super::learning::{Band, VALUES_PER_INDEPENDENT_VALUE, ResampledError, LearningState, MeanError, RESPONSE_LIMITS};
+use super::learning::{Band, LearningState, MeanError, RESPONSE_LIMITS, ResampledError, VALUES_PER_INDEPENDENT_VALUE};
 use crate::geometry::Grid;
 
 /// Minimum variance of the mean over that of N: that after one pass.
@@ -159,8 +159,7 @@ impl LearningState {
         }
         let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
         let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
-        let why =
-            || format!("{columns} x {rows} nodes in {bands} bands make {steps:.0e} steps, limit {MAX_STEPS:.0e}");
+        let why = || format!("{columns} x {rows} nodes in {bands} bands make {steps:.0e} steps, limit {MAX_STEPS:.0e}");
         (steps > MAX_STEPS).then(why)
     }
 
@@ -339,8 +338,9 @@ mod tests {
         // k = 0.5, t = c = 2, w = 1/3, 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
         let flat = |value: f64| machine(GainRule::Adaptive, vec![value; GRID.len()], [0.5, 2.0]);
         let (one, two) = (flat(5f64.sqrt()), flat(-(5f64.sqrt())));
-        let begun =
-            |others: &[&LearningState]| fresh(GainRule::Adaptive).seeded_from(others, &similarity_of(0.5), GRID).unwrap();
+        let begun = |others: &[&LearningState]| {
+            fresh(GainRule::Adaptive).seeded_from(others, &similarity_of(0.5), GRID).unwrap()
+        };
         let TransferredState { state: known, own_shares: differ } = begun(&[&one, &one]);
         let values = &known.mean.as_ref().unwrap().values_mm;
         assert!(values.iter().all(|v| (v - 4.0 / 7.0 * 5f64.sqrt()).abs() < 1e-12), "{}", values[0]);
@@ -405,7 +405,8 @@ mod tests {
             (0..4).map(|k| machine(rule, field(k), [0.3 + 0.2 * k as f64, 1e-2 * (k + 1) as f64])).collect();
         let of = |order: [usize; 4]| {
             let others: Vec<&LearningState> = order.iter().map(|k| &machines[*k]).collect();
-            let TransferredState { state: known, own_shares: differ } = fresh(rule).seeded_from(&others, &similarity_of(0.5), GRID).unwrap();
+            let TransferredState { state: known, own_shares: differ } =
+                fresh(rule).seeded_from(&others, &similarity_of(0.5), GRID).unwrap();
             (known.mean.unwrap().values_mm, known.bands, known.response, differ)
         };
         let (values, bands, response, differ) = of([0, 1, 2, 3]);
@@ -485,7 +486,11 @@ mod tests {
         let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
         long.mean = Some(MeanError { grid, values_mm: vec![0.0; grid.len()] });
         for (state, why) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
-            assert!(state.is_valid() && state.transfer_obstacle().unwrap().contains(why), "{:?}", state.transfer_obstacle());
+            assert!(
+                state.is_valid() && state.transfer_obstacle().unwrap().contains(why),
+                "{:?}",
+                state.transfer_obstacle()
+            );
         }
     }
 
@@ -497,8 +502,9 @@ mod tests {
         own.response = [0.9, 0.02];
         let mut borrowed = own.clone();
         borrowed.bands.iter_mut().for_each(|band| band.borrowed = 0.9);
-        let begun =
-            |others: &[&LearningState]| fresh(rule).seeded_from(others, &similarity_of(0.1), GRID).unwrap().state.response;
+        let begun = |others: &[&LearningState]| {
+            fresh(rule).seeded_from(others, &similarity_of(0.1), GRID).unwrap().state.response
+        };
         assert_eq!(begun(&[&own, &borrowed, &borrowed]), begun(&[&own]));
     }
 

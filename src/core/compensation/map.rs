@@ -7,13 +7,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::MapError;
-use super::filter::{FilterResult, GaussianFilter, MAX_FILTER_NODES, FilterOrder};
+use super::cutoff_limits::{check_cutoff, point_spacings_mm};
+use super::filter::{FilterOrder, FilterResult, GaussianFilter, MAX_FILTER_NODES};
 use super::inliers::InlierReadings;
 use super::level_off::{Levelled, level_off};
-use super::robust_filter::{FarReadings, Residuals, RobustResult, residuals, filter_robust};
-use super::cutoff_limits::{check_cutoff, point_spacings_mm};
+use super::robust_filter::{FarReadings, Residuals, RobustResult, filter_robust, residuals};
 use super::spline::{SplineSmoothness, fit_spline};
-use crate::geometry::{Grid, DeviationSample};
+use crate::geometry::{DeviationSample, Grid};
 
 /// Minimum cut-off of the surface that readings are compared with, in distances between readings.
 const MIN_REFERENCE_CUTOFF_SPACINGS: f64 = 4.0;
@@ -117,7 +117,10 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
     let gaussian = GaussianFilter { cutoff_mm: options.cutoff_mm, order: options.order };
     let worked = refined_grid(&grid, &gaussian)?;
     let apart_mm = point_spacings_mm(readings);
-    let wide = GaussianFilter { cutoff_mm: options.cutoff_mm.max(MIN_REFERENCE_CUTOFF_SPACINGS * apart_mm[0].max(apart_mm[1])), ..gaussian };
+    let wide = GaussianFilter {
+        cutoff_mm: options.cutoff_mm.max(MIN_REFERENCE_CUTOFF_SPACINGS * apart_mm[0].max(apart_mm[1])),
+        ..gaussian
+    };
     let wide = ReferenceFilter { gaussian: wide, grid: refined_grid(&grid, &wide)?, is_map_filter: wide == gaussian };
     let mut kept = InlierReadings::from_all(readings);
     let (mut outliers, mut features, mut found, mut advice) = (Vec::new(), Vec::new(), None, Vec::new());
@@ -163,7 +166,12 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
 ///
 /// `features` holds indices of readings, with their heights over the surface around. A chip that covers two targets
 /// is narrower than the filter.
-fn preserve_features(filtered: &mut FilterResult, gaussian: &GaussianFilter, kept: &InlierReadings, features: &[(usize, f64)]) {
+fn preserve_features(
+    filtered: &mut FilterResult,
+    gaussian: &GaussianFilter,
+    kept: &InlierReadings,
+    features: &[(usize, f64)],
+) {
     /// Maximum number of repetitions: enough for a feature of which an eighth passes at a time. Where readings are
     /// denser, less of it remains.
     const MAX_ROUNDS: usize = 8;
@@ -198,7 +206,11 @@ fn preserve_features(filtered: &mut FilterResult, gaussian: &GaussianFilter, kep
 ///
 /// # Errors
 /// Those of [`error_map`].
-pub fn map_from_model(told: &[(DeviationSample, f64)], options: &MapOptions, scatter_mm: f64) -> Result<ErrorMap, MapError> {
+pub fn map_from_model(
+    told: &[(DeviationSample, f64)],
+    options: &MapOptions,
+    scatter_mm: f64,
+) -> Result<ErrorMap, MapError> {
     let options = MapOptions { outlier_limit: None, ..*options };
     let form: Vec<DeviationSample> = told.iter().map(|(sample, _)| *sample).collect();
     let sigma = |(sample, sigma_mm): &(DeviationSample, f64)| DeviationSample { deviation_mm: *sigma_mm, ..*sample };
@@ -306,7 +318,13 @@ impl UnlevelledMap {
     }
 
     /// Replaces the surface of the filter by that of the spline; `valid` stays unchanged.
-    fn with_spline(self, grid: &Grid, kept: &InlierReadings, density: f64, options: &MapOptions) -> Result<Self, MapError> {
+    fn with_spline(
+        self,
+        grid: &Grid,
+        kept: &InlierReadings,
+        density: f64,
+        options: &MapOptions,
+    ) -> Result<Self, MapError> {
         let fitted = fit_spline(kept, grid, density, options.cutoff_mm, options.spline_smoothness)?;
         Ok(Self {
             values: fitted.values,
@@ -417,7 +435,8 @@ pub fn filter_grid(
     let gaussian = GaussianFilter { cutoff_mm, order };
     let mask: Vec<f64> = valid.iter().map(|v| f64::from(u8::from(*v))).collect();
     let plain = gaussian.filter_nodes(values, &mask, grid);
-    let (filtered, rounds) = if robust_form { filter_robustly(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
+    let (filtered, rounds) =
+        if robust_form { filter_robustly(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
     let count = filtered.supported.iter().filter(|s| **s).count();
     if count == 0 {
         return Err(MapError::TooSparse { valid: 0, nodes: grid.len(), cutoff_mm });
@@ -426,7 +445,13 @@ pub fn filter_grid(
     Ok(FilteredGrid { values: levelled.values, valid: filtered.supported, rounds })
 }
 
-fn filter_robustly(gaussian: &GaussianFilter, plain: FilterResult, values: &[f64], mask: &[f64], grid: &Grid) -> (FilterResult, usize) {
+fn filter_robustly(
+    gaussian: &GaussianFilter,
+    plain: FilterResult,
+    values: &[f64],
+    mask: &[f64],
+    grid: &Grid,
+) -> (FilterResult, usize) {
     let masked = |weights: &[f64]| weights.iter().zip(mask).map(|(w, m)| w * m).collect::<Vec<f64>>();
     let again = |weights: &[f64]| gaussian.filter_nodes(values, &masked(weights), grid);
     let compare = |filtered: &FilterResult, _: Option<&[f64]>| {

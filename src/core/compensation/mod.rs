@@ -13,32 +13,32 @@
 //! sign.
 
 mod correction;
+mod cutoff_limits;
 mod error;
 mod filter;
 mod inliers;
 mod learning;
 mod level_off;
+mod machine_transfer;
 mod map;
 mod next_pass;
 mod parameters;
 pub mod path;
 mod response;
 mod robust_filter;
-mod cutoff_limits;
-mod machine_transfer;
 mod spline;
 
 pub use correction::Correction;
+pub use cutoff_limits::{contact_width_mm, point_spacing_mm};
 pub use error::MapError;
 pub use filter::FilterOrder;
-pub use learning::{Forecast, GainRule, LearningState, PassObservation, ParameterExplainer};
+pub use learning::{Forecast, GainRule, LearningState, ParameterExplainer, PassObservation};
+pub use machine_transfer::{MachineSimilarity, TransferredState};
 pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, map_from_model};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{
-    SurfacePoint, EstimatedParameter, ParameterError, ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, ExplainedDeviation, WheelTerm,
-    estimate_parameters, explained_by_parameters,
+    EstimatedParameter, ExplainedDeviation, ParameterCorrections, ParameterError, ParameterEstimation, ParameterKind,
+    ParameterOptions, SurfacePoint, WheelTerm, estimate_parameters, explained_by_parameters,
 };
 pub use response::{Response, ResponseKind, estimate_response};
-pub use cutoff_limits::{contact_width_mm, point_spacing_mm};
-pub use machine_transfer::{MachineSimilarity, TransferredState};
-pub use spline::{SplineSmoothness, SplineError};
+pub use spline::{SplineError, SplineSmoothness};

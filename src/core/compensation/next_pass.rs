@@ -185,7 +185,12 @@ mod tests {
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<NextPass, NextPassError> {
         let options = MapOptions::new(1.0, 1.0);
         let known = LearningState::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
-        correction.next_pass(error, &known.updated(&PassObservation { correction, error, response: None, explained: None }), None, &LIMITS)
+        correction.next_pass(
+            error,
+            &known.updated(&PassObservation { correction, error, response: None, explained: None }),
+            None,
+            &LIMITS,
+        )
     }
 
     #[test]

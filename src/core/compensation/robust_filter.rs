@@ -14,7 +14,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::filter::{FilterResult, GaussianFilter};
-use crate::geometry::{Grid, PointTree, Point};
+use crate::geometry::{Grid, Point, PointTree};
 
 /// Maximum number of rounds of the robust filter.
 const ROUNDS: usize = 15;
@@ -102,7 +102,12 @@ impl Residuals {
 }
 
 /// Applies the robust filter.
-pub(super) fn filter_robust(gaussian: &GaussianFilter, places: &[[f64; 2]], values: &[f64], grid: &Grid) -> RobustResult {
+pub(super) fn filter_robust(
+    gaussian: &GaussianFilter,
+    places: &[[f64; 2]],
+    values: &[f64],
+    grid: &Grid,
+) -> RobustResult {
     let again = |weights: &[f64]| gaussian.filter_scattered(places, values, Some(weights), grid);
     let compare = |filtered: &FilterResult, weights: Option<&[f64]>| residuals(filtered, places, values, weights);
     iterate(gaussian.filter_scattered(places, values, None, grid), values.len(), again, compare)
@@ -153,7 +158,12 @@ impl RobustResult {
     ///
     /// `apart` is the distance of neighbouring readings along x and y. Returns `None` if more than a tenth would be
     /// outliers: then they are no exception, and no other rule defines the surface.
-    pub fn find_far(&self, (places, values): (&[[f64; 2]], &[f64]), limit: f64, apart: [f64; 2]) -> Option<FarReadings> {
+    pub fn find_far(
+        &self,
+        (places, values): (&[[f64; 2]], &[f64]),
+        limit: f64,
+        apart: [f64; 2],
+    ) -> Option<FarReadings> {
         if places.len() < MIN_READINGS {
             return Some(FarReadings::default());
         }
@@ -170,7 +180,11 @@ impl RobustResult {
             let around = ReadingIndex { places, values, tree: PointTree::new(places.iter().map(on_plane)), apart };
             let least = MIN_LIMIT_SHARE * limit;
             for k in alone.into_iter().map(|n| off[n]) {
-                if around.is_confirmed(k, self.scaled_residuals[k].signum(), least) { features.push(k) } else { outliers.push(k) }
+                if around.is_confirmed(k, self.scaled_residuals[k].signum(), least) {
+                    features.push(k)
+                } else {
+                    outliers.push(k)
+                }
             }
         }
         features.sort_unstable();
@@ -184,7 +198,8 @@ impl RobustResult {
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
         let agrees = |j: &usize| {
             is_neighbour(away(*j), apart)
-                && self.scaled_residuals[*j] * self.scaled_residuals[k].signum() >= MIN_HEIGHT_SHARE * self.scaled_residuals[k].abs()
+                && self.scaled_residuals[*j] * self.scaled_residuals[k].signum()
+                    >= MIN_HEIGHT_SHARE * self.scaled_residuals[k].abs()
         };
         let in_reach = |j: &&usize| away(**j)[0].abs() <= NEIGHBOUR * apart[0];
         let mut before = off[..n].iter().rev().take_while(in_reach);

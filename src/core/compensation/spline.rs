@@ -28,7 +28,7 @@ use thiserror::Error;
 use super::filter::Trend;
 use super::inliers::InlierReadings;
 use crate::geometry::Grid;
-use crate::sparse::{SparsityPattern, SelectedInverse};
+use crate::sparse::{SelectedInverse, SparsityPattern};
 
 /// Number of knots per cut-off: with five the splines alone pass waves at the cut-off to 0.2 %.
 const KNOTS: f64 = 5.0;

@@ -9,7 +9,9 @@ use crate::geometry::DeviationSample;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum FormError {
-    #[error("there are {points} points; at least {least} are required; measure more points or request fewer terms")]
+    #[error(
+        "there are {points} points; at least {min_points} are required; measure more points or request fewer terms"
+    )]
     TooFewPoints { points: usize, min_points: usize },
     #[error("point {} has a place or a deviation that is not a finite number; remove it", index + 1)]
     NotFinite { index: usize },
@@ -20,7 +22,7 @@ pub enum FormError {
          densely or request fewer terms"
     )]
     Undetermined { term: String, points: usize },
-    #[error("{terms} terms are requested, and {basis} has 1 to {most}; request fewer")]
+    #[error("{terms} terms are requested, and {basis} has 1 to {max_terms}; request fewer")]
     Terms { terms: usize, basis: &'static str, max_terms: usize },
     #[error(
         "point {} lies {distance_mm} mm from the middle of polynomials with a radius of {radius_mm} mm; the limit is \

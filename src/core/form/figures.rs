@@ -3,10 +3,10 @@
 use serde::Serialize;
 
 use super::FormError;
-use super::polynomial_basis::PolynomialBasis;
 use super::error::check;
 use super::fit::{PolynomialFit, fit_determined_terms};
 use super::iso::{Iso10110, iso_10110};
+use super::polynomial_basis::PolynomialBasis;
 use super::removed_forms::{RemovedForm, pv, remove_forms};
 use crate::geometry::{Aperture, DeviationSample, bounds};
 

@@ -10,8 +10,8 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::FormError;
-use super::polynomial_basis::{PolynomialBasis, Terms};
 use super::error::check;
+use super::polynomial_basis::{PolynomialBasis, Terms};
 use crate::geometry::DeviationSample;
 
 /// Number of rows in a chunk.
@@ -43,7 +43,11 @@ pub struct PolynomialFit {
 ///
 /// # Errors
 /// Fewer points than terms; a term that the points do not determine; a point that is not finite or far outside.
-pub fn fit_polynomials(basis: &PolynomialBasis, terms: usize, samples: &[DeviationSample]) -> Result<PolynomialFit, FormError> {
+pub fn fit_polynomials(
+    basis: &PolynomialBasis,
+    terms: usize,
+    samples: &[DeviationSample],
+) -> Result<PolynomialFit, FormError> {
     check(samples, terms)?;
     let rows = basis.prepare_terms(terms)?;
     let solved = solve_least_squares(terms, samples, |index, sample, row| rows.values(index, sample, row))?;
@@ -64,7 +68,11 @@ pub fn fit_polynomials(basis: &PolynomialBasis, terms: usize, samples: &[Deviati
 ///
 /// # Errors
 /// Points that do not determine even one term, or that are not finite or far outside.
-pub fn fit_determined_terms(basis: &PolynomialBasis, most: usize, samples: &[DeviationSample]) -> Result<PolynomialFit, FormError> {
+pub fn fit_determined_terms(
+    basis: &PolynomialBasis,
+    most: usize,
+    samples: &[DeviationSample],
+) -> Result<PolynomialFit, FormError> {
     check(samples, POINTS_PER_TERM)?;
     let mut terms = basis.complete_terms(most.min(samples.len() / POINTS_PER_TERM));
     loop {

@@ -58,7 +58,8 @@ pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm
     }
     let [low, high] = aperture.bounds();
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
-    let radius = samples.iter().map(|s| (s.place_mm[0] - middle[0]).hypot(s.place_mm[1] - middle[1])).fold(0.0, f64::max);
+    let radius =
+        samples.iter().map(|s| (s.place_mm[0] - middle[0]).hypot(s.place_mm[1] - middle[1])).fold(0.0, f64::max);
     let square = |s: &DeviationSample| {
         let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.place_mm[k] - middle[k]) / radius);
         x * x + y * y
@@ -94,7 +95,10 @@ pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm
 /// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 and returns the values of the fit at the samples. These
 /// polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer terms if the points do not
 /// determine all.
-fn fit_symmetric_part(samples: &[DeviationSample], square: impl Fn(&DeviationSample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
+fn fit_symmetric_part(
+    samples: &[DeviationSample],
+    square: impl Fn(&DeviationSample) -> f64 + Sync,
+) -> Result<Vec<f64>, FormError> {
     let values = |s: &DeviationSample| even_terms(square(s));
     let mut terms = (MAX_SYMMETRIC_DEGREE + 1).min(samples.len() / 4).max(1);
     loop {
@@ -103,7 +107,8 @@ fn fit_symmetric_part(samples: &[DeviationSample], square: impl Fn(&DeviationSam
             Ok(())
         })?;
         if solved.undetermined.is_none() || terms == 1 {
-            let even = |s: &DeviationSample| values(s).iter().zip(&solved.coefficients).map(|(value, c)| value * c).sum();
+            let even =
+                |s: &DeviationSample| values(s).iter().zip(&solved.coefficients).map(|(value, c)| value * c).sum();
             return Ok(samples.iter().map(even).collect());
         }
         terms -= 1;

@@ -158,8 +158,9 @@ mod tests {
     fn a_motion_changes_nothing_and_a_sphere_has_power_alone() {
         let places = disc(2.0);
         let fits = IsoFits::new(&places, None).unwrap();
-        let of =
-            |form: &dyn Fn(f64, f64) -> f64| fits.evaluate(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>());
+        let of = |form: &dyn Fn(f64, f64) -> f64| {
+            fits.evaluate(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>())
+        };
         let sphere = of(&|x, y| 5e-6 * (x * x + y * y) + 0.3 - 2e-3 * x + 1e-3 * y);
         // 5e-6 * 20^2 from the middle to the rim.
         assert!((sphere.power_mm - 2e-3).abs() < 1e-12 && (sphere.power_rim_mm - 2e-3).abs() < 1e-12, "{sphere:?}");

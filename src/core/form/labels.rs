@@ -79,7 +79,10 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
             at_mm: Some(highest.at_mm),
             ..um("highest (stock left)", highest.value_mm, "the one highest point")
         },
-        LabelledFigure { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the one lowest point") },
+        LabelledFigure {
+            at_mm: Some(lowest.at_mm),
+            ..um("lowest (undercut)", lowest.value_mm, "the one lowest point")
+        },
         labelled_figure("coverage", 100.0 * coverage.share, "%", "nothing", NO_CUT_OFF, &cells),
     ]
 }
@@ -94,7 +97,14 @@ pub fn label_slope(slope: &Slope, taken_out: &RemovedParts) -> Vec<LabelledFigur
     vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.largest_rad)]
 }
 
-fn labelled_figure(name: &'static str, value: f64, unit: &'static str, removed: &str, cut_off: &str, made: &str) -> LabelledFigure {
+fn labelled_figure(
+    name: &'static str,
+    value: f64,
+    unit: &'static str,
+    removed: &str,
+    cut_off: &str,
+    made: &str,
+) -> LabelledFigure {
     LabelledFigure {
         name,
         value,

@@ -10,24 +10,24 @@
 //! inside, nanometres and micrometres only in text. Signs: positive where material is above the nominal surface, along
 //! the outward normal. The figures describe the surface. A wavefront reflected by a mirror has twice the error.
 
-mod polynomial_basis;
 mod error;
 mod figures;
 mod fit;
 mod iso;
-mod labels;
 mod iso_fits;
+mod labels;
+mod polynomial_basis;
 mod removed_forms;
 mod slope;
 mod slope_operator;
 
-pub use polynomial_basis::PolynomialBasis;
 pub use error::FormError;
-pub use figures::{Coverage, Extreme, DeviationFigures, FormOptions, RobustPv, compute_figures, pv_998};
-pub use fit::{PolynomialFit, fit_polynomials, fit_determined_terms};
+pub use figures::{Coverage, DeviationFigures, Extreme, FormOptions, RobustPv, compute_figures, pv_998};
+pub use fit::{PolynomialFit, fit_determined_terms, fit_polynomials};
 pub use iso::{Iso10110, iso_10110, iso_10110_notation};
-pub use labels::{DIRECTION, NO_CUT_OFF, LabelledFigure, RemovedParts, label_figures, label_slope};
 pub use iso_fits::{IsoFits, IsoFormValues};
+pub use labels::{DIRECTION, LabelledFigure, NO_CUT_OFF, RemovedParts, label_figures, label_slope};
+pub use polynomial_basis::PolynomialBasis;
 pub use removed_forms::RemovedForm;
 pub use slope::{Slope, slope};
 pub use slope_operator::SlopeOperator;

@@ -257,9 +257,17 @@ mod tests {
         assert_eq!((0..6).map(degrees).collect::<Vec<_>>(), [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]);
         assert_eq!([1, 2, 3, 9, 36, 200].map(|most| rectangle.complete_terms(most)), [1, 1, 3, 6, 36, 105]);
         let ring = Aperture::Annulus { centre_mm: [1.0, 2.0], inner_radius_mm: 3.0, outer_radius_mm: 9.0 };
-        let PolynomialBasis::Zernike { centre_mm, radius_mm, .. } = PolynomialBasis::for_aperture(&ring) else { panic!("discs have Zernike's") };
+        let PolynomialBasis::Zernike { centre_mm, radius_mm, .. } = PolynomialBasis::for_aperture(&ring) else {
+            panic!("discs have Zernike's")
+        };
         assert_eq!((centre_mm, radius_mm), ([1.0, 2.0], 9.0));
-        assert_eq!((PolynomialBasis::for_aperture(&ring).term_name(8), PolynomialBasis::for_aperture(&ring).complete_terms(40)), ("Z9 (4, 0)".into(), 36));
+        assert_eq!(
+            (
+                PolynomialBasis::for_aperture(&ring).term_name(8),
+                PolynomialBasis::for_aperture(&ring).complete_terms(40)
+            ),
+            ("Z9 (4, 0)".into(), 36)
+        );
         let square = Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 6.0, height_mm: 8.0 };
         assert!(matches!(PolynomialBasis::zernike(&square), PolynomialBasis::Zernike { radius_mm: 5.0, .. }));
         assert!(matches!(rectangle.prepare_terms(0), Err(FormError::Terms { max_terms: 105, .. })));
@@ -284,7 +292,11 @@ mod tests {
                     };
                     let surface = Zernike::try_from(&written).unwrap();
                     let (expected, _) = surface.sag_and_gradient(at_mm[0] - 1.0, at_mm[1] + 2.0).unwrap();
-                    assert!((value - expected).abs() <= 1e-11 * expected.abs().max(1.0), "{}: {value}", basis.term_name(k));
+                    assert!(
+                        (value - expected).abs() <= 1e-11 * expected.abs().max(1.0),
+                        "{}: {value}",
+                        basis.term_name(k)
+                    );
                 }
             }
         }

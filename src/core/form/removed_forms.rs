@@ -44,7 +44,10 @@ impl RemovedForm {
 ///
 /// # Errors
 /// Too few points, points at one place, and forms that the points do not determine.
-pub(super) fn remove_forms(removed: &[RemovedForm], samples: &[DeviationSample]) -> Result<Vec<DeviationSample>, FormError> {
+pub(super) fn remove_forms(
+    removed: &[RemovedForm],
+    samples: &[DeviationSample],
+) -> Result<Vec<DeviationSample>, FormError> {
     let [low, high] = bounds(samples.iter().map(|s| s.place_mm));
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     let half = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);

@@ -102,7 +102,12 @@ impl SlopeOperator {
 
 /// Returns the weight of each place around one for the slope of a plane through them; `None` if they do not lie all
 /// around it.
-fn plane_slope_weights(places: &[[f64; 2]], order: &[usize], of: usize, radius_mm: f64) -> Option<Vec<(usize, [f64; 2])>> {
+fn plane_slope_weights(
+    places: &[[f64; 2]],
+    order: &[usize],
+    of: usize,
+    radius_mm: f64,
+) -> Option<Vec<(usize, [f64; 2])>> {
     let [x, y] = places[of];
     let first = order.partition_point(|&k| places[k][0] < x - radius_mm);
     let run = order[first..].iter().copied().take_while(|&k| places[k][0] <= x + radius_mm);

@@ -71,7 +71,9 @@ pub enum Aperture {
 #[non_exhaustive]
 pub enum ApertureError {
     /// A coordinate is NaN, infinite or too large.
-    #[error("`{key}` is {value_mm} mm; it must be a number between -{MAX_COORDINATE_MM:e} and {MAX_COORDINATE_MM:e} mm")]
+    #[error(
+        "`{key}` is {value_mm} mm; it must be a number between -{MAX_COORDINATE_MM:e} and {MAX_COORDINATE_MM:e} mm"
+    )]
     Coordinate { key: &'static str, value_mm: f64 },
     /// A size is zero, negative, NaN or too large.
     #[error("`{key}` is {value_mm} mm; it must be greater than 0 and at most {MAX_COORDINATE_MM:e} mm")]

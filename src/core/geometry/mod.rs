@@ -3,22 +3,22 @@
 //! Pure: no file, no clock, no randomness. Lengths are in millimetres, angles in radians.
 
 pub mod aperture;
+pub mod deviation_sample;
 mod far_off;
 pub mod grid;
 pub mod grid_recognition;
 mod point_tree;
 pub mod pose;
 pub mod rigid;
-pub mod deviation_sample;
 
 pub use aperture::{Aperture, ApertureError};
+pub use deviation_sample::DeviationSample;
 pub(crate) use far_off::find_far_off;
 pub use grid::{Grid, GridError};
 pub use grid_recognition::{GriddedCloud, recognise_grid};
 pub(crate) use point_tree::PointTree;
 pub use pose::{Pose, PoseError, Twist};
 pub use rigid::{RigidError, RigidFit, fit_rigid};
-pub use deviation_sample::DeviationSample;
 
 /// A position in space, in millimetres.
 pub type Point = nalgebra::Point3<f64>;

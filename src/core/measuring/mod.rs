@@ -9,10 +9,10 @@
 //! Pure: no file, no clock, no randomness. Units: millimetres. Frames: targets are in the model frame {M}, and centres
 //! on the sphere are in the CMM frame {W}.
 
-mod thermal_expansion;
 mod pattern;
 mod sphere;
+mod thermal_expansion;
 
-pub use thermal_expansion::{ThermalExpansion, REFERENCE_TEMPERATURE_C};
 pub use pattern::{Layout, PatternError, Target, sphere_targets, targets};
 pub use sphere::{SphereFit, SphereFitError, fit_sphere};
+pub use thermal_expansion::{REFERENCE_TEMPERATURE_C, ThermalExpansion};

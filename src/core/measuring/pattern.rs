@@ -5,7 +5,7 @@ use std::f64::consts::{PI, TAU};
 use thiserror::Error;
 
 use crate::geometry::{Point, Vector};
-use crate::surface::{Nominal, OffsetSurface, FacetIndex, Side};
+use crate::surface::{FacetIndex, Nominal, OffsetSurface, Side};
 
 /// Maximum number of targets: more than a machine measures in a week.
 const MAX_TARGETS: f64 = 1e7;

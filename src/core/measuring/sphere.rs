@@ -24,7 +24,7 @@ pub struct SphereFit {
 #[non_exhaustive]
 pub enum SphereFitError {
     #[error(
-        "{points} points were touched on the reference sphere; at least {LEAST} are required; check the sphere and \
+        "{points} points were touched on the reference sphere; at least {MIN_POINTS} are required; check the sphere and \
          its position in the cell file"
     )]
     TooFew { points: usize },

@@ -67,11 +67,20 @@ pub struct IsoFigures {
 impl SlopeFigures {
     /// Computes the figures of smooth forms, a column each: the first matrix is for the figures, the second one raises
     /// the upper ends of the maximum.
-    pub(super) fn from_forms(slopes: &SlopeOperator, forms: &[DMatrix<f64>; 2], (is_seen, inputs): (bool, &ModelInputs)) -> Self {
+    pub(super) fn from_forms(
+        slopes: &SlopeOperator,
+        forms: &[DMatrix<f64>; 2],
+        (is_seen, inputs): (bool, &ModelInputs),
+    ) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| slopes.evaluate(form)));
         let [rms, largest] = [0, 1].map(|k| {
             let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
-            let of = Interval::from_samples(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, inputs);
+            let of = Interval::from_samples(
+                values(0),
+                (Vec::new(), (k == 1).then(|| values(1)).into_iter()),
+                is_seen,
+                inputs,
+            );
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
         Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }

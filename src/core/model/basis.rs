@@ -120,7 +120,8 @@ impl Basis {
 
     /// Evaluates every basis function at the places: one row for each place, one column for each polynomial and cosine.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
-        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| self.anisotropy.rotated(place)[axis]).collect::<Vec<f64>>());
+        let at_mm =
+            [0, 1].map(|axis| places.iter().map(|&place| self.anisotropy.rotated(place)[axis]).collect::<Vec<f64>>());
         let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
         let cosines = [0, 1].map(|axis| self.cosines(axis, &at_mm[axis]));
         let of_polynomials = self.degrees.iter().map(|order| (&polynomials, order));
@@ -244,7 +245,9 @@ mod tests {
 
     #[test]
     fn within_the_part_they_make_the_covariance_of_the_field() {
-        for (smoothness, near) in [(Smoothness::Exponential, 0.05), (Smoothness::Matern2, 0.02), (Smoothness::SquaredExponential, 0.02)] {
+        for (smoothness, near) in
+            [(Smoothness::Exponential, 0.05), (Smoothness::Matern2, 0.02), (Smoothness::SquaredExponential, 0.02)]
+        {
             for lay in [Anisotropy::NONE, Anisotropy::from_angle(0.7, 3.0)] {
                 let field = Field { smoothness, anisotropy: lay, ..Field::new(1.0, 12.0) };
                 let waves = Basis::over(&PART, lay, 3000, 4);

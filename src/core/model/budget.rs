@@ -133,7 +133,12 @@ fn parts(
     let of_stated = |e: usize| (0..whole).map(|k| effect(k, e) * weights[(k, 0)]).sum::<f64>().powi(2);
     let stated: Vec<f64> = (0..stated).map(of_stated).collect();
     let form = (pose_known - scatter - stated.iter().sum::<f64>()).max(0.0);
-    Some(VarianceComponents { noise: scatter, form, pose: (explained - explained_free).max(0.0), random_effects: stated })
+    Some(VarianceComponents {
+        noise: scatter,
+        form,
+        pose: (explained - explained_free).max(0.0),
+        random_effects: stated,
+    })
 }
 
 /// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the

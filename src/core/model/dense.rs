@@ -208,7 +208,8 @@ mod tests {
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {
         // By hand, k = 4 and s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
-        let model = DensePosterior::fit(&Observations::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPERPARAMETERS).unwrap();
+        let model =
+            DensePosterior::fit(&Observations::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPERPARAMETERS).unwrap();
         let [at, far] = model.predict(&[[1.0, 2.0], [1e4, 0.0]])[..] else { panic!() };
         assert!((at.mean_mm - 12.0 / 4.25).abs() < 1e-14 && (at.sigma_mm.powi(2) - (4.0 - 16.0 / 4.25)).abs() < 1e-14);
         assert_eq!(far, Prediction { mean_mm: 0.0, sigma_mm: 2.0 });

@@ -9,7 +9,7 @@ use thiserror::Error;
 pub enum ModelError {
     #[error("{points} places, {deviations} deviations and {rows} rows of effects do not match")]
     Shape { points: usize, deviations: usize, rows: usize },
-    #[error("the model requires at least {least} points; {points} are given")]
+    #[error("the model requires at least {min_points} points; {points} are given")]
     TooFewPoints { points: usize, min_points: usize },
     #[error("point {} has a number that is not finite", point + 1)]
     NotFinite { point: usize },
@@ -40,7 +40,7 @@ pub enum ModelError {
     #[error("these points do not separate the effects; remove the effects that the surface does not show")]
     CollinearEffects,
     #[error(
-        "the points are of {sessions} session; at least {least} are required for the variance between sessions: \
+        "the points are of {sessions} session; at least {min_sessions} are required for the variance between sessions: \
          measure once more, or from another station"
     )]
     TooFewSessions { sessions: usize, min_sessions: usize },

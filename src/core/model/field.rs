@@ -169,7 +169,8 @@ mod tests {
         assert!((at(40.0, 0.5) - alike).abs() < 1e-12, "{} {alike}", at(40.0, 0.5));
         assert!((at(10.0, 0.5 + std::f64::consts::FRAC_PI_2) - alike).abs() < 1e-12);
         assert_eq!(field.covariance_mm2([3.0, 4.0], [3.0, 4.0]), 4.0);
-        let angle_deg = |angle: f64| Anisotropy::from_angle(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
+        let angle_deg =
+            |angle: f64| Anisotropy::from_angle(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
         for (angle, told) in [(30.0, 30.0), (120.0, -60.0), (-150.0, 30.0), (90.0, 90.0)] {
             assert!((angle_deg(angle) - told).abs() < 1e-9, "{angle}: {}", angle_deg(angle));
         }
@@ -181,10 +182,12 @@ mod tests {
         let of = |field: Field| field.check().err().map(|error| error.to_string()).unwrap_or_default();
         assert!(of(Field::new(0.0, 1.0)).contains("the field is 0 mm"));
         assert!(of(Field::new(1.0, f64::INFINITY)).contains("the range is inf mm"));
-        for lay in
-            [Anisotropy::from_angle(0.0, 0.5), Anisotropy::from_angle(f64::NAN, 2.0), Anisotropy { along: [1.0, 1.0], stretch: 2.0 }]
-        {
-            assert!(of(Field { anisotropy, ..Field::new(1.0, 1.0) }).contains("lay"));
+        for lay in [
+            Anisotropy::from_angle(0.0, 0.5),
+            Anisotropy::from_angle(f64::NAN, 2.0),
+            Anisotropy { along: [1.0, 1.0], stretch: 2.0 },
+        ] {
+            assert!(of(Field { anisotropy: lay, ..Field::new(1.0, 1.0) }).contains("lay"));
         }
         assert!(of(Field { anisotropy: Anisotropy::from_angle(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
     }

@@ -15,12 +15,12 @@ use super::budget::{self, BudgetEntry};
 use super::hypotheses::FieldHypotheses;
 use super::intermediate::IntermediateNodes;
 use super::machine_uncertainty::{MachineEffects, MachineUncertainty, UncertaintySource, invalid_uncertainty};
-use super::random_normals::NormalGenerator;
 use super::posterior::{HypothesisSet, NoisePrior, Posterior, PosteriorSamples, select_hypotheses};
+use super::random_normals::NormalGenerator;
 use super::{AreaOptions, IsoFigures, SlopeFigures};
 use super::{Hyperparameters, ModelError, Observations, Prediction, Prior, orthonormal_base, spacing_mm};
 use crate::form::{IsoFits, SlopeOperator};
-use crate::geometry::{PointTree, Point, Vector};
+use crate::geometry::{Point, PointTree, Vector};
 use crate::registration::{Deviation, MIN_SIGMA_MM, PointStatus, Registration, robust_median_and_sigma};
 
 /// Posterior of the form of a part, from a registered measurement.
@@ -151,17 +151,24 @@ impl Form {
             drawn.without_ground_in(at(&seen.indices_of_all(&chosen)).as_ref())
         };
         let whole = |drawn: SampledForms, apart: &[usize], inputs: &ModelInputs| {
-            seen.with_unexplained_points(apart, drawn.with_unresolved_form(&seen.observed, &posterior, inputs), inputs).after_best_fit()
+            seen.with_unexplained_points(apart, drawn.with_unresolved_form(&seen.observed, &posterior, inputs), inputs)
+                .after_best_fit()
         };
         let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1), true);
         let slope = seen.slope(inputs, &posterior, &drawn);
         let drawn = whole(drawn, &seen.unexplained, inputs);
         let form = if seen.is_chance { &[][..] } else { &seen.confirmed };
-        let least =
-            whole(of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2), false), form, &min_form_inputs(&posterior, inputs))
-                .figures_at_places();
+        let least = whole(
+            of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2), false),
+            form,
+            &min_form_inputs(&posterior, inputs),
+        )
+        .figures_at_places();
         let most = match posterior.rough_probability() > MIN_PROBABILITY {
-            true => whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3), false), &seen.unexplained, inputs).figures_at_places(),
+            true => {
+                whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3), false), &seen.unexplained, inputs)
+                    .figures_at_places()
+            }
             false => Vec::new(),
         };
         let ground_in = at(&drawn.chosen);
@@ -205,7 +212,8 @@ impl Form {
         let ground_in = seen.ground_in.is_some().then(|| seen.machine_effects.columns(places.iter().copied()));
         let drawn = drawn.without_ground_in(ground_in.as_ref());
         let slope = if is_whole { seen.slope(inputs, &posterior, &drawn) } else { None };
-        let drawn = seen.with_unexplained_points(&seen.unexplained, drawn.with_narrow_form(inputs), inputs).after_best_fit();
+        let drawn =
+            seen.with_unexplained_points(&seen.unexplained, drawn.with_narrow_form(inputs), inputs).after_best_fit();
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
     }
 }
@@ -487,7 +495,9 @@ fn min_form_inputs(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
     const MAX_EXCESS_SIGMAS: f64 = 2.0;
     match noise_prior(inputs) {
-        Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAX_EXCESS_SIGMAS * u).exp() => {
+        Some([probe_mm, u])
+            if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAX_EXCESS_SIGMAS * u).exp() =>
+        {
             ModelInputs { probe_noise_mm: [0.0; 2], ..*inputs }
         }
         _ => *inputs,
@@ -645,7 +655,12 @@ impl SampledForms {
         moved: &[DMatrix<f64>; 2],
         is_between: bool,
     ) -> Self {
-        let PosteriorSamples { coefficients: waves, noise_mm: scatter_mm, truncated_mm: narrow_mm, random_effects: stated } = draws;
+        let PosteriorSamples {
+            coefficients: waves,
+            noise_mm: scatter_mm,
+            truncated_mm: narrow_mm,
+            random_effects: stated,
+        } = draws;
         let count = scatter_mm.len();
         let at = fields.basis.at(&places);
         let firsts: Vec<usize> = (0..count).step_by(SAMPLES_PER_BLOCK).collect();

@@ -33,7 +33,8 @@ use super::basis::Basis;
 use super::{Anisotropy, ModelError, Observations, Smoothness, orthonormal_base, spacing_mm};
 
 /// Smoothnesses of the hypotheses, from rough to smooth.
-pub(super) const SMOOTHNESSES: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
+pub(super) const SMOOTHNESSES: [Smoothness; 3] =
+    [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
 /// Number of ranges for each smoothness.
 const RANGES: usize = 9;
 /// Shortest range, in spacings of the points.
@@ -152,8 +153,8 @@ impl FieldHypotheses {
     /// Returns the ranges in equal steps of their logarithm, from the shortest that the points and the basis resolve to
     /// more than the size of the part.
     fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
-        let least_mm =
-            (MIN_RANGE_SPACINGS * spacing_mm(&self.places)).max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
+        let least_mm = (MIN_RANGE_SPACINGS * spacing_mm(&self.places))
+            .max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
         let most_mm = (MAX_RANGE_SIZES * size_mm(&self.places)).max(1.5 * least_mm);
         let ratio = (most_mm / least_mm).ln() / (RANGES - 1) as f64;
         (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
@@ -163,7 +164,8 @@ impl FieldHypotheses {
         observed.check()?;
         let places = observed.places.clone();
         let n = places.len();
-        let count = ((COSINES_PER_POINT * n as f64) as usize).clamp(MIN_COSINES, MAX_COSINES[usize::from(n > MAX_INDIVIDUAL_POINTS)]);
+        let count = ((COSINES_PER_POINT * n as f64) as usize)
+            .clamp(MIN_COSINES, MAX_COSINES[usize::from(n > MAX_INDIVIDUAL_POINTS)]);
         let waves = Basis::over(&places, kind.anisotropy, count, if n > MAX_INDIVIDUAL_POINTS { DEGREE } else { 0 });
         let whitening = whitening(&observed.path, n, kind.autocorrelation);
         let effects = whitened(&whitening, &observed.fixed_effects);
@@ -185,7 +187,8 @@ impl FieldHypotheses {
             removed_by_fit: Mat::new(),
             hypotheses: Vec::new(),
         };
-        (fields.reduced, fields.removed_by_fit) = if n <= MAX_INDIVIDUAL_POINTS { fields.individual_points() } else { fields.reduced_by_products() };
+        (fields.reduced, fields.removed_by_fit) =
+            if n <= MAX_INDIVIDUAL_POINTS { fields.individual_points() } else { fields.reduced_by_products() };
         Ok(fields)
     }
 

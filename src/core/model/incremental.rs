@@ -183,7 +183,8 @@ impl IncrementalPosterior {
     /// Returns the prior covariance of two places: that of the field and that of the effects.
     fn covariance_mm2(&self, a: &Place, b: &Place) -> f64 {
         let effects: f64 = a.effects.iter().zip(&b.effects).map(|(a, b)| a * b).sum();
-        self.pairs.covariance_mm2(a.at, b.at) + (FIXED_EFFECT_SIGMAS * self.hyperparameters.field.sigma_mm).powi(2) * effects
+        self.pairs.covariance_mm2(a.at, b.at)
+            + (FIXED_EFFECT_SIGMAS * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
     /// Returns L^-1 times the covariances of a place with all observed points, and mean and standard deviation of the
@@ -306,7 +307,9 @@ mod tests {
         growing.update_with_expected(77).unwrap();
         let imagined: Vec<Prediction> = growing.predictions().collect();
         assert!(before.iter().zip(&imagined).all(|(a, b)| (a.mean_mm - b.mean_mm).abs() < 1e-12));
-        assert!(imagined[77].sigma_mm < HYPERPARAMETERS.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
+        assert!(
+            imagined[77].sigma_mm < HYPERPARAMETERS.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm
+        );
         // A real touch at the same place finds a different deviation.
         let mut touched = updated_in_batches(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
@@ -334,8 +337,11 @@ mod tests {
         let hyperparameters =
             Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
         let (place, stated) = (vec![[1.0, 2.0]], DMatrix::from_element(1, 1, 1.5));
-        let mut growing = IncrementalPosterior::at_places(&place, &DMatrix::zeros(1, 0), &stated, hyperparameters).unwrap();
-        growing.update(&Observations { random_effects: stated, ..Observations::without_effects(place, vec![3.0]) }).unwrap();
+        let mut growing =
+            IncrementalPosterior::at_places(&place, &DMatrix::zeros(1, 0), &stated, hyperparameters).unwrap();
+        growing
+            .update(&Observations { random_effects: stated, ..Observations::without_effects(place, vec![3.0]) })
+            .unwrap();
         // The prior variance of field and effect together is 4 + 2.25; the noise variance of the observed point is
         // 0.25.
         let told = growing.predictions().next().unwrap();

@@ -7,7 +7,7 @@ use nalgebra::DMatrix;
 
 use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
-use crate::geometry::{PointTree, Point, bounds};
+use crate::geometry::{Point, PointTree, bounds};
 
 /// Maximum number of grid points, and grid points per spacing of the touched points where that maximum allows it.
 const MAX_NODES: f64 = 3000.0;
@@ -45,7 +45,9 @@ impl IntermediateNodes {
             [0, 1].map(|axis: usize| 0.5 * (low[axis] + high[axis] - spacing_mm * (counts[axis] - 1) as f64));
         let grid = BasisGrid { corner_mm, spacing_mm, counts };
         let tree = PointTree::new(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
-        let beside = |node: usize| Some((node, surrounding_places(grid.place(node), &places, &tree, MAX_DISTANCE_SPACINGS * distance_mm)?));
+        let beside = |node: usize| {
+            Some((node, surrounding_places(grid.place(node), &places, &tree, MAX_DISTANCE_SPACINGS * distance_mm)?))
+        };
         let (nodes, corners): (Vec<usize>, Vec<_>) = (0..counts[0] * counts[1]).filter_map(beside).unzip();
         if nodes.is_empty() {
             return None;
@@ -77,7 +79,12 @@ impl IntermediateNodes {
 
 /// Returns the three nearest touched places and their weights; `None` if touched places within `near_mm` do not
 /// surround the place.
-fn surrounding_places(at: [f64; 2], places: &[[f64; 2]], tree: &PointTree, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
+fn surrounding_places(
+    at: [f64; 2],
+    places: &[[f64; 2]],
+    tree: &PointTree,
+    near_mm: f64,
+) -> Option<([usize; 3], [f64; 3])> {
     const CANDIDATES: u32 = 12;
     let near: Vec<(usize, f64)> = tree.nearest(&Point::new(at[0], at[1], 0.0), CANDIDATES).collect();
     let mut angles: Vec<f64> = Vec::new();

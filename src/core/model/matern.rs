@@ -31,7 +31,10 @@ pub(super) struct Correlation {
 impl Correlation {
     pub(super) fn new(smoothness: Smoothness) -> Self {
         static ONCE: Table = Table::new();
-        Self { table: (smoothness == Smoothness::Matern2).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Exponential }
+        Self {
+            table: (smoothness == Smoothness::Matern2).then(|| read(&ONCE)),
+            is_rough: smoothness == Smoothness::Exponential,
+        }
     }
 
     /// Returns the correlation at a distance; the argument is the square of the distance divided by the range.

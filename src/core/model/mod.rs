@@ -21,13 +21,13 @@
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
+mod area_figures;
 mod basis;
 mod budget;
 mod dense;
 mod effects;
 mod error;
 mod field;
-mod area_figures;
 mod form;
 mod hypotheses;
 mod incremental;
@@ -36,19 +36,19 @@ mod machine_uncertainty;
 mod matern;
 mod nelder_mead;
 mod noise_kind;
-mod random_normals;
 mod part_priors;
 mod posterior;
 mod prior;
+mod random_normals;
 mod sessions;
 mod stopping;
 
+pub use area_figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use budget::BudgetEntry;
 pub use dense::{DensePosterior, Prediction};
 pub use effects::EffectEstimates;
 pub use error::ModelError;
 pub use field::{Anisotropy, Field, Smoothness};
-pub use area_figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use form::{Form, FormFigures, FormPoint, Interval, ModelInputs};
 pub use incremental::IncrementalPosterior;
 pub use machine_uncertainty::{MachineUncertainty, UncertaintySource};

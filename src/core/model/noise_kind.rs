@@ -155,8 +155,8 @@ impl CompositeLikelihood {
         // logarithm of the stretch are polar coordinates of the search plane.
         let of = |[a, b]: [f64; 2]| Anisotropy::from_angle(0.5 * b.atan2(a), a.hypot(b).exp().min(MAX_STRETCH));
         let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { anisotropy: of(place), ..kind }, without.0);
-        let starts =
-            [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * START_LOG_STRETCH));
+        let starts = [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]
+            .map(|along: [f64; 2]| along.map(|v| v * START_LOG_STRETCH));
         let start = starts.map(|start| (start, height(start))).into_iter().fold(([0.0; 2], without.1), higher);
         if start.0 == [0.0; 2] {
             return None;

@@ -133,8 +133,15 @@ impl<'f> Posterior<'f> {
             Projected { v, rest }
         };
         let seen: Vec<Projected> = fields.hypotheses.iter().map(see).collect();
-        let posterior =
-            Self { fields, observed, probe, projected: seen, densities: Vec::new(), evidence: 0.0, squares: products[(0, 0)] };
+        let posterior = Self {
+            fields,
+            observed,
+            probe,
+            projected: seen,
+            densities: Vec::new(),
+            evidence: 0.0,
+            squares: products[(0, 0)],
+        };
         let of = |(k, node): (usize, &FieldHypothesis)| {
             let likelihoods: Vec<f64> =
                 variance_ratios().map(|tau| posterior.noise_likelihood(k, tau).log_marginal()).collect();
@@ -258,7 +265,10 @@ impl<'f> Posterior<'f> {
             let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
             let hyperparameters = self.hyperparameters(node, tau);
             let sum: f64 = densities.iter().map(|of| (of - most).exp()).sum();
-            Some((hyperparameters, most + sum.ln() + self.strength_weight(&hyperparameters).max(f64::MIN_POSITIVE).ln()))
+            Some((
+                hyperparameters,
+                most + sum.ln() + self.strength_weight(&hyperparameters).max(f64::MIN_POSITIVE).ln(),
+            ))
         };
         let chosen = self.densities.iter().enumerate().filter(|of| is_of(self.fields.hypotheses[of.0].smoothness));
         let mut all: Vec<(Hyperparameters, f64)> = chosen.filter_map(of).collect();
@@ -344,7 +354,8 @@ impl<'f> Posterior<'f> {
     ) -> PosteriorSamples {
         let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let (waves, seen, count) = (node.standard_deviations.len(), node.eigenvalues.len(), chosen.len());
-        let mut streams: Vec<NormalGenerator> = chosen.iter().map(|(.., k)| NormalGenerator::new(seed, *k as u64)).collect();
+        let mut streams: Vec<NormalGenerator> =
+            chosen.iter().map(|(.., k)| NormalGenerator::new(seed, *k as u64)).collect();
         let told: Vec<(f64, DVector<f64>)> = chosen
             .iter()
             .zip(&mut streams)
@@ -471,7 +482,14 @@ impl NoiseLikelihood {
             let beside = eigenvectors.tr_mul(&products.view((1, 0), (stated, 1)));
             (eigenvalues.iter().zip(&beside).map(|(u, b)| [u.max(0.0), *b]).collect(), eigenvectors)
         };
-        Self { degrees_of_freedom: free, logs, squares: products[(0, 0)].max(f64::MIN_POSITIVE), random_effect_terms: by_stated, axes, probe }
+        Self {
+            degrees_of_freedom: free,
+            logs,
+            squares: products[(0, 0)].max(f64::MIN_POSITIVE),
+            random_effect_terms: by_stated,
+            axes,
+            probe,
+        }
     }
 
     /// Returns the logarithm of the density over ln s.
@@ -497,7 +515,10 @@ impl NoiseLikelihood {
         let told: f64 = self.random_effect_terms.iter().map(|[u, b]| b * b / u.max(f64::MIN_POSITIVE)).sum();
         let wide = (16.0 / (2.0 * self.degrees_of_freedom).sqrt()).max(0.05);
         let least = (self.squares - told).max(1e-12 * self.squares);
-        let [mut low, mut high] = [0.5 * (least / self.degrees_of_freedom).ln() - wide, 0.5 * (self.squares / self.degrees_of_freedom).ln() + wide];
+        let [mut low, mut high] = [
+            0.5 * (least / self.degrees_of_freedom).ln() - wide,
+            0.5 * (self.squares / self.degrees_of_freedom).ln() + wide,
+        ];
         if let Some([probe_mm, u]) = self.probe {
             high = high.max(probe_mm.ln() + 4.0 * u);
         }
@@ -694,8 +715,10 @@ mod tests {
     #[test]
     fn the_scale_of_everything_is_the_scale_of_what_is_found() {
         let observed = simulated(PLANTED, places(120), Vec::new(), 1);
-        let tenfold =
-            Observations { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
+        let tenfold = Observations {
+            deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(),
+            ..observed.clone()
+        };
         let [a, b] = [observed, tenfold].map(|observed| Hyperparameters::estimate(&observed, None).unwrap());
         assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);

@@ -50,7 +50,8 @@ impl Prior {
         };
         let factors = [self.range_mm[1], self.noise_ratio[1]];
         let like = by(factors) + (1.0 - DISSIMILAR_SHARE).ln();
-        let unlike = by([factors[0].max(UNKNOWN_PART_FACTORS[0]), factors[1].max(UNKNOWN_PART_FACTORS[1])]) + DISSIMILAR_SHARE.ln();
+        let unlike = by([factors[0].max(UNKNOWN_PART_FACTORS[0]), factors[1].max(UNKNOWN_PART_FACTORS[1])])
+            + DISSIMILAR_SHARE.ln();
         let higher = like.max(unlike);
         higher + ((like - higher).exp() + (unlike - higher).exp()).ln()
     }

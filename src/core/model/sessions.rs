@@ -212,9 +212,11 @@ impl Sessions {
     fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
         let own = own.pair_covariance();
-        DensePosterior::with_shared_covariance(&self.observed, hyperparameters, |a, b| match self.session_numbers[a] == self.session_numbers[b] {
-            true => own.covariance_mm2(places[a], places[b]),
-            false => 0.0,
+        DensePosterior::with_shared_covariance(&self.observed, hyperparameters, |a, b| {
+            match self.session_numbers[a] == self.session_numbers[b] {
+                true => own.covariance_mm2(places[a], places[b]),
+                false => 0.0,
+            }
         })
     }
 
@@ -222,7 +224,10 @@ impl Sessions {
     fn thinned(&self, most: usize) -> Self {
         let n = self.session_numbers.len();
         let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
-        Self { observed: self.observed.subset(&chosen), session_numbers: chosen.iter().map(|&k| self.session_numbers[k]).collect() }
+        Self {
+            observed: self.observed.subset(&chosen),
+            session_numbers: chosen.iter().map(|&k| self.session_numbers[k]).collect(),
+        }
     }
 }
 
@@ -254,9 +259,11 @@ impl BetweenSessionVariance {
         let Observations { places, fixed_effects: effects, .. } = &unseen.observed;
         let (means_mm, common) = model.predict_together(places);
         let pairs = self.session_field.pair_covariance();
-        let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.session_numbers[r] == unseen.session_numbers[c] {
-            true => pairs.covariance_mm2(places[r], places[c]),
-            false => 0.0,
+        let own = Mat::from_fn(places.len(), places.len(), |r, c| {
+            match unseen.session_numbers[r] == unseen.session_numbers[c] {
+                true => pairs.covariance_mm2(places[r], places[c]),
+                false => 0.0,
+            }
         });
         let base = BestFitBasis::new(effects);
         let fitted_mm = base.after_best_fit(&means_mm);

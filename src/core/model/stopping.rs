@@ -149,12 +149,21 @@ pub fn decide(
         () if !around.is_empty() => Reason::UnconfirmedOutlier,
         () => reason_from_form(&form, purpose, (count, so_far.targets.len())),
     };
-    let is_over = matches!(why, Reason::WithinLimits | Reason::FormKnown | Reason::CorrectionPreferred | Reason::BeyondLimit | Reason::AllTargetsTried);
+    let is_over = matches!(
+        why,
+        Reason::WithinLimits
+            | Reason::FormKnown
+            | Reason::CorrectionPreferred
+            | Reason::BeyondLimit
+            | Reason::AllTargetsTried
+    );
     let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
     let why = if batches >= MAX_BATCHES && !is_over { Reason::MaxBatchesReached } else { why };
     let next = match why {
         _ if is_over => Vec::new(),
-        Reason::NarrowFeature | Reason::MaxBatchesReached => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
+        Reason::NarrowFeature | Reason::MaxBatchesReached => {
+            (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect()
+        }
         _ => {
             let wanted = if count < MIN_TOUCHES { MIN_TOUCHES - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
             growing.choose_next(so_far, &around, wanted.max(around.len()).min(left), seed)?
@@ -241,7 +250,8 @@ impl ExpectedTouches {
 
     /// Returns true if the innovations of the last batch without its outliers are larger than expected by chance.
     fn has_large_innovations(&self) -> bool {
-        let squares: Vec<f64> = self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
+        let squares: Vec<f64> =
+            self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
         let n = squares.len() as f64;
         // Quantile of chi-squared divided by its degrees of freedom (Wilson and Hilferty 1931).
         let ninth = 2.0 / (9.0 * n);

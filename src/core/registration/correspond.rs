@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::simd::{F64x4, LANES, Real, Vector3x4};
-use crate::surface::{PointProjection, ProjectionX4, OffsetSurface, FacetIndex, points_x4};
+use crate::surface::{FacetIndex, OffsetSurface, PointProjection, ProjectionX4, points_x4};
 
 use super::deviation::PointStatus;
 use super::linearize::{FourSums, Scaling, Sums};
@@ -51,7 +51,8 @@ impl Correspondence {
         self.beyond_steps > EDGE_TOLERANCE_STEPS
     }
 
-    pub(crate) const INITIAL: Self = Self { facet: FacetIndex::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
+    pub(crate) const INITIAL: Self =
+        Self { facet: FacetIndex::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
 }
 
 /// Projects all points under a pose and returns the sums of the linear problem at the projections.
@@ -147,7 +148,11 @@ impl ProjectionPass<'_> {
     /// Returns the last places of four points, or places extrapolated from the eight points before them; `None` if
     /// neither is known.
     #[inline(always)]
-    fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[FacetIndex; LANES]; 2]) -> Option<[FacetIndex; LANES]> {
+    fn start(
+        &self,
+        correspondences: &[Correspondence; LANES],
+        recent: &[[FacetIndex; LANES]; 2],
+    ) -> Option<[FacetIndex; LANES]> {
         let places =
             [correspondences[0].facet, correspondences[1].facet, correspondences[2].facet, correspondences[3].facet];
         if !places.contains(&FacetIndex::UNKNOWN) {
@@ -255,8 +260,14 @@ pub(crate) fn report_projections<R: ProjectionReporter>(
     scaling: &Scaling,
     report: &R,
 ) -> Vec<R::Item> {
-    let at_end =
-        FinalPass { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, reporter: report };
+    let at_end = FinalPass {
+        surface,
+        measured,
+        correspondences,
+        model_from_cmm: cmm_from_model.inverse(),
+        scaling,
+        reporter: report,
+    };
     let arch = pulp::Arch::new();
     // Whole blocks, written in place. The last block is padded with the last point.
     let blocks: Vec<[[R::Item; LANES]; GROUPS_PER_TASK]> = (0..measured.len().div_ceil(LANES * GROUPS_PER_TASK))
@@ -314,8 +325,10 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
             Some(feet) => feet,
             None => self.project_individually(&centre, correspondences),
         };
-        self.reporter
-            .report_x4(correspondences, &FinalProjectionX4 { centre, projections: feet, row: self.scaling.four_rows(&centre, &feet.normal) })
+        self.reporter.report_x4(
+            correspondences,
+            &FinalProjectionX4 { centre, projections: feet, row: self.scaling.four_rows(&centre, &feet.normal) },
+        )
     }
 
     /// Returns the projections of four points, each searched on its own.

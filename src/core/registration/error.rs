@@ -18,14 +18,14 @@ pub enum RegistrationError {
     )]
     ProbeRadius { radius_mm: f64, limit_mm: f64 },
     #[error(
-        "there are {points} measured points; at least {least} are required, one more than the pose has free \
+        "there are {points} measured points; at least {min_points} are required, one more than the pose has free \
          directions; measure more, or lock the directions that the fixture holds"
     )]
     TooFewPoints { points: usize, min_points: usize },
     #[error(
         "the measured points lie on or near one line: {width_mm:.3} mm wide, with {distance_mm:.3} mm from point to \
          point; they do not determine the rotation of the part about that line, nor its position across it; measure \
-         a strip at least {least_mm:.3} mm wide, or give a start pose and lock {} and {}",
+         a strip at least {min_width_mm:.3} mm wide, or give a start pose and lock {} and {}",
         to_lock[0].name(), to_lock[1].name()
     )]
     Narrow { width_mm: f64, distance_mm: f64, min_width_mm: f64, to_lock: [Coordinate; 2] },

@@ -6,12 +6,12 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{PointTree, Point};
+use crate::geometry::{Point, PointTree};
 
-use super::deviation::{StatusCounts, Deviation, PointStatus};
+use super::deviation::{Deviation, PointStatus, StatusCounts};
+use super::quality::RegistrationQuality;
 use super::refit::MIN_SIGMA_MM;
 use super::robust_loss::robust_median_and_sigma;
-use super::quality::RegistrationQuality;
 
 /// Number of neighbours to compare with, and number of nearest points whose median distance is the scale.
 const NEIGHBOURS: usize = 8;
@@ -30,7 +30,11 @@ const MIN_SURFACE_HEIGHT_SHARE: f64 = 0.25;
 
 /// Marks the outliers that are not isolated as used, and adds them to the number of points used, the objective, RMS and
 /// PV.
-pub(super) fn count_confirmed_outliers(deviations: &mut [Deviation], verdict: &mut RegistrationQuality, outlier_sigmas: f64) {
+pub(super) fn count_confirmed_outliers(
+    deviations: &mut [Deviation],
+    verdict: &mut RegistrationQuality,
+    outlier_sigmas: f64,
+) {
     if StatusCounts::count(deviations).outliers == 0 {
         return;
     }
@@ -59,7 +63,8 @@ pub(super) fn count_contradicted(deviations: &[Deviation]) -> usize {
     let around = NeighbourIndex::new(deviations, 0.0);
     let is_left = |k: &usize| !deviations[around.indices[*k]].in_fit;
     let among_others = |&k: &usize| {
-        let near = around.tree.nearest(&around.projections[k], SCALE_NEIGHBOURS).filter(|(n, _)| *n != k).take(NEIGHBOURS);
+        let near =
+            around.tree.nearest(&around.projections[k], SCALE_NEIGHBOURS).filter(|(n, _)| *n != k).take(NEIGHBOURS);
         let (near, left) = near.fold((0, 0), |(near, left), (n, _)| (near + 1, left + usize::from(is_left(&n))));
         2 * left < near
     };
@@ -88,7 +93,14 @@ impl NeighbourIndex {
             of.iter().map(|&k| deviations[k].point - deviations[k].normal * deviations[k].deviation_mm).collect();
         let (surface_mm, sigma_mm) = robust_median_and_sigma(heights_mm.iter().copied());
         let least_mm = 0.5 * outlier_sigmas * sigma_mm.max(MIN_SIGMA_MM);
-        Self { tree: PointTree::new(feet.iter().copied()), heights_mm, indices: of, projections: feet, median_height_mm: surface_mm, half_limit_mm: least_mm }
+        Self {
+            tree: PointTree::new(feet.iter().copied()),
+            heights_mm,
+            indices: of,
+            projections: feet,
+            median_height_mm: surface_mm,
+            half_limit_mm: least_mm,
+        }
     }
 
     /// Returns true if no neighbour deviates as this point does, relative to the level around the point.
@@ -115,7 +127,8 @@ impl NeighbourIndex {
         };
         let agrees = |(n, apart): &(usize, f64)| {
             *apart <= MAX_NEIGHBOUR_DISTANCE * apart_mm
-                && (is_same(*n, level_mm, MIN_HEIGHT_SHARE) || is_same(*n, self.median_height_mm, MIN_SURFACE_HEIGHT_SHARE))
+                && (is_same(*n, level_mm, MIN_HEIGHT_SHARE)
+                    || is_same(*n, self.median_height_mm, MIN_SURFACE_HEIGHT_SHARE))
         };
         (self.heights_mm[own] - level_mm).abs() > self.half_limit_mm && !others.iter().any(agrees)
     }

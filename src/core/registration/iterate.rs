@@ -165,7 +165,8 @@ impl Problem<'_> {
 
     /// Returns true if a step is not worth a trial. The first step of a registration is tried if it moves anything.
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
-        let little = !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
+        let little =
+            !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
         step.length < MIN_STEP || sums.objective_mm2 == 0.0 || little
     }
 

@@ -202,7 +202,13 @@ mod tests {
             iterations: 1,
             converged: true,
         };
-        Registration { cmm_from_model: Pose::identity(), deviations, trace: Vec::new(), side: Side::Normal, quality: verdict }
+        Registration {
+            cmm_from_model: Pose::identity(),
+            deviations,
+            trace: Vec::new(),
+            side: Side::Normal,
+            quality: verdict,
+        }
     }
 
     #[test]

@@ -14,17 +14,18 @@
 //! measured points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and
 //! radians.
 
-mod isolated_touches;
 mod correspond;
+mod degenerate;
 mod deviation;
-mod plausibility;
 mod error;
+mod isolated_touches;
 mod iterate;
 mod lateral;
 mod linearize;
-mod degenerate;
 mod options;
 mod part;
+mod plausibility;
+mod quality;
 mod radius;
 mod refit;
 mod result;
@@ -32,7 +33,6 @@ mod robust_loss;
 mod sampling_directions;
 mod solve;
 mod start;
-mod quality;
 
 use rayon::prelude::*;
 
@@ -47,13 +47,13 @@ use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, map_obstacle};
 pub use options::{Coordinate, Method, Options, ProbeSide, Start};
 use part::Part;
+pub use quality::{RegistrationQuality, WeakDirection};
 pub(crate) use refit::MIN_SIGMA_MM;
 use refit::trim_and_refit;
-pub use result::{Registration, FiguresWithOutliers};
+pub use result::{FiguresWithOutliers, Registration};
 pub use robust_loss::Loss;
 pub(crate) use robust_loss::robust_median_and_sigma;
-use start::{InitialPose, free_rms, initial_pose, detect_mirror_image, mirrored_rms};
-pub use quality::{RegistrationQuality, WeakDirection};
+use start::{InitialPose, detect_mirror_image, free_rms, initial_pose, mirrored_rms};
 
 /// Registers measured points to a nominal surface and returns the pose, the deviations and the verdict.
 ///
@@ -96,7 +96,12 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
 /// Replaces an error by [`RegistrationError::Mirrored`] if a mirrored cloud is the cause.
 ///
 /// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
-fn explain_by_mirror_image(part: &Part, measured: &[Point], options: &Options, error: RegistrationError) -> RegistrationError {
+fn explain_by_mirror_image(
+    part: &Part,
+    measured: &[Point],
+    options: &Options,
+    error: RegistrationError,
+) -> RegistrationError {
     use RegistrationError::{NotConverged, TooFewUsed, Undetermined, WrongSide};
     if !matches!(error, TooFewUsed { .. } | NotConverged { .. } | WrongSide { .. } | Undetermined) {
         return error;
@@ -156,7 +161,12 @@ fn with_final_state(mut trace: Vec<Iteration>, verdict: &RegistrationQuality, op
 ///
 /// # Errors
 /// A strip that is too narrow, a mirror image, or an rms above the limit.
-fn check_fit(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+fn check_fit(
+    part: &Part,
+    found: &Registration,
+    measured: &[Point],
+    options: &Options,
+) -> Result<(), RegistrationError> {
     degenerate::check_strip(&found.deviations, options)?;
     let rms_mm = found.quality.rms_mm;
     let limit_mm = part.rms_limit_mm(options);

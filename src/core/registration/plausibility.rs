@@ -2,13 +2,13 @@
 
 use crate::geometry::Point;
 
+use super::deviation::{Deviation, PointStatus, StatusCounts};
 use super::isolated_touches::count_contradicted;
-use super::deviation::{StatusCounts, Deviation, PointStatus};
 use super::options::{Method, Options, Start};
 use super::part::Part;
-use super::result::{Registration, FiguresWithOutliers};
-use super::start::sample_evenly;
 use super::quality::format_length;
+use super::result::{FiguresWithOutliers, Registration};
+use super::start::sample_evenly;
 
 /// Largest share of the rms that another radius leaves, if the given radius is doubted. On a free-form surface of 64 mm
 /// radius, half the radius leaves a quarter in addition to the form error of a ground part. Double the radius leaves
@@ -42,7 +42,12 @@ const MAX_OFF_PART_SHARE: f64 = 0.2;
 const MIN_COVERAGE: f64 = 0.5;
 
 /// Returns warnings about the points, the nominal surface and the probe radius.
-pub(super) fn plausibility_warnings(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Vec<String> {
+pub(super) fn plausibility_warnings(
+    part: &Part,
+    found: &Registration,
+    measured: &[Point],
+    options: &Options,
+) -> Vec<String> {
     let mut doubts = point_warnings(found);
     doubts.extend(nominal_noise_warning(part, found));
     doubts.extend(radius_warning(part, found, measured, options));
@@ -177,7 +182,12 @@ fn outlier_warning(found: &Registration) -> Option<String> {
 }
 
 /// Describes another probe radius that fits the points much better, if there is one.
-pub(super) fn radius_warning(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Option<String> {
+pub(super) fn radius_warning(
+    part: &Part,
+    found: &Registration,
+    measured: &[Point],
+    options: &Options,
+) -> Option<String> {
     let given_mm = options.probe_radius_mm;
     if !is_radius_testable(part, found, options) {
         return None;
@@ -214,7 +224,13 @@ pub(super) fn radius_warning(part: &Part, found: &Registration, measured: &[Poin
 
 /// Registers a sample of the points with another radius, in mm. A negative radius is a ball on the other side of the
 /// surface. Zero means contact points.
-fn refit_with_radius(part: &Part, found: &Registration, sample: &[Point], given: &Options, radius_mm: f64) -> Option<Registration> {
+fn refit_with_radius(
+    part: &Part,
+    found: &Registration,
+    sample: &[Point],
+    given: &Options,
+    radius_mm: f64,
+) -> Option<Registration> {
     let is_ball = radius_mm.abs() >= MIN_BALL_RADIUS_MM;
     let options = Options {
         probe_radius_mm: if is_ball { radius_mm.abs() } else { 0.0 },
@@ -240,7 +256,8 @@ fn is_radius_testable(part: &Part, found: &Registration, options: &Options) -> b
     const MARGIN: f64 = 1.15;
     let (given_mm, rms_mm) = (options.probe_radius_mm, found.quality.rms_mm);
     // With a locked coordinate, a wrong position of the fixture would look like a wrong radius.
-    let is_ball = options.method != Method::Contact && given_mm >= MIN_BALL_RADIUS_MM && !options.locked.contains(&true);
+    let is_ball =
+        options.method != Method::Contact && given_mm >= MIN_BALL_RADIUS_MM && !options.locked.contains(&true);
     if !is_ball || found.quality.inliers < 7 + MIN_DEGREES_OF_FREEDOM || rms_mm < MIN_RMS_PER_SIZE * part.size_mm {
         return false;
     }

@@ -75,7 +75,8 @@ pub(crate) fn assess_quality(
     initial: &InitialPose,
     iterations: usize,
 ) -> RegistrationQuality {
-    let DistanceSummary { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = DistanceSummary::summarize(correspondences);
+    let DistanceSummary { used: n, squares_mm2: objective_mm2, low_mm, high_mm } =
+        DistanceSummary::summarize(correspondences);
     let free = free_projector(&problem.locked, &descent.scaling);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
@@ -85,8 +86,14 @@ pub(crate) fn assess_quality(
     let to_twist = descent.scaling.to_twist();
     let locked = problem.locked.iter().filter(|l| **l).count();
     let held = spectrum.directions.columns(rank, 6 - rank).into_owned();
-    let mut weak_directions = undetermined_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.scaling);
-    weak_directions.extend(uncertain_directions(&scaled, residual2.sqrt(), &descent.scaling, !weak_directions.is_empty()));
+    let mut weak_directions =
+        undetermined_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.scaling);
+    weak_directions.extend(uncertain_directions(
+        &scaled,
+        residual2.sqrt(),
+        &descent.scaling,
+        !weak_directions.is_empty(),
+    ));
     // If a direction is undetermined, the surface fits in any pose along it. That is reported already.
     let all_seen = rank + locked >= 6;
     let alternatives: Vec<(Pose, f64)> =
@@ -273,7 +280,12 @@ fn direction_name(v: &Vector) -> String {
 
 /// Describes the shifts and rotations that are less certain than a single point: along and about the model's axes, at
 /// the centroid of the cloud. Returns nothing if a direction is undetermined.
-fn uncertain_directions(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_held: bool) -> Vec<WeakDirection> {
+fn uncertain_directions(
+    scaled: &Matrix6<f64>,
+    sigma_mm: f64,
+    scaling: &Scaling,
+    some_held: bool,
+) -> Vec<WeakDirection> {
     let at_rim: [f64; 6] = std::array::from_fn(|k| scaled[(k, k)].sqrt() * scaling.size_mm);
     let weak = |k: &usize| at_rim[*k] > sigma_mm && !some_held;
     let mut found = Vec::new();

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{PointTree, Point, Pose};
+use crate::geometry::{Point, PointTree, Pose};
 
 use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
@@ -173,7 +173,12 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
 ///
 /// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
 /// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.
-fn select_fit_points(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
+fn select_fit_points(
+    problem: &Problem,
+    options: &Options,
+    correspondences: &mut [Correspondence],
+    both_ways: bool,
+) -> usize {
     let (median, sigma) = robust_distance_sigma(correspondences);
     let limit = options.outlier_sigmas * sigma;
     let far = |t: &Correspondence| (t.distance_mm - median).abs() > limit;
@@ -202,7 +207,12 @@ fn select_fit_points(problem: &Problem, options: &Options, correspondences: &mut
 ///
 /// Neighbours nearer than half the mean spacing are twins: repeats of the same place with the same fault. They are left
 /// out. A suspect with only twins around it is isolated.
-fn isolated_flags(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
+fn isolated_flags(
+    measured: &[Point],
+    correspondences: &[Correspondence],
+    suspects: &[usize],
+    limit_mm: f64,
+) -> Vec<bool> {
     const NEIGHBOURS: usize = 8;
     const SEARCHED: u32 = 64;
     let tree = PointTree::new(measured.iter().copied());

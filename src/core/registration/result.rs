@@ -3,7 +3,7 @@
 use crate::geometry::Pose;
 use crate::surface::Side;
 
-use super::deviation::{StatusCounts, Deviation, PointStatus};
+use super::deviation::{Deviation, PointStatus, StatusCounts};
 use super::iterate::Iteration;
 use super::quality::RegistrationQuality;
 
@@ -59,6 +59,11 @@ impl Registration {
         let add =
             |(low, high, squares, n): (f64, f64, f64, usize), d: f64| (low.min(d), high.max(d), squares + d * d, n + 1);
         let (low, high, squares, n) = on_part.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
-        Some(FiguresWithOutliers { outliers: points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, description: places })
+        Some(FiguresWithOutliers {
+            outliers: points,
+            rms_mm: (squares / n as f64).sqrt(),
+            pv_mm: high - low,
+            description: places,
+        })
     }
 }

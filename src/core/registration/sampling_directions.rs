@@ -8,7 +8,7 @@
 use super::correspond::Correspondence;
 use super::iterate::{Descent, Problem, free_projector};
 use super::solve::Spectrum;
-use crate::surface::{OffsetSurface, FacetIndex};
+use crate::surface::{FacetIndex, OffsetSurface};
 
 /// Share of the singular value above which a direction is not examined.
 const MAX_DOUBTFUL_SHARE: f64 = 1e-4;
@@ -28,7 +28,9 @@ pub(super) fn sampling_share(problem: &Problem, descent: &Descent, correspondenc
     }
     let half = problem.surface.nominal().coarsened()?;
     let surface = &problem.surface;
-    let coarse = OffsetSurface::new(&half, surface.radius_mm(), surface.side()).ok()?.with_distance_model(surface.distance_model());
+    let coarse = OffsetSurface::new(&half, surface.radius_mm(), surface.side())
+        .ok()?
+        .with_distance_model(surface.distance_model());
     let model_from_cmm = descent.cmm_from_model.inverse();
     let used: Vec<usize> = (0..correspondences.len()).filter(|&k| correspondences[k].in_fit).collect();
     let rows: Vec<[[f64; 6]; 2]> = used

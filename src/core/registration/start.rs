@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
-use crate::surface::{CurvatureFeature, OffsetSurface, FacetIndex, Side, fit_features, principal_axes};
+use crate::surface::{CurvatureFeature, FacetIndex, OffsetSurface, Side, fit_features, principal_axes};
 
 use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
@@ -147,7 +147,14 @@ struct Search<'a> {
 impl<'a> Search<'a> {
     fn new(part: &'a Part, measured: &'a [Point], options: &'a Options) -> Self {
         let sample = |count| sample_evenly(measured, count).copied().collect();
-        Self { part, options, measured, few: sample(SCORE_POINTS), some: sample(REFINE_POINTS), many: sample(COMPARE_POINTS) }
+        Self {
+            part,
+            options,
+            measured,
+            few: sample(SCORE_POINTS),
+            some: sample(REFINE_POINTS),
+            many: sample(COMPARE_POINTS),
+        }
     }
 
     /// Keeps a given pose and determines the side on which the points fit.
@@ -171,7 +178,10 @@ impl<'a> Search<'a> {
     fn nearer_side(&self, pose: &Pose) -> Side {
         let nominal = OffsetSurface::new(self.part.nominal, 0.0, Side::Normal).expect("0 is a radius");
         let inverse = pose.inverse();
-        let above = self.many.iter().filter(|p| nominal.project(&inverse.transform_point(p), FacetIndex::UNKNOWN).distance_mm >= 0.0);
+        let above = self
+            .many
+            .iter()
+            .filter(|p| nominal.project(&inverse.transform_point(p), FacetIndex::UNKNOWN).distance_mm >= 0.0);
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
@@ -211,7 +221,8 @@ impl<'a> Search<'a> {
         let told = |better: &Candidate, worse: &Candidate| {
             // The distance of the points beyond the edge says nothing about the side.
             let is_nearer = better.on_part_rms_mm * MIN_SIDE_RATIO < worse.on_part_rms_mm;
-            self.part.offset_mm == 0.0 || is_nearer && better.off_part_share <= worse.off_part_share + MAX_OFF_PART_EXCESS
+            self.part.offset_mm == 0.0
+                || is_nearer && better.off_part_share <= worse.off_part_share + MAX_OFF_PART_EXCESS
         };
         match self.options.side.side() {
             None if self.part.offset_mm > 0.0 && told(&opposite, &normal) => Ok((Side::Opposite, opposite, true)),
@@ -281,7 +292,9 @@ impl<'a> Search<'a> {
     fn pose_distance(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inverse() * *b;
         let centre = self.few.iter().map(|p| p.coords).sum::<Vector>() / self.few.len() as f64;
-        let shift = (a.inverse().transform_point(&Point::from(centre)) - b.inverse().transform_point(&Point::from(centre))).norm();
+        let shift = (a.inverse().transform_point(&Point::from(centre))
+            - b.inverse().transform_point(&Point::from(centre)))
+        .norm();
         between.angle_rad() + shift / self.part.size_mm
     }
 
@@ -389,18 +402,25 @@ impl<'a> Search<'a> {
         let as_filed = rayon::join(|| refined(Vector::zeros()), || refined(centred));
         let as_filed = [as_filed.0, as_filed.1].into_iter().flatten().collect::<Vec<_>>();
         let fits_as_well = |c: &&Candidate| {
-            c.side == best.side && c.rms_mm <= MAX_RMS_RATIO * best.rms_mm + MIN_DIFFERENCE_MM && c.off_part_share <= best.off_part_share
+            c.side == best.side
+                && c.rms_mm <= MAX_RMS_RATIO * best.rms_mm + MIN_DIFFERENCE_MM
+                && c.off_part_share <= best.off_part_share
         };
         let turn = |c: &Candidate| c.cmm_from_model.angle_rad();
         let least = as_filed.iter().chain(all).filter(fits_as_well).min_by(|a, b| turn(a).total_cmp(&turn(b)));
-        least.filter(|c| self.pose_distance(&c.cmm_from_model, &best.cmm_from_model) > MAX_POSE_DISTANCE).copied().unwrap_or(best)
+        least
+            .filter(|c| self.pose_distance(&c.cmm_from_model, &best.cmm_from_model) > MAX_POSE_DISTANCE)
+            .copied()
+            .unwrap_or(best)
     }
 
     /// Returns other poses that fit nearly as well as the best.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
-                c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side && c.off_part_share <= best.off_part_share + 0.02
+                c.rms_mm < 1.5 * best.rms_mm + 1e-6
+                    && c.side == best.side
+                    && c.off_part_share <= best.off_part_share + 0.02
             })
             .filter(|c| self.pose_distance(&c.cmm_from_model, &best.cmm_from_model) > 0.05)
             .copied()
@@ -441,7 +461,8 @@ impl<'a> Search<'a> {
         if on_nominal.len() < MATCHES_PER_FEATURE {
             return Vec::new();
         }
-        let offset: Vec<CurvatureFeature> = on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
+        let offset: Vec<CurvatureFeature> =
+            on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
         let sample: Vec<Point> = sample_evenly(self.measured, 2000).copied().collect();
         let measured = most_anisotropic(fit_features(&sample, None));
         measured.iter().flat_map(|m| [*m, m.flipped()]).flat_map(|m| poses_by_feature(&m, &offset)).collect()

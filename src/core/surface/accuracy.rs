@@ -18,8 +18,8 @@ use super::error::SurfaceError;
 use super::facet::Side;
 use super::nominal::{Nominal, check_grid};
 use super::normals::tangents;
-use super::offset::{DistanceModel, OffsetSurface, FacetIndex};
-use super::plane_projection::{Projector, PlaneProjection, is_line};
+use super::offset::{DistanceModel, FacetIndex, OffsetSurface};
+use super::plane_projection::{PlaneProjection, Projector, is_line};
 
 /// Spacings of the two coarser samplings of a grid, in spacings of the whole grid.
 const GRID_STRIDES: [usize; 2] = [3, 6];
@@ -169,7 +169,11 @@ pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceErro
                 return Err(SurfaceError::NotFinite { index });
             }
             let (factors, kept) = choose_coarse_points(points, projection)?;
-            (points, factors, [subset_errors(points, &kept[0], projection)?, subset_errors(points, &kept[1], projection)?])
+            (
+                points,
+                factors,
+                [subset_errors(points, &kept[0], projection)?, subset_errors(points, &kept[1], projection)?],
+            )
         }
     };
     let count = points.iter().filter(|p| p.x.is_finite()).count();
@@ -185,7 +189,11 @@ pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceErro
     let spacing_mm = fine.spacing_mm / factor;
     let [flat, curved] = [0, 1].map(|kind| {
         let told = extrapolate_errors(&fine, &coarse, kind, [factor, coarsest / factor], spacing_mm);
-        let trust = if is_border && told.reliability == Reliability::Extrapolated { Reliability::TooCoarse } else { told.reliability };
+        let trust = if is_border && told.reliability == Reliability::Extrapolated {
+            Reliability::TooCoarse
+        } else {
+            told.reliability
+        };
         ErrorEstimate { reliability: trust, ..told }
     });
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
@@ -236,7 +244,10 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
 
 /// Chooses the points of the two coarser samplings. Returns their spacings, in spacings of the whole sampling, and the
 /// indices of the points they keep.
-fn choose_coarse_points(points: &[Point], projection: PlaneProjection) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
+fn choose_coarse_points(
+    points: &[Point],
+    projection: PlaneProjection,
+) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
     let on_plane = matches!(projection, PlaneProjection::Auto | PlaneProjection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
         let kept = GRID_STRIDES.map(|stride| {
@@ -288,7 +299,8 @@ fn subset_errors(points: &[Point], kept: &[u32], projection: PlaneProjection) ->
 /// Measures the distances of the withheld points from a coarser sampling.
 fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> WithheldErrors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
-    let (flat, curved) = (surface.with_distance_model(DistanceModel::Triangle), surface.with_distance_model(DistanceModel::Curved));
+    let (flat, curved) =
+        (surface.with_distance_model(DistanceModel::Triangle), surface.with_distance_model(DistanceModel::Curved));
     // Odd, so that the stride does not divide a common number of columns.
     let stride = (points.len() / MAX_MEASURED) | 1;
     let one = |k: usize| {
@@ -314,12 +326,18 @@ fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Wi
 }
 
 /// Extrapolates the errors of two coarser samplings to the whole sampling.
-fn extrapolate_errors(fine: &WithheldErrors, coarse: &WithheldErrors, kind: usize, [factor, step]: [f64; 2], spacing_mm: f64) -> ErrorEstimate {
+fn extrapolate_errors(
+    fine: &WithheldErrors,
+    coarse: &WithheldErrors,
+    kind: usize,
+    [factor, step]: [f64; 2],
+    spacing_mm: f64,
+) -> ErrorEstimate {
     let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| error_figures(&errors.inside, kind));
     let [border_fine, border_coarse] = [fine, coarse].map(|errors| error_figures(&errors.border, kind));
-    let observed_order = observed_order(&inside_fine, &inside_coarse, step);
-    let trust = assess_reliability(observed_order, MIN_PLAUSIBLE_ORDERS[kind], inside_fine.rms_mm, spacing_mm);
-    let order = observed_order.clamp(ORDER_RANGE[0], ORDER_RANGE[1]);
+    let order_inside = observed_order(&inside_fine, &inside_coarse, step);
+    let trust = assess_reliability(order_inside, MIN_PLAUSIBLE_ORDERS[kind], inside_fine.rms_mm, spacing_mm);
+    let order = order_inside.clamp(ORDER_RANGE[0], ORDER_RANGE[1]);
     let scale = |order: f64| if trust == Reliability::Rounding { 1.0 } else { factor.powf(-order) };
     let (inside_scale, border_scale) =
         (scale(order), scale(observed_order(&border_fine, &border_coarse, step).clamp(ORDER_RANGE[0], ORDER_RANGE[1])));
@@ -337,7 +355,7 @@ fn extrapolate_errors(fine: &WithheldErrors, coarse: &WithheldErrors, kind: usiz
         border: border_fine.scaled(border_scale),
         max_error: worst,
         order,
-        observed_order,
+        observed_order: order_inside,
         reliability: trust,
         spacing_mm,
         coarsest_mm: coarse.spacing_mm,

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{PointTree, Point, Vector};
+use crate::geometry::{Point, PointTree, Vector};
 
 use super::facet::Side;
 use super::normals::fit_to_neighbours;
@@ -90,8 +90,11 @@ fn fit_feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Cur
     let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
     let good = |p: &&Point| distance(p) <= 6.0 * median;
     // With the same neighbours the second fit would equal the first.
-    let second =
-        if around.iter().all(|p| good(&p)) { first } else { fit_to_neighbours(at, mean, around.iter().filter(good).copied()) };
+    let second = if around.iter().all(|p| good(&p)) {
+        first
+    } else {
+        fit_to_neighbours(at, mean, around.iter().filter(good).copied())
+    };
     let finite = second.curvatures.iter().all(|k| k.is_finite()) && second.direction.iter().all(|c| c.is_finite());
     finite.then_some(CurvatureFeature {
         point: at,

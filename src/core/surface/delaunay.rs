@@ -6,10 +6,10 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, bounds, find_far_off};
 
-use super::triangulation::{SortedSites, Triangulation};
 use super::error::SurfaceError;
 use super::mesh_topology::BORDER;
 use super::plane_projection::Projector;
+use super::triangulation::{SortedSites, Triangulation};
 
 /// Triangles and, for each corner, the neighbour across the opposite edge.
 pub(crate) struct Triangles {

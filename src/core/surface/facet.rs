@@ -92,7 +92,13 @@ impl<T: Real> Facet<T> {
     #[inline(always)]
     pub(crate) fn new([a, b, c]: [Corner<T>; 3], sign: T) -> Self {
         let turned = cross(&minus(&b.0, &a.0), &minus(&c.0, &a.0));
-        Self { corners: [a.0, b.0, c.0], normals: [a.1, b.1, c.1], area_normal: turned, area_normal_squared: dot(&turned, &turned), sign }
+        Self {
+            corners: [a.0, b.0, c.0],
+            normals: [a.1, b.1, c.1],
+            area_normal: turned,
+            area_normal_squared: dot(&turned, &turned),
+            sign,
+        }
     }
 
     /// Returns the vector from a corner to a point.

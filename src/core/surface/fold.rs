@@ -7,8 +7,8 @@ use crate::geometry::Vector;
 use super::error::SurfaceError;
 use super::facet::{Facets, Vertex, vertices_x4};
 use super::grid_topology::GridTopology;
-use super::offset::{OffsetSurface, FacetIndex};
-use super::patch::{Topology, Patch};
+use super::offset::{FacetIndex, OffsetSurface};
+use super::patch::{Patch, Topology};
 use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
 
 /// Maximum number of facets of a mesh that are checked in addition to the touched ones. It is limited because a mesh

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::grid_recognition::{OrderedGrid, GriddedCloud, NO_POINT};
+use crate::geometry::grid_recognition::{GriddedCloud, NO_POINT, OrderedGrid};
 use crate::geometry::{Point, Vector};
 
 use super::facet::{Facets, Vertex, points_x4};

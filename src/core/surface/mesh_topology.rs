@@ -1,6 +1,6 @@
 //! Triangles in flat arrays: corners, neighbours, and iteration around a vertex.
 
-use crate::geometry::{PointTree, Point, Vector};
+use crate::geometry::{Point, PointTree, Vector};
 
 use super::error::SurfaceError;
 use super::facet::Facets;
@@ -37,7 +37,8 @@ impl MeshTopology {
             return Err(SurfaceError::VertexOutOfRange { vertex, points: points.len() });
         }
         // A doubled triangle also breaks a rule of edges; the error that names it helps more.
-        let neighbours = facet_neighbours(&corners, points).map_err(|error| find_doubled(&corners, points).unwrap_or(error))?;
+        let neighbours =
+            facet_neighbours(&corners, points).map_err(|error| find_doubled(&corners, points).unwrap_or(error))?;
         Self::from_parts(points, corners, neighbours)
     }
 

@@ -5,19 +5,19 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::geometry::grid_recognition::recognise_ordered_grid;
-use crate::geometry::{Aperture, PointTree, Point, Vector, recognise_grid};
+use crate::geometry::{Aperture, Point, PointTree, Vector, recognise_grid};
 
+use super::curvature_feature::{CurvatureFeature, fit_features};
 use super::delaunay;
 use super::error::SurfaceError;
 use super::facet::Vertex;
-use super::curvature_feature::{CurvatureFeature, fit_features};
 use super::grid_topology::{GridTopology, fit_grid_nodes, reorder_to_grid};
 use super::mesh_topology::MeshTopology;
+use super::nominal_noise;
 use super::normals;
 use super::offset::FacetIndex;
-use super::patch::{Topology, Patch};
+use super::patch::{Patch, Topology};
 use super::plane_projection::{PlaneProjection, is_line, principal_axes};
-use super::nominal_noise;
 
 /// Nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
@@ -311,10 +311,12 @@ impl Nominal {
         let (nearest, places) = self.start_facets.get_or_init(|| {
             let share = (TREE_POINTS / self.patches.len()).max(1);
             let of_patch = |(number, patch): (usize, &Patch)| {
-                let place = move |vertex| (*patch.point(vertex), FacetIndex::new(number as u32, patch.facet_at(vertex)));
+                let place =
+                    move |vertex| (*patch.point(vertex), FacetIndex::new(number as u32, patch.facet_at(vertex)));
                 patch.sample(share).map(place).collect::<Vec<_>>()
             };
-            let (points, places): (Vec<Point>, Vec<FacetIndex>) = self.patches.iter().enumerate().flat_map(of_patch).unzip();
+            let (points, places): (Vec<Point>, Vec<FacetIndex>) =
+                self.patches.iter().enumerate().flat_map(of_patch).unzip();
             (PointTree::new(points.into_iter()), places)
         });
         nearest.nearest(p, RETURNED).map(|(k, _)| places[k])

@@ -7,7 +7,7 @@ use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 
 use super::normals::{NEIGHBOURS, ring_around, tangents};
-use super::patch::{Topology, Patch};
+use super::patch::{Patch, Topology};
 use crate::geometry::Point;
 
 /// Number of terms of a cubic in two variables.
@@ -23,7 +23,8 @@ const MAX_GROWTH: f64 = 2.0;
 pub(super) fn noise_sigma_mm(patches: &[Patch]) -> f64 {
     let some = |patch| Patch::sample(patch, (CHECKED_POINTS / patches.len()).max(1)).map(move |vertex| (patch, vertex));
     let vertices: Vec<(&Patch, u32)> = patches.iter().flat_map(some).collect();
-    let left: Vec<[f64; 2]> = vertices.into_par_iter().filter_map(|(patch, vertex)| residual_variances(patch, vertex)).collect();
+    let left: Vec<[f64; 2]> =
+        vertices.into_par_iter().filter_map(|(patch, vertex)| residual_variances(patch, vertex)).collect();
     if left.is_empty() {
         return 0.0;
     }

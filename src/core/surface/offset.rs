@@ -6,7 +6,7 @@ use crate::geometry::{Point, Vector};
 use super::error::SurfaceError;
 use super::facet::{Facet, Facets, Side, offset_corner};
 use super::nominal::Nominal;
-use super::patch::{Topology, Patch};
+use super::patch::{Patch, Topology};
 use super::simd::{dot, minus};
 
 /// Shape of the surface between the corners of a facet.
@@ -90,7 +90,9 @@ pub struct PointProjection {
 impl PointProjection {
     /// Orders feet by their distance beyond an edge, then by the absolute distance of the point.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
-        self.beyond_edge_mm.total_cmp(&other.beyond_edge_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
+        self.beyond_edge_mm
+            .total_cmp(&other.beyond_edge_mm)
+            .then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
     }
 }
 
@@ -180,14 +182,21 @@ impl<'a> OffsetSurface<'a> {
     fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
         let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
-        let best = feet.iter().copied().min_by(PointProjection::by_nearness).expect("a nominal surface has at least one patch");
+        let best = feet
+            .iter()
+            .copied()
+            .min_by(PointProjection::by_nearness)
+            .expect("a nominal surface has at least one patch");
         let is_at_seam = |other: &PointProjection| {
             let apart_mm = (other.distance_mm - best.distance_mm).abs();
             other.facet.patch != best.facet.patch
                 && other.beyond_edge_steps <= MAX_CONTINUATION_STEPS
                 && apart_mm <= MAX_CONTINUATION_STEPS * self.spacing_mm(best.facet)
         };
-        if best.beyond_edge_steps > 0.0 && best.beyond_edge_steps <= MAX_CONTINUATION_STEPS && feet.iter().any(is_at_seam) {
+        if best.beyond_edge_steps > 0.0
+            && best.beyond_edge_steps <= MAX_CONTINUATION_STEPS
+            && feet.iter().any(is_at_seam)
+        {
             return PointProjection { beyond_edge_mm: 0.0, beyond_edge_steps: 0.0, ..best };
         }
         best
@@ -249,7 +258,14 @@ impl<'a> OffsetSurface<'a> {
 
     /// Walks from facet to facet until one holds the foot, then measures the distance there.
     #[inline]
-    fn search_projection<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> PointProjection {
+    fn search_projection<F: Facets>(
+        &self,
+        patch: &Patch,
+        facets: &F,
+        number: u32,
+        p: &Point,
+        start: u32,
+    ) -> PointProjection {
         let mut facet = self.approach(patch, facets, p, start);
         let mut before = u32::MAX;
         for _ in 0..MAX_STEPS {
@@ -295,7 +311,14 @@ impl<'a> OffsetSurface<'a> {
     }
 
     #[inline(always)]
-    fn project_in_facet(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: FacetIndex) -> PointProjection {
+    fn project_in_facet(
+        &self,
+        facet: &Facet<f64>,
+        p: &Point,
+        weights: [f64; 3],
+        inside: bool,
+        place: FacetIndex,
+    ) -> PointProjection {
         let w = facet.vector_from_corner(0, &p.coords.into());
         let (mut beyond_mm, mut beyond_steps) = (0.0, 0.0);
         if !inside {
@@ -305,14 +328,26 @@ impl<'a> OffsetSurface<'a> {
             beyond_steps = beyond_mm / facet.area_normal_squared.sqrt().sqrt();
             if beyond_steps > MAX_CONTINUATION_STEPS {
                 let (distance_mm, normal) = self.tangent_plane_distance(facet, p, &clamped);
-                return PointProjection { facet: place, distance_mm, normal, beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps };
+                return PointProjection {
+                    facet: place,
+                    distance_mm,
+                    normal,
+                    beyond_edge_mm: beyond_mm,
+                    beyond_edge_steps: beyond_steps,
+                };
             }
         }
         let (distance_mm, normal) = match self.distance_model {
             DistanceModel::Triangle => facet.flat_distance(&w),
             DistanceModel::Curved => facet.curved_distance(&w, &weights),
         };
-        PointProjection { facet: place, distance_mm, normal: normal.into(), beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps }
+        PointProjection {
+            facet: place,
+            distance_mm,
+            normal: normal.into(),
+            beyond_edge_mm: beyond_mm,
+            beyond_edge_steps: beyond_steps,
+        }
     }
 
     /// Returns the distance from the tangent plane at a place of the edge, and the normal of that plane.

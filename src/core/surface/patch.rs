@@ -142,7 +142,9 @@ impl Patch {
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.topology {
-            Topology::Mesh(mesh) => pulp::Arch::new().dispatch(NormalFitX4 { patch: self, mesh, vertices: [vertex; LANES] })[0],
+            Topology::Mesh(mesh) => {
+                pulp::Arch::new().dispatch(NormalFitX4 { patch: self, mesh, vertices: [vertex; LANES] })[0]
+            }
             Topology::Grid(_) => unreachable!("a grid has its normals ready"),
         }
     }

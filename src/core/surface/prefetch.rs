@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::geometry::Point;
 
 use super::facet::Facets;
-use super::offset::{OffsetSurface, FacetIndex};
+use super::offset::{FacetIndex, OffsetSurface};
 use super::patch::Topology;
 
 /// Number of points per task.

@@ -6,8 +6,8 @@
 //! lanes. Points that leave the surface, or have a longer way, use the single search. The two agree to rounding.
 
 use super::facet::{Corner, Facet, Facets, offset_corner, vertices_x4};
-use super::offset::{DistanceModel, MIN_INSIDE_WEIGHT, Lookup, OffsetSurface, FacetIndex};
-use super::patch::{Topology, Patch};
+use super::offset::{DistanceModel, FacetIndex, Lookup, MIN_INSIDE_WEIGHT, OffsetSurface};
+use super::patch::{Patch, Topology};
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 
 /// Maximum number of jumps of four points together over a grid; after that the single search is used.
@@ -24,7 +24,9 @@ impl OffsetSurface<'_> {
     /// Returns true if [`OffsetSurface::project_x4`] supports this surface: one patch, and the curved distance at the
     /// foot.
     pub(crate) fn supports_project_x4(&self) -> bool {
-        self.nominal().patches().len() == 1 && self.distance_model() == DistanceModel::Curved && self.lookup() == Lookup::ContainingFacet
+        self.nominal().patches().len() == 1
+            && self.distance_model() == DistanceModel::Curved
+            && self.lookup() == Lookup::ContainingFacet
     }
 
     /// Finds the feet of four points near the given places, and replaces the places by those of the feet.
@@ -53,7 +55,8 @@ impl OffsetSurface<'_> {
             return None;
         }
         Some(std::array::from_fn(|l| {
-            let step = if before[l] == FacetIndex::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
+            let step =
+                if before[l] == FacetIndex::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
             let next = last[l].facet().wrapping_add(step);
             if grid.has_facet(next) { FacetIndex::in_first_patch(next) } else { last[l] }
         }))
@@ -74,7 +77,12 @@ impl OffsetSurface<'_> {
             let w = four.vector_from_corner(0, p);
             let b = four.weights(&w);
             let least = b[0].min(b[1]).min(b[2]);
-            let stays = [least.0[0] >= MIN_INSIDE_WEIGHT, least.0[1] >= MIN_INSIDE_WEIGHT, least.0[2] >= MIN_INSIDE_WEIGHT, least.0[3] >= MIN_INSIDE_WEIGHT];
+            let stays = [
+                least.0[0] >= MIN_INSIDE_WEIGHT,
+                least.0[1] >= MIN_INSIDE_WEIGHT,
+                least.0[2] >= MIN_INSIDE_WEIGHT,
+                least.0[3] >= MIN_INSIDE_WEIGHT,
+            ];
             if stays == [true; LANES] {
                 let (distance_mm, normal) = four.curved_distance(&w, &b);
                 return Some(ProjectionX4 { distance_mm, normal });
@@ -107,7 +115,12 @@ impl OffsetSurface<'_> {
 /// Moves the points that do not stay to the facets that their weights point at. Returns false if one of them has no
 /// next facet.
 #[inline(never)]
-fn jump_to_facets<F: Facets>(facets: &F, places: &mut [FacetIndex; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
+fn jump_to_facets<F: Facets>(
+    facets: &F,
+    places: &mut [FacetIndex; LANES],
+    stays: &[bool; LANES],
+    b: &[F64x4; 3],
+) -> bool {
     for l in (0..LANES).filter(|&l| !stays[l]) {
         match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
             Some(next) => places[l] = FacetIndex::in_first_patch(next),

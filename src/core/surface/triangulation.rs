@@ -137,7 +137,8 @@ impl Triangulation {
 fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32) -> (PartialTriangulation, FreeEdges) {
     if range.len() <= MAX_POINTS_PER_THREAD {
         let fresh = base..base + edges.len() as u32;
-        let mut part = Subdivision { sites, edges, base, free_edges: FreeEdges { freed: Vec::new(), fresh: vec![fresh] } };
+        let mut part =
+            Subdivision { sites, edges, base, free_edges: FreeEdges { freed: Vec::new(), fresh: vec![fresh] } };
         let hull = part.build(range);
         return (hull, part.free_edges);
     }
@@ -242,7 +243,12 @@ impl Subdivision<'_> {
     }
 
     /// Merges two parts that a line separates; the lower part lies before the line. Returns their common hull.
-    fn merge(&mut self, lower: PartialTriangulation, upper: PartialTriangulation, axis: CutAxis) -> PartialTriangulation {
+    fn merge(
+        &mut self,
+        lower: PartialTriangulation,
+        upper: PartialTriangulation,
+        axis: CutAxis,
+    ) -> PartialTriangulation {
         let mut base = self.tangent(lower, upper, axis);
         loop {
             let (right, left) = (self.origin(base), self.destination(base));
@@ -287,7 +293,9 @@ impl Subdivision<'_> {
         // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
             PartialTriangulation::Vertex(_) => None,
-            PartialTriangulation::Hull(e) => Some(self.edge(self.farthest(e, |a, b| self.compare(axis, a, b).is_lt()))[BEFORE]),
+            PartialTriangulation::Hull(e) => {
+                Some(self.edge(self.farthest(e, |a, b| self.compare(axis, a, b).is_lt()))[BEFORE])
+            }
         };
         let mut u = match upper {
             PartialTriangulation::Vertex(_) => None,

@@ -24,7 +24,7 @@ use crate::words::{
     Answer, Armed, Command, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, State,
     Status, digest, hex,
 };
-use regrind_formats::{JsonlAppender, FormatError, ResultFolder, write_atomic};
+use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
 
 /// Measuring machine that prints a line for each hit.
 #[derive(Debug)]

@@ -19,7 +19,7 @@ use super::check::Check;
 use super::control::{AXES, Act, Control, all};
 use super::map::{MapBase, ProgramMap, identity_in};
 use super::number::{push_fixed, rounded};
-use super::read::{Block, Refusal, GcodeWord, block};
+use super::read::{Block, GcodeWord, Refusal, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
 use crate::is_same_file;

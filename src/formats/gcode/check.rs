@@ -162,7 +162,8 @@ impl Machine {
                 if motion == 1 {
                     return Ok(Some(Movement::Straight(from, to)));
                 }
-                self.round((from, to), motion == 3, offsets, number(b'R'), scale).map(|round| Some(Movement::Round(round)))
+                self.round((from, to), motion == 3, offsets, number(b'R'), scale)
+                    .map(|round| Some(Movement::Round(round)))
             }
         }
     }

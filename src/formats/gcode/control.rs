@@ -5,7 +5,7 @@
 
 use super::arc::{Arc, Centre, Plane};
 use super::number::MAX_COORDINATE_MM;
-use super::read::{Block, Refusal, GcodeWord};
+use super::read::{Block, GcodeWord, Refusal};
 use regrind_core::geometry::Point;
 
 pub(super) const INCH_MM: f64 = 25.4;
@@ -247,7 +247,11 @@ impl Control {
     /// valid.
     ///
     /// Returns the word of the first rotary axis, and whether one of the axes can turn now.
-    fn turning<'w>(&mut self, block: &'w Block, asked: &BlockRequests) -> Result<Option<(&'w GcodeWord<'w>, bool)>, Refusal> {
+    fn turning<'w>(
+        &mut self,
+        block: &'w Block,
+        asked: &BlockRequests,
+    ) -> Result<Option<(&'w GcodeWord<'w>, bool)>, Refusal> {
         let mut first = None;
         for word in &block.words {
             let Some(k) = TURNING.iter().position(|letter| *letter == word.letter) else { continue };

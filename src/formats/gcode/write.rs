@@ -8,7 +8,9 @@ use super::dialect::{ArcWords, CentreWords, Dialect, Exactness, LineEnd, NAME, N
 use super::number::{push_decimals, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Arc, ArcSummary, ProgramBlock, Move, Plane, RotaryAxis, PathSummary, ToolPath, RotationAxis};
+use regrind_core::compensation::path::{
+    Arc, ArcSummary, Move, PathSummary, Plane, ProgramBlock, RotaryAxis, RotationAxis, ToolPath,
+};
 
 /// Bytes that are collected before they are written to the file.
 const CHUNK: usize = 1 << 16;
@@ -610,7 +612,8 @@ fn tilt_in_words(rotary: &RotaryAxis, h: &ProgramHeader, s: &PathSummary) -> [St
     let about = if rotary.axis == RotationAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
     let reached = s.head_rotation.map_or(String::new(), |turned| {
-        let [a, b] = [turned.min_tilt_rad, turned.max_tilt_rad].map(|peak| rotary.scale_reading_rad(peak.value).to_degrees());
+        let [a, b] =
+            [turned.min_tilt_rad, turned.max_tilt_rad].map(|peak| rotary.scale_reading_rad(peak.value).to_degrees());
         format!(", {:.4} to {:.4} degrees", a.min(b), a.max(b))
     });
     let of = match rotary.pivot_mm {
@@ -796,7 +799,8 @@ mod tests {
         let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(ProgramBlock::Straight);
         let (there, back) = (arc(false, Point::new(2.0, y_mm, 0.0)), arc(true, Point::new(0.0, y_mm, 2.0)));
         let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(ProgramBlock::Straight);
-        let blocks = straight.into_iter().chain([there]).chain(over).chain([back, ProgramBlock::Straight(Move::RapidZ(5.0))]);
+        let blocks =
+            straight.into_iter().chain([there]).chain(over).chain([back, ProgramBlock::Straight(Move::RapidZ(5.0))]);
         vec![blocks.collect::<Vec<_>>().into_iter()]
     }
 
@@ -883,7 +887,7 @@ mod tests {
             vec![
                 moves
                     .into_iter()
-                    .chain([Move::Feed { to, feed_mm_min }, Move::RapidZ(5.0)])
+                    .chain([Move::Feed { to: at, feed_mm_min }, Move::RapidZ(5.0)])
                     .collect::<Vec<_>>()
                     .into_iter(),
             ]

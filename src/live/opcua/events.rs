@@ -8,7 +8,7 @@ use opcua_types::{
 use regrind_cell::Alarm;
 use regrind_control::{CycleRow, Snapshot};
 
-use crate::cell_status::{RunStatus, CellStatus};
+use crate::cell_status::{CellStatus, RunStatus};
 
 /// Severities of events, from 1 to 1000.
 const OF_INTEREST: u16 = 100;
@@ -213,7 +213,10 @@ mod tests {
         assert!(cycles(&on("a", 3), &on("a", 3)).is_empty());
         assert_eq!(cycles(&on("a", 3), &on("b", 1)), [Variant::UInt32(1)]);
         assert_eq!(cycles(&CellStatus::default(), &on("b", 1)), [Variant::UInt32(1)]);
-        let gone = CellStatus { run_status: RunStatus::ProgramGone { run: "a".into(), machines_within: false }, last_run: None };
+        let gone = CellStatus {
+            run_status: RunStatus::ProgramGone { run: "a".into(), machines_within: false },
+            last_run: None,
+        };
         assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
         // A cycle that was measured again has other results.
         let mut again = on("a", 1);

@@ -18,11 +18,11 @@ use tokio::time::{sleep, timeout};
 
 use self::events::events_between;
 use self::nodes::{CellNodes, CellNodesBuilder, Namespaces};
+use crate::cell_status::{CellStatus, RunStatus};
 use crate::error::LiveError;
 use crate::publisher_event::EventSender;
-use crate::settings::OpcUaSettings;
-use crate::cell_status::{RunStatus, CellStatus};
 use crate::publisher_lock::PublisherLock;
+use crate::settings::OpcUaSettings;
 
 /// Time between two attempts to bind the port.
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);

@@ -28,10 +28,10 @@ use opcua_types::{
 use regrind_cell::StateName;
 
 use super::events::{ALL, KINDS};
+use crate::cell_status::{CellStatus, RunStatus};
 use crate::figures::{FIGURES, Figure, FigureKind, FigureValue};
-use crate::publisher_event::EventSender;
 use crate::packml::state_number;
-use crate::cell_status::{RunStatus, CellStatus};
+use crate::publisher_event::EventSender;
 
 const PACKML: &str = "http://opcfoundation.org/UA/PackML/";
 const OWN: &str = "urn:regrind:live";

@@ -22,12 +22,12 @@ use tokio::time::{Instant, sleep_until, timeout};
 
 use self::link::BrokerOptions;
 use self::message::Values;
+use crate::cell_status::CellStatus;
 use crate::error::LiveError;
 use crate::figures::FIGURES;
 use crate::publisher_event::EventSender;
-use crate::settings::SparkplugSettings;
-use crate::cell_status::CellStatus;
 use crate::publisher_lock::{BdSeqCounter, PublisherLock};
+use crate::settings::SparkplugSettings;
 
 /// Limits of the time between two attempts to connect to the broker.
 const SHORTEST_WAIT: Duration = Duration::from_millis(500);
@@ -96,7 +96,13 @@ impl Node {
             validate_name(name).map_err(|_| LiveError::Topic { of, name: name.to_owned() })?;
         }
         let way = BrokerOptions::new(settings, &format!("regrind-{}-{cell}", settings.group))?;
-        Ok(Self { broker: way, bd_seq: BdSeqCounter::open(turn)?, topics: Topics::new(&settings.group, cell), status: told, notes })
+        Ok(Self {
+            broker: way,
+            bd_seq: BdSeqCounter::open(turn)?,
+            topics: Topics::new(&settings.group, cell),
+            status: told,
+            notes,
+        })
     }
 
     /// Publishes the state of the cell until its source closes, whether or not the broker can be reached.

@@ -11,7 +11,7 @@ use super::super::ToSql;
 use super::super::error::PlantError;
 use super::super::link::Link;
 use super::rank::{ENOUGH, holm, rank_sum};
-use super::selection::{SelectionQuery, Selection, mark};
+use super::selection::{Selection, SelectionQuery, mark};
 use super::words::{encoded, interval, share, shown, um};
 use super::{Made, Shared, Unmade, page};
 

@@ -11,7 +11,7 @@ use regrind_report::{DfqPart, dfq_of_parts};
 use super::super::{Row, ToSql};
 use super::control_chart::Value;
 use super::run::file;
-use super::selection::{SelectionQuery, Selection};
+use super::selection::{Selection, SelectionQuery};
 use super::trend::parts;
 use super::{PlantPage, Shared, Unmade, unmade, within};
 

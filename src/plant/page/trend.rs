@@ -9,7 +9,7 @@ use regrind_page::Session;
 use super::super::error::PlantError;
 use super::super::link::Link;
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
-use super::selection::{ALL_KINDS, SelectionQuery, Selection, mark};
+use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
 use super::words::{shown, um};
 use super::{Made, Shared, Unmade, page};
 

@@ -96,7 +96,7 @@ impl Cell {
             let lines = if kills < KILLS_A_PART * 20 { chance.random_range(1..120) } else { usize::MAX };
             let code = follow(&mut running, &|| self.open_run(&left), lines);
             kills += usize::from(code.is_none());
-            let told = running.told.clone();
+            let told = running.error_text.clone();
             running = match self.open_run(&left) {
                 // The program was killed before any request to a machine.
                 Some(run) if told.contains("begin a new run") => {

@@ -71,9 +71,9 @@ fn parts_are_made_in_the_order_in_which_they_are_due() {
         std::io::Write::write_all(&mut at_cell.keys(), format!("{typed}\n").as_bytes()).unwrap();
         let (code, told) = at_cell.end();
         assert!(
-            code == ends && at_cell.said.iter().any(|line| line.contains(does)),
+            code == ends && at_cell.output_lines.iter().any(|line| line.contains(does)),
             "{typed}: {told} {:?}",
-            at_cell.said
+            at_cell.output_lines
         );
     }
     plant.does(&["plant", "unqueue", "2", "--why", "broken", "--plant", "planner.toml"]);

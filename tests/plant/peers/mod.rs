@@ -79,7 +79,7 @@ impl Peer {
 
     /// Returns the number of messages so far: a position from which to search later.
     pub fn place(&mut self) -> usize {
-        self.running.has_said()
+        self.running.line_count()
     }
 
     /// Waits until the messages from a position on satisfy a condition.
@@ -89,8 +89,8 @@ impl Peer {
 
     /// Returns all messages of the peer.
     pub fn said(&mut self) -> Vec<Value> {
-        self.running.has_said();
-        parsed(&self.running.said)
+        self.running.line_count();
+        parsed(&self.running.output_lines)
     }
 }
 

@@ -1,7 +1,7 @@
 //! Columns of the fit: effects on the deviations of a unit of each parameter, of each motion and of the machine's
 //! slides.
 
-use super::{SurfacePoint, ParameterKind, WheelTerm};
+use super::{ParameterKind, SurfacePoint, WheelTerm};
 use crate::geometry::bounds;
 
 /// Minimum share of a column that remains without those before it; a column with less is a combination of them.
@@ -71,7 +71,8 @@ pub(super) fn motions(contacts: &[SurfacePoint], free: [bool; 6]) -> Vec<Column<
 /// Returns the effects of slides that are not straight, guided in z: the second and the third Legendre polynomial
 /// along either axis.
 pub(super) fn slides(contacts: &[SurfacePoint], extent: &Extent) -> Vec<Column<&'static str>> {
-    let of = |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
+    let of =
+        |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
     (0..SLIDES.len()).map(of).collect()
 }
 

@@ -4,7 +4,7 @@ use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 
 use super::columns::{Extent, motion_effect, slide_effect};
-use super::{SurfacePoint, ColumnFit, MIN_NZ, ParameterKind, ParameterOptions, WheelTerm, estimate_parameters};
+use super::{ColumnFit, MIN_NZ, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm, estimate_parameters};
 use crate::compensation::path::{HeightField, Jet};
 use crate::geometry::{Grid, Point, Vector};
 
@@ -22,12 +22,17 @@ pub struct ExplainedDeviation {
 }
 
 impl ExplainedDeviation {
-    pub(super) fn new(contacts: &[SurfacePoint], extent: &Extent, options: &ParameterOptions, fitted: &ColumnFit) -> Self {
+    pub(super) fn new(
+        contacts: &[SurfacePoint],
+        extent: &Extent,
+        options: &ParameterOptions,
+        fitted: &ColumnFit,
+    ) -> Self {
         let believed = fitted.joint_expectation(options);
         let (slides, parameters) = believed.as_slice().split_at(fitted.slides);
         let none = AbsorbedMotion([0.0; 6]);
-        let (slides, parameters) = (slides.to_vec(), estimate_parameters.to_vec());
-        let whole = Self { extent: *extent, term: options.wheel_term, slides, estimate_parameters, motion: none };
+        let (slides, parameters) = (slides.to_vec(), parameters.to_vec());
+        let whole = Self { extent: *extent, term: options.wheel_term, slides, parameters, motion: none };
         let motion = AbsorbedMotion::fit(contacts, options.free_motions, |c| whole.deviation_with_motion_mm(c));
         Self { motion, ..whole }
     }
@@ -35,7 +40,7 @@ impl ExplainedDeviation {
     fn deviation_with_motion_mm(&self, contact: &SurfacePoint) -> f64 {
         let slides = self.slides.iter().enumerate().map(|(k, value)| value * slide_effect(contact, &self.extent, k));
         let parameters = ParameterKind::ALL.into_iter().zip(&self.parameters);
-        slides.sum::<f64>() + estimate_parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
+        slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
     }
 
     /// Returns the part of the deviation at a contact that parameters and slides explain, after shrinkage and without
@@ -56,7 +61,8 @@ pub fn explained_by_parameters(
     [contacts, nodes]: [&[SurfacePoint]; 2],
     options: &ParameterOptions,
 ) -> Vec<f64> {
-    let on_part = |c: &SurfacePoint| SurfacePoint { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
+    let on_part =
+        |c: &SurfacePoint| SurfacePoint { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
     let told = estimate_parameters(&contacts.iter().map(on_part).collect::<Vec<_>>(), None, options);
     told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.explained.at(node)).collect())
 }

@@ -41,8 +41,8 @@ use thiserror::Error;
 use crate::geometry::{Point, Vector};
 use crate::model::{EffectEstimates, ModelError, Observations, Prior};
 pub use columns::Extent;
-use columns::{OrthonormalBasis, Column, candidates, dot, motions, rms, slides};
-pub use corrections::{ParameterCorrections, ExplainedDeviation, explained_by_parameters};
+use columns::{Column, OrthonormalBasis, candidates, dot, motions, rms, slides};
+pub use corrections::{ExplainedDeviation, ParameterCorrections, explained_by_parameters};
 
 /// Minimum number of points; fewer carry no information on a dozen unknowns.
 const MIN_POINTS: usize = 30;
@@ -215,7 +215,7 @@ pub struct ParameterEstimation {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ParameterError {
-    #[error("{points} points do not separate parameters from form; measure at least {LEAST_POINTS}")]
+    #[error("{points} points do not separate parameters from form; measure at least {MIN_POINTS}")]
     TooFew { points: usize },
     #[error(
         "point {} has a coordinate, normal or deviation that is not finite; do not use this measurement",
@@ -223,7 +223,7 @@ pub enum ParameterError {
     )]
     NotFinite { index: usize },
     #[error(
-        "the normal at point {} has nz = {nz:.4}; it must be at least {LEAST_NZ}, because the wheel comes from above",
+        "the normal at point {} has nz = {nz:.4}; it must be at least {MIN_NZ}, because the wheel comes from above",
         index + 1
     )]
     Normal { index: usize, nz: f64 },
@@ -264,7 +264,9 @@ pub fn estimate_parameters(
     let rms_mm = rms(&unseen.orthogonal_part(&deviations));
     let (told, own_shares) = columns.separability();
     let fitted = columns.fitted(contacts, &told, rms_mm, options)?;
-    let alike = |k: usize| if told[k] && !options.lacks_locked_sigma(k) { Vec::new() } else { columns.inseparable_from(k, options) };
+    let alike = |k: usize| {
+        if told[k] && !options.lacks_locked_sigma(k) { Vec::new() } else { columns.inseparable_from(k, options) }
+    };
     let alike = (0..ParameterKind::COUNT).map(alike).collect();
     let mut found = fitted.parameters(alike, &own_shares, options);
     let left = |but: Option<usize>| {
@@ -283,10 +285,20 @@ pub fn estimate_parameters(
         parameter.message = texts::message(parameter, rest_rms_mm, options);
     }
     let smooth = ExplainedDeviation::new(contacts, &extent, options, &fitted);
-    Ok(ParameterEstimation { estimates: found, rms_mm, residual_rms_mm: rest_rms_mm, residuals_mm: rest_mm, explained: smooth })
+    Ok(ParameterEstimation {
+        estimates: found,
+        rms_mm,
+        residual_rms_mm: rest_rms_mm,
+        residuals_mm: rest_mm,
+        explained: smooth,
+    })
 }
 
-fn check(contacts: &[SurfacePoint], progress: Option<&[f64]>, options: &ParameterOptions) -> Result<(), ParameterError> {
+fn check(
+    contacts: &[SurfacePoint],
+    progress: Option<&[f64]>,
+    options: &ParameterOptions,
+) -> Result<(), ParameterError> {
     let points = contacts.len();
     let radius_mm = options.wheel_radius_mm;
     if !(radius_mm > 0.0 && radius_mm.is_finite()) {
@@ -347,7 +359,10 @@ impl Columns {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
             let before = (0..k).filter(|&j| told[j]).map(|j| &self.candidates[j].values);
-            told.push(own_share(&self.candidates[k].values, &OrthonormalBasis::new(self.nuisance().chain(before))) > MIN_OWN_SHARE);
+            told.push(
+                own_share(&self.candidates[k].values, &OrthonormalBasis::new(self.nuisance().chain(before)))
+                    > MIN_OWN_SHARE,
+            );
         }
         let share = |k: usize| {
             let others = (0..told.len()).filter(|&j| j != k && told[j]).map(|j| &self.candidates[j].values);
@@ -446,7 +461,12 @@ impl Columns {
 
 impl ColumnFit {
     /// Returns the estimate of each parameter, without its message and `removes_rms_mm`.
-    fn parameters(&self, alike: Vec<Vec<String>>, own_shares: &[f64], options: &ParameterOptions) -> Vec<EstimatedParameter> {
+    fn parameters(
+        &self,
+        alike: Vec<Vec<String>>,
+        own_shares: &[f64],
+        options: &ParameterOptions,
+    ) -> Vec<EstimatedParameter> {
         let parameter = |(k, alike): (usize, Vec<String>)| {
             let is_told = alike.is_empty();
             let variance = self.covariance[(self.slides + k, self.slides + k)].max(0.0);
@@ -509,8 +529,8 @@ impl ColumnFit {
             let solved = factor.solve(&told);
             Some((prior.component_mul(&solved), -0.5 * told.dot(&solved) - 0.5 * factor.ln_determinant()))
         };
-        let strengths =
-            (0..PRIOR_STRENGTHS).map(|k| self.rms_mm * MIN_STRENGTH_SHARE.powf(f64::from(k) / f64::from(PRIOR_STRENGTHS - 1)));
+        let strengths = (0..PRIOR_STRENGTHS)
+            .map(|k| self.rms_mm * MIN_STRENGTH_SHARE.powf(f64::from(k) / f64::from(PRIOR_STRENGTHS - 1)));
         let seen: Vec<_> = strengths.filter_map(by).collect();
         let top = seen.iter().map(|(_, likely)| *likely).fold(f64::NEG_INFINITY, f64::max);
         let weight = |likely: f64| (likely - top).exp();

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::columns::dot;
-use super::{COVERAGE_FACTOR, MIN_EFFECT_MM2, EstimatedParameter, ParameterKind, ParameterOptions};
+use super::{COVERAGE_FACTOR, EstimatedParameter, MIN_EFFECT_MM2, ParameterKind, ParameterOptions};
 
 /// Minimum share, relative to the largest, with which another column is named as a cause of an inseparable one.
 const MIN_NAMED_SHARE: f64 = 0.2;
@@ -77,7 +77,12 @@ pub(super) fn inseparable_names(target: &[f64], others: &[(String, &Vec<f64>)]) 
         others.iter().zip(shares.iter()).map(|((name, _), share)| (share.abs(), name)).collect();
     named.sort_by(|a, b| b.0.total_cmp(&a.0));
     let most = named.first().map_or(0.0, |(share, _)| *share);
-    named.into_iter().take(3).filter(|(share, _)| *share > MIN_NAMED_SHARE * most).map(|(_, name)| name.clone()).collect()
+    named
+        .into_iter()
+        .take(3)
+        .filter(|(share, _)| *share > MIN_NAMED_SHARE * most)
+        .map(|(_, name)| name.clone())
+        .collect()
 }
 
 pub(super) fn message(parameter: &EstimatedParameter, rest_rms_mm: f64, options: &ParameterOptions) -> String {

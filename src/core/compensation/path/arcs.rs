@@ -540,7 +540,10 @@ mod tests {
     fn a_planted_circle_is_one_arc_about_its_centre() {
         for y_mm in [0.0, 0.3] {
             let blocks: Vec<ProgramBlock> = ArcBlocks::new(track(quarter(y_mm), 300), &OPTIONS).collect();
-            assert!(matches!(blocks[..2], [ProgramBlock::Straight(Move::RapidZ(9.0)), ProgramBlock::Straight(Move::Feed { .. })]));
+            assert!(matches!(
+                blocks[..2],
+                [ProgramBlock::Straight(Move::RapidZ(9.0)), ProgramBlock::Straight(Move::Feed { .. })]
+            ));
             assert!(matches!(blocks[3..], [ProgramBlock::Straight(Move::RapidZ(10.0))]), "{blocks:?}");
             let ProgramBlock::Arc(arc) = blocks[2] else { panic!("{blocks:?}") };
             // A turn from z towards x is counter-clockwise in the plane of z and x.

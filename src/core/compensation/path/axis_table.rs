@@ -20,7 +20,12 @@ const STEPS: usize = 40;
 ///
 /// # Errors
 /// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.
-pub fn axis_offsets(before: &TargetSurface, after: &TargetSurface, wheel: &Wheel, grid: &Grid) -> Result<Vec<f64>, PathError> {
+pub fn axis_offsets(
+    before: &TargetSurface,
+    after: &TargetSurface,
+    wheel: &Wheel,
+    grid: &Grid,
+) -> Result<Vec<f64>, PathError> {
     let one = |node: usize| {
         let axes = grid.place_mm(node);
         Ok(height_mm(after, wheel, axes)? - height_mm(before, wheel, axes)?)
@@ -111,8 +116,8 @@ mod tests {
                 (0..on.columns * on.rows).map(|k| [if ground(k) > 0.0 { facing } else { 0.0 }, 0.0]).collect();
             let grid = Grid { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
             let corrected = |e: f64| Correction { grid, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0, set: None };
-            let [before, after] =
-                [0.0, 0.004].map(|e| TargetSurface::new(HeightField::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
+            let [before, after] = [0.0, 0.004]
+                .map(|e| TargetSurface::new(HeightField::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
             axis_offsets(&before, &after, &wheel, &grid)
         };
         let found = offsets(-20.0).unwrap();

@@ -94,7 +94,8 @@ impl HeightField {
         }
         let [a, b] = self.per_mm;
         jet.slope = [jet.slope[0] * a, jet.slope[1] * b];
-        jet.second_derivatives = [jet.second_derivatives[0] * a * a, jet.second_derivatives[1] * a * b, jet.second_derivatives[2] * b * b];
+        jet.second_derivatives =
+            [jet.second_derivatives[0] * a * a, jet.second_derivatives[1] * a * b, jet.second_derivatives[2] * b * b];
         jet
     }
 
@@ -318,7 +319,8 @@ mod tests {
         }
         let ([x, y], e) = ([0.25, 5.0], 1e-9);
         for k in 0..3 {
-            let (left, right) = (field.at([x - e, y - e]).second_derivatives[k], field.at([x + e, y + e]).second_derivatives[k]);
+            let (left, right) =
+                (field.at([x - e, y - e]).second_derivatives[k], field.at([x + e, y + e]).second_derivatives[k]);
             assert!((left - right).abs() < 1e-9, "{left} {right}");
         }
         // Away from the border the error is of fourth order in the spacing. At the border the wave has a slope and the

@@ -2,7 +2,7 @@
 
 use super::tilt::{StepDeviation, WheelPosition};
 use super::tracks::Span;
-use super::{TrackPattern, ToolPath};
+use super::{ToolPath, TrackPattern};
 use crate::geometry::Point;
 
 /// Target of a step's deviation, as a share of the chord error. The deviation is evaluated in the middle of a step;
@@ -147,7 +147,8 @@ impl<'a> Moves<'a> {
             let taken = (t - walk.t).abs();
             let at = path.wheel_position(&span, t);
             let middle = path.wheel_position(&span, 0.5 * (walk.t + t));
-            let StepDeviation { sag_mm: sag, chord_mm: chord, slide_sag_mm: bent } = options.step_deviation(&walk.at, &middle, &at);
+            let StepDeviation { sag_mm: sag, chord_mm: chord, slide_sag_mm: bent } =
+                options.step_deviation(&walk.at, &middle, &at);
             let share = sag / (AIM * options.chord_error_mm);
             if share > 1.0 && taken > MIN_STEP_SHARE * longest {
                 step = taken * (0.95 / share.sqrt()).max(0.2);
@@ -160,7 +161,13 @@ impl<'a> Moves<'a> {
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
             // The curvature jumps where a lead meets the span. The middle does not represent a step across that place.
             let over_an_end = [low, high].iter().any(|end| walk.t.min(t) < *end && *end < walk.t.max(t));
-            self.middle = (!over_an_end).then(|| Point::new(middle.programmed_point.x, middle.programmed_point.y, path.flipped_height_mm(middle.programmed_point.z)));
+            self.middle = (!over_an_end).then(|| {
+                Point::new(
+                    middle.programmed_point.x,
+                    middle.programmed_point.y,
+                    path.flipped_height_mm(middle.programmed_point.z),
+                )
+            });
             walk = SpanWalk { t, at, step: next, ..walk };
             return walk;
         }
@@ -172,7 +179,9 @@ impl<'a> Moves<'a> {
         let (at, feed_mm_min) = (stand.programmed_point, self.feed_mm_min());
         match self.path.options().tilt {
             None => Move::Feed { to: at, feed_mm_min },
-            Some(_) => Move::FeedTilted { to: at, tilt_rad: stand.programmed_tilt_rad, feed_mm_min, centre_mm: self.centre_mm },
+            Some(_) => {
+                Move::FeedTilted { to: at, tilt_rad: stand.programmed_tilt_rad, feed_mm_min, centre_mm: self.centre_mm }
+            }
         }
     }
 
@@ -223,7 +232,9 @@ impl Iterator for Moves<'_> {
             }
             State::Above => (State::Ended, Move::RapidZ(safe)),
             State::Over(walk) => (State::Down(walk), self.over(&walk)),
-            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.programmed_point.z + APPROACH_MM).min(safe))),
+            State::Down(walk) => {
+                (State::Begin(walk), Move::RapidZ((walk.at.programmed_point.z + APPROACH_MM).min(safe)))
+            }
             State::Begin(walk) => {
                 (self.curvature_per_mm, self.on_span, self.middle) = (0.0, false, None);
                 self.centre_mm = APPROACH_MM.min(safe - walk.at.programmed_point.z);

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::geometry::{Aperture, Grid, Point, bounds};
-use crate::surface::{Nominal, NominalKind, OffsetSurface, FacetIndex, Side};
+use crate::surface::{FacetIndex, Nominal, NominalKind, OffsetSurface, Side};
 
 use super::PathError;
 use super::height_field::HeightField;
@@ -123,7 +123,12 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<HeightField,
 
 /// Finds the height and the slopes at a place by Newton's method along z. The height is NaN off the part or without
 /// convergence.
-fn height_at(surface: &OffsetSurface, [x, y]: [f64; 2], start_mm: f64, place: &mut FacetIndex) -> Result<HeightAndSlopes, PathError> {
+fn height_at(
+    surface: &OffsetSurface,
+    [x, y]: [f64; 2],
+    start_mm: f64,
+    place: &mut FacetIndex,
+) -> Result<HeightAndSlopes, PathError> {
     let mut z = start_mm;
     for _ in 0..STEPS {
         let foot = surface.project(&Point::new(x, y, z), *place);

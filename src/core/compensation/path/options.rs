@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::wheel::MIN_SPINDLE_ANGLE_SINE;
-use super::{TiltMode, PathError, RotaryAxis, Wheel};
+use super::{PathError, RotaryAxis, TiltMode, Wheel};
 
 /// Pattern of the tracks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

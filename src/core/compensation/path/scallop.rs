@@ -14,9 +14,9 @@
 
 use rayon::prelude::*;
 
+use super::target_surface::{Contact, SurfaceCurvature};
 use super::wheel_fit::{PLACES, on_grid, wheel_curvatures};
-use super::target_surface::{SurfaceCurvature, Contact};
-use super::{TrackPattern, ToolPath, TargetSurface, Wheel};
+use super::{TargetSurface, ToolPath, TrackPattern, Wheel};
 use crate::geometry::{Aperture, Vector};
 
 /// Ratio of the rms of a parabola about its mean to its height: 2 / (3 sqrt 5).
@@ -50,7 +50,8 @@ impl Scallops {
         let height = |place: &[f64; 2]| {
             let bend = wanted.curvature_at(*place);
             let wheel = wheel_at(&bend.contact);
-            let Groove { curvature_per_mm: bend, stretch } = groove(&bend, relative_to_middle(outline, *place), &wheel, pattern);
+            let Groove { curvature_per_mm: bend, stretch } =
+                groove(&bend, relative_to_middle(outline, *place), &wheel, pattern);
             let height = (track_mm * stretch).powi(2) * bend / 8.0;
             if height.is_finite() { height } else { 0.0 }
         };
@@ -158,7 +159,8 @@ mod tests {
         // A quarter of the distance gives a sixteenth of the height.
         let near = scallops_on(&quadric(0.0, 0.0), Wheel::Sphere { radius_mm: 12.5 }, 0.125);
         assert!(
-            (near.height_mm - flat.with_track_mm(0.125).height_mm).abs() < 1e-15 && near.rms_mm == flat.with_track_mm(0.125).rms_mm
+            (near.height_mm - flat.with_track_mm(0.125).height_mm).abs() < 1e-15
+                && near.rms_mm == flat.with_track_mm(0.125).rms_mm
         );
     }
 

@@ -168,10 +168,14 @@ impl PathSummary {
                 Move::FeedTilted { to: at, tilt_rad, feed_mm_min, centre_mm } => {
                     let seconds = 60.0 * centre_mm / feed_mm_min;
                     let by_rad = tilted.replace(tilt_rad).map_or(0.0, |from| tilt_rad - from);
-                    self.head_rotation.iter_mut().for_each(|turned| turned.add_rotation(by_rad, tilt_rad, seconds, &at, feed_mm_min));
+                    self.head_rotation
+                        .iter_mut()
+                        .for_each(|turned| turned.add_rotation(by_rad, tilt_rad, seconds, &at, feed_mm_min));
                     self.add_feed(&mut last, &mut before, &moves, (at, feed_mm_min, Some(centre_mm)));
                 }
-                Move::Feed { to: at, feed_mm_min } => self.add_feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
+                Move::Feed { to: at, feed_mm_min } => {
+                    self.add_feed(&mut last, &mut before, &moves, (at, feed_mm_min, None))
+                }
             }
         }
     }
@@ -223,7 +227,8 @@ impl PathSummary {
     #[inline]
     fn update_jerk(&mut self, before: ChordCurvature, now: ChordCurvature, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
-        let changes = (now.curvature_per_mm - before.curvature_per_mm) / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
+        let changes = (now.curvature_per_mm - before.curvature_per_mm)
+            / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
         let value = speed.powi(3) * changes.hypot(now.curvature_per_mm.max(before.curvature_per_mm).powi(2));
         if value > self.jerk_mm_s3.value {
             self.jerk_mm_s3 = Peak { value, place_mm: [at.x, at.y], feed_mm_min };
@@ -384,7 +389,8 @@ mod tests {
             summary.check(&MachineLimits { speed_mm_s, ..MachineLimits::default() }),
             Err(PathError::Speed { axis: 'X', .. })
         ));
-        let limited = |a: f64| summary.check(&MachineLimits { acceleration_mm_s2: Some(a), ..MachineLimits::default() });
+        let limited =
+            |a: f64| summary.check(&MachineLimits { acceleration_mm_s2: Some(a), ..MachineLimits::default() });
         assert!(limited(25.0).is_ok());
         let Err(PathError::Acceleration { feed_mm_min, .. }) = limited(10.0) else { panic!() };
         assert!((feed_mm_min - 600.0 * (10.0 / value).sqrt()).abs() < 1.0);
@@ -416,8 +422,11 @@ mod tests {
 
     #[test]
     fn a_run_up_takes_what_acceleration_and_jerk_leave() {
-        let limits =
-            |a: Option<f64>, j: Option<f64>| MachineLimits { acceleration_mm_s2: a, jerk_mm_s3: j, ..MachineLimits::default() };
+        let limits = |a: Option<f64>, j: Option<f64>| MachineLimits {
+            acceleration_mm_s2: a,
+            jerk_mm_s3: j,
+            ..MachineLimits::default()
+        };
         // 10 mm/s with 100 mm/s²: 0.1 s, 0.5 mm. With 1000 mm/s³ the acceleration rises for 0.1 s and falls for 0.1 s;
         // its limit is just reached.
         assert!((limits(Some(100.0), None).run_up_mm(600.0) - 0.5).abs() < 1e-12);

@@ -112,7 +112,11 @@ impl TargetSurface {
         let turned = [n_x / length, n_x * a + n_y * b];
         let of = |i: usize, j: usize| -turned[i].dot(&along[j]);
         // In a hollow the normal turns against the step, hence the minus sign in `of`.
-        SurfaceCurvature { contact: Contact { point, normal }, tangents: along, second_form_per_mm: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)] }
+        SurfaceCurvature {
+            contact: Contact { point, normal },
+            tangents: along,
+            second_form_per_mm: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)],
+        }
     }
 
     /// Returns the factor for a tangent-plane step towards the projection of a point at height h above the surface:

@@ -137,7 +137,9 @@ impl PathOptions {
     pub fn tilt_rad(&self, contact: &Contact) -> f64 {
         match (self.tilt, &self.rotary) {
             (Some(TiltMode::Constant { angle_rad }), _) => angle_rad,
-            (Some(TiltMode::Following { lead_rad }), Some(rotary)) => rotary.normal_tilt_rad(&contact.normal) + lead_rad,
+            (Some(TiltMode::Following { lead_rad }), Some(rotary)) => {
+                rotary.normal_tilt_rad(&contact.normal) + lead_rad
+            }
             _ => 0.0,
         }
     }
@@ -186,13 +188,23 @@ impl PathOptions {
         // `at` belongs to the rounded angle, so the rounding of the angle causes no error of the surface.
         let written_rad = rotary.rounded(tilt_rad);
         let at = centre(self.wheel_turned(written_rad))? + rotary.pivot_shift_mm(written_rad);
-        Some(WheelPosition { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, programmed_point: at, programmed_tilt_rad: written_rad })
+        Some(WheelPosition {
+            centre: centre(self.wheel_turned(tilt_rad))?,
+            tilt_rad,
+            programmed_point: at,
+            programmed_tilt_rad: written_rad,
+        })
     }
 
     /// Computes the deviation of a step at its middle. The control moves slides and head in proportion. An error of
     /// the tilt counts as the distance that it moves the points of the ring.
     #[inline]
-    pub(super) fn step_deviation(&self, from: &WheelPosition, middle: &WheelPosition, to: &WheelPosition) -> StepDeviation {
+    pub(super) fn step_deviation(
+        &self,
+        from: &WheelPosition,
+        middle: &WheelPosition,
+        to: &WheelPosition,
+    ) -> StepDeviation {
         let (chord, half) = (to.centre - from.centre, middle.centre - from.centre);
         let length2 = chord.norm_squared();
         let share = if length2 > 0.0 { half.dot(&chord) / length2 } else { 0.0 };
@@ -349,7 +361,11 @@ mod tests {
     fn a_wheel_that_follows_keeps_its_lead() {
         // Along x the normal rotates by -atan(2 a x), and B follows it. Seen along y there is no other rotation.
         let (a, lead) = (0.02f64, 0.5);
-        let follows = tilted_options(head(RotationAxis::Y), TiltMode::Following { lead_rad: lead }, Wheel::Sphere { radius_mm: 8.0 });
+        let follows = tilted_options(
+            head(RotationAxis::Y),
+            TiltMode::Following { lead_rad: lead },
+            Wheel::Sphere { radius_mm: 8.0 },
+        );
         let laid = path(quadric(a, 0.0), follows).unwrap();
         for x in [-7.0, 0.0, 5.0] {
             let contact = laid.target().at([x, 1.0]);
@@ -359,7 +375,9 @@ mod tests {
         }
         assert!((laid.min_head_angle_rad() - lead).abs() < 1e-6);
         let turned = laid.summary().unwrap().head_rotation.unwrap();
-        assert!(turned.min_tilt_rad.value < 0.2 && turned.max_tilt_rad.value > 0.8 && turned.max_rate_rad_s.value > 0.1);
+        assert!(
+            turned.min_tilt_rad.value < 0.2 && turned.max_tilt_rad.value > 0.8 && turned.max_rate_rad_s.value > 0.1
+        );
     }
 
     #[test]
@@ -446,7 +464,10 @@ mod tests {
         let refused = path(quadric(-0.0125, -0.001), cup).unwrap_err();
         let PathError::NeedsTilt { angle_deg, .. } = refused else { panic!("{refused}") };
         let lean = Some(TiltMode::Constant { angle_rad: angle_deg.to_radians() });
-        assert!(angle_deg < 0.0 && path(quadric(-0.0125, -0.001), PathOptions { tilt, ..cup }).is_ok(), "{angle_deg}");
+        assert!(
+            angle_deg < 0.0 && path(quadric(-0.0125, -0.001), PathOptions { tilt: lean, ..cup }).is_ok(),
+            "{angle_deg}"
+        );
     }
 
     #[test]
@@ -464,8 +485,11 @@ mod tests {
             0.5,
         );
         assert!((found.height_mm - 0.25 / 8.0 / 5.0).abs() < 1e-12, "{found:?}");
-        let across =
-            tilted_options(head(RotationAxis::X), lean, Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::x() });
+        let across = tilted_options(
+            head(RotationAxis::X),
+            lean,
+            Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::x() },
+        );
         let laid = path(quadric(0.0, 0.0), across).unwrap();
         // With its spindle along the tracks, the disc has the curvature of its outer circle across the tracks.
         assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 8.0 / 45.0).abs() < 1e-12);

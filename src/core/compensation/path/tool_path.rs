@@ -37,7 +37,8 @@ impl ToolPath {
         options.check()?;
         let grain_mm = wanted.min_node_spacing_mm();
         let tracks = Tracks { spans: Vec::new(), track_mm: f64::NAN };
-        let mut path = Self { target: wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, min_node_spacing_mm: grain_mm };
+        let mut path =
+            Self { target: wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, min_node_spacing_mm: grain_mm };
         match path.lay() {
             Ok(()) => Ok(path),
             Err(refused) => Err(suggest_tilt(refused, &options, |tilted| {
@@ -118,7 +119,12 @@ impl ToolPath {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
         let nowhere = Point::new(f64::NAN, f64::NAN, f64::NAN);
-        let none = WheelPosition { centre: nowhere, tilt_rad: f64::NAN, programmed_point: nowhere, programmed_tilt_rad: f64::NAN };
+        let none = WheelPosition {
+            centre: nowhere,
+            tilt_rad: f64::NAN,
+            programmed_point: nowhere,
+            programmed_tilt_rad: f64::NAN,
+        };
         self.options.wheel_position(&contact, lifted).unwrap_or(none)
     }
 
@@ -127,7 +133,9 @@ impl ToolPath {
     fn clearance_height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
-        self.options.wheel_position(&contact, lifted).map_or(f64::NAN, |stand| self.options.clearance_height_mm(&contact, lifted, &stand))
+        self.options
+            .wheel_position(&contact, lifted)
+            .map_or(f64::NAN, |stand| self.options.clearance_height_mm(&contact, lifted, &stand))
     }
 
     /// Returns the largest height that rapid moves must clear, in mm. The search uses steps of about 1 mm on some of
@@ -180,7 +188,8 @@ mod tests {
             let options = PathOptions { pattern, ..PathOptions::new(wheel, 1.5, 600.0) };
             let above = ToolPath::new(asymmetric_target(1.0), PART, options).unwrap();
             // A hanging part: its lower side is the mirror image of the upper side of the other part.
-            let below = ToolPath::new(asymmetric_target(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
+            let below =
+                ToolPath::new(asymmetric_target(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
             assert_eq!(above.track_count(), below.track_count());
             for (up, down) in above.moves().zip(below.moves()) {
                 let mirrored = match up {

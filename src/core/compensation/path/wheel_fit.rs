@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::options::{PathOptions, TrackSpacing};
-use super::scallop::{relative_to_middle, groove};
+use super::scallop::{groove, relative_to_middle};
 use super::target_surface::SurfaceCurvature;
 use super::{PathError, TargetSurface, Wheel};
 use crate::geometry::{Aperture, Point};
@@ -73,7 +73,12 @@ pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
 
 /// Checks slope, contact and hollows at a place. Returns the distance between tracks over x and y that leaves the
 /// requested scallop height, in mm, or infinity if no scallop height is given.
-fn fit_at(bend: &SurfaceCurvature, place: [f64; 2], outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
+fn fit_at(
+    bend: &SurfaceCurvature,
+    place: [f64; 2],
+    outline: &Aperture,
+    options: &PathOptions,
+) -> Result<f64, PathError> {
     let [x_mm, y_mm] = place;
     let normal = &bend.contact.normal;
     let finite = (bend.second_form_per_mm.iter().sum::<f64>() + bend.contact.point.z).is_finite();

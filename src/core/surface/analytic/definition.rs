@@ -261,7 +261,9 @@ impl SamplingDefinition {
     /// Checks the numbers.
     fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
-            (Some(spacing), None) => Ok(Sampling::Spacing { spacing_mm: error::check_positive("spacing_mm", spacing)? }),
+            (Some(spacing), None) => {
+                Ok(Sampling::Spacing { spacing_mm: error::check_positive("spacing_mm", spacing)? })
+            }
             (None, Some(nm)) if nm > 0.0 && nm <= 1e6 => Ok(Sampling::Accuracy { accuracy_mm: 1e-6 * nm }),
             (None, Some(nm)) => {
                 let limit = "greater than 0 and at most 1e6 nm";
@@ -351,7 +353,11 @@ fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
 }
 
 /// Turns `{ kind = "a", b = 1 }` into `{ a = { b = 1 } }`, every part at its place in the text.
-fn deserialize_by_kind<'t>(text: &str, name: &str, table: Spanned<DeValue<'t>>) -> Result<ValueDeserializer<'t>, DefinitionError> {
+fn deserialize_by_kind<'t>(
+    text: &str,
+    name: &str,
+    table: Spanned<DeValue<'t>>,
+) -> Result<ValueDeserializer<'t>, DefinitionError> {
     let span = table.span();
     let DeValue::Table(mut keys) = table.into_inner() else {
         return Err(toml_error(text, Some(span), &format!("`{name}` must be a table, [{name}]")));
@@ -432,7 +438,9 @@ mod tests {
 
     fn place(error: &DefinitionError) -> (usize, usize) {
         match error {
-            DefinitionError::Toml { line, column, .. } | DefinitionError::Located { line, column, .. } => (*line, *column),
+            DefinitionError::Toml { line, column, .. } | DefinitionError::Located { line, column, .. } => {
+                (*line, *column)
+            }
             other => panic!("{other} has no place"),
         }
     }

@@ -256,7 +256,10 @@ mod tests {
     fn without_coefficients_they_are_their_base_and_at_the_rim_qbfs_is_too() {
         let con =
             QconDefinition { radius_mm: 50.0, conic: -2.0, normalisation_radius_mm: 30.0, coefficients_mm: vec![] };
-        assert_eq!(Qcon::try_from(&con).unwrap().sag_and_derivative(400.0), Conic::new(50.0, -2.0).unwrap().sag_and_derivative(400.0));
+        assert_eq!(
+            Qcon::try_from(&con).unwrap().sag_and_derivative(400.0),
+            Conic::new(50.0, -2.0).unwrap().sag_and_derivative(400.0)
+        );
         let sphere = Conic::new(50.0, 0.0).unwrap();
         let mut bfs = QbfsDefinition { radius_mm: 50.0, normalisation_radius_mm: 30.0, coefficients_mm: vec![] };
         assert_eq!(Qbfs::try_from(&bfs).unwrap().sag_and_derivative(400.0), sphere.sag_and_derivative(400.0));

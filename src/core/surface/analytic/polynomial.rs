@@ -76,7 +76,8 @@ impl TryFrom<&XyPolynomialDefinition> for XyPolynomial {
     type Error = DefinitionError;
 
     fn try_from(written: &XyPolynomialDefinition) -> Result<Self, DefinitionError> {
-        let normalisation_radius_mm = error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?;
+        let normalisation_radius_mm =
+            error::check_positive("normalisation_radius_mm", written.normalisation_radius_mm)?;
         let mut terms = written.terms.clone();
         terms.sort_by_key(|term| (term.0, term.1));
         for (n, &(i, j, coefficient)) in terms.iter().enumerate() {

@@ -133,7 +133,8 @@ impl TryFrom<&BiconicDefinition> for Biconic {
     fn try_from(written: &BiconicDefinition) -> Result<Self, DefinitionError> {
         let cx = error::checked_curvature("radius_x_mm", written.radius_x_mm)?;
         let cy = error::checked_curvature("radius_y_mm", written.radius_y_mm)?;
-        let conics = [error::check_finite("conic_x", written.conic_x)?, error::check_finite("conic_y", written.conic_y)?];
+        let conics =
+            [error::check_finite("conic_x", written.conic_x)?, error::check_finite("conic_y", written.conic_y)?];
         Ok(Self { curvatures_per_mm: [cx, cy], conics })
     }
 }

@@ -132,7 +132,9 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
                         from 1 to 37 in fringe, of a degree up to 100";
         let normalisation = written.normalisation.unwrap_or(written.numbering.normalisation());
         let mut orders: BTreeMap<u32, Vec<[f64; 2]>> = BTreeMap::new();
-        for (index, coefficient) in conic::parse_coefficients("coefficients_mm", 'Z', expected, &written.coefficients_mm)? {
+        for (index, coefficient) in
+            conic::parse_coefficients("coefficients_mm", 'Z', expected, &written.coefficients_mm)?
+        {
             let Some((n, m)) = written.numbering.degree_and_order(index) else {
                 return Err(DefinitionError::Term { key: format!("coefficients_mm.{index}"), expected });
             };

@@ -3,7 +3,7 @@
 use crate::common::points;
 use regrind_core::geometry::Point;
 use regrind_core::surface::accuracy::{Accuracy, NominalPoints, Reliability, estimate_accuracy};
-use regrind_core::surface::{DistanceModel, Nominal, OffsetSurface, FacetIndex, PlaneProjection, Side, SurfaceError};
+use regrind_core::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, PlaneProjection, Side, SurfaceError};
 use regrind_sim::shape::{FreeForm, Shape};
 
 fn free_form(columns: usize, rows: usize) -> Vec<Point> {
@@ -115,7 +115,9 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
 
 #[test]
 fn what_makes_no_surface_is_refused() {
-    let of = |points: &[Point]| estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap_err();
+    let of = |points: &[Point]| {
+        estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap_err()
+    };
     assert!(matches!(of(&[]), SurfaceError::TooFewPoints { .. }));
     assert!(matches!(of(&free_form(9, 9)), SurfaceError::TooFewPoints { .. }));
     let line: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k), 0.0, 0.0)).collect();

@@ -131,7 +131,8 @@ fn a_turn_that_only_the_sampling_sees_is_held() {
             normalisation_radius_mm: 50.0,
             terms: [(2, 0, 12.0), (0, 2, 12.0)].into_iter().chain(r4).collect(),
         };
-        let nominal = Nominal::from_points(points(&shape.grid(102.0, 62.0, columns, rows)), PlaneProjection::Auto).unwrap();
+        let nominal =
+            Nominal::from_points(points(&shape.grid(102.0, 62.0, columns, rows)), PlaneProjection::Auto).unwrap();
         let mut rng = StdRng::seed_from_u64(seed);
         let mut cloud =
             placed(&placement(), &centres(&shape, &FormError::none(), [[-48.0, -28.0], [48.0, 28.0]], [47, 31]));

@@ -2,7 +2,7 @@
 
 use crate::common::{RADIUS_MM, free_form};
 use regrind_core::geometry::Point;
-use regrind_core::surface::{DistanceModel, Nominal, OffsetSurface, FacetIndex, Side};
+use regrind_core::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 

@@ -3,7 +3,8 @@
 use std::f64::consts::TAU;
 
 use regrind_core::form::{
-    PolynomialBasis, DeviationFigures, PolynomialFit, FormError, FormOptions, RemovedForm, RemovedParts, compute_figures, fit_polynomials, fit_determined_terms, iso_10110, label_figures,
+    DeviationFigures, FormError, FormOptions, PolynomialBasis, PolynomialFit, RemovedForm, RemovedParts,
+    compute_figures, fit_determined_terms, fit_polynomials, iso_10110, label_figures,
 };
 use regrind_core::geometry::{Aperture, DeviationSample};
 use regrind_core::surface::analytic::ZernikeNumbering;
@@ -50,8 +51,8 @@ fn planted(x: f64, y: f64) -> f64 {
 }
 
 fn coefficient(fit: &PolynomialFit, term: &str) -> f64 {
-    let k = (0..fit_polynomials.coefficients_mm.len()).find(|k| fit_polynomials.basis.term_name(*k) == term);
-    fit_polynomials.coefficients_mm[k.unwrap_or_else(|| panic!("no {term}"))]
+    let k = (0..fit.coefficients_mm.len()).find(|k| fit.basis.term_name(*k) == term);
+    fit.coefficients_mm[k.unwrap_or_else(|| panic!("no {term}"))]
 }
 
 fn is_about(found: f64, expected: f64, within: f64) -> bool {
@@ -77,7 +78,8 @@ fn planted_zernike_terms_come_back_on_disc_and_ring() {
         // The same surface has other indices in other numberings.
         let PolynomialBasis::Zernike { centre_mm, radius_mm, .. } = fitted.basis else { panic!() };
         for (numbering, term) in [(ZernikeNumbering::Noll, "Z11 (4, 0)"), (ZernikeNumbering::Ansi, "Z12 (4, 0)")] {
-            let other = fit_polynomials(&PolynomialBasis::Zernike { numbering, centre_mm, radius_mm }, 21, &samples).unwrap();
+            let other =
+                fit_polynomials(&PolynomialBasis::Zernike { numbering, centre_mm, radius_mm }, 21, &samples).unwrap();
             assert!(is_about(coefficient(&other, term), 2e-4, 1e-13), "{numbering:?}");
         }
     }
@@ -92,7 +94,8 @@ fn planted_legendre_terms_come_back_on_the_rectangle() {
         let [u, v] = [(x + 4.0) / 30.0, (y - 10.0) / 18.0];
         1e-3 * p2(u) * 3f64.sqrt() * v - 4e-4 * p3(v) + 2e-5
     };
-    let fitted = fit_polynomials(&PolynomialBasis::for_aperture(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
+    let fitted =
+        fit_polynomials(&PolynomialBasis::for_aperture(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
     for (term, expected) in [("L2(x) L1(y)", 1e-3), ("L0(x) L3(y)", -4e-4), ("L0(x) L0(y)", 2e-5), ("L7(x) L0(y)", 0.0)]
     {
         assert!(is_about(coefficient(&fitted, term), expected, 1e-14), "{term}: {}", coefficient(&fitted, term));
@@ -105,7 +108,8 @@ fn orthogonal_terms_share_out_the_mean_square_and_do_not_change_with_their_numbe
     for aperture in [circle(), ring(), rectangle()] {
         let samples = sampled(&aperture, 1.0, rough);
         let basis = PolynomialBasis::for_aperture(&aperture);
-        let (few, many) = (fit_polynomials(&basis, 15, &samples).unwrap(), fit_polynomials(&basis, 36, &samples).unwrap());
+        let (few, many) =
+            (fit_polynomials(&basis, 15, &samples).unwrap(), fit_polynomials(&basis, 36, &samples).unwrap());
         for (a, b) in few.orthogonal_mm.iter().zip(&many.orthogonal_mm) {
             assert!(is_about(*a, *b, 1e-15), "{a} {b}");
         }
@@ -131,7 +135,12 @@ fn one_spike_makes_the_pv_and_not_the_pvr() {
         let found = figures_over(&spiked, aperture);
         assert_eq!((found.pvr.basis, found.pvr.terms), (basis, 36));
         assert!(found.pv_mm > 5.0 * clean.pv_mm && found.pvr.value_mm < 2.0 * clean.pvr.value_mm, "{:?}", found.pvr);
-        assert!(is_about(found.pv_998_mm, clean.pv_998_mm, 1e-2 * clean.pv_mm), "{} {}", found.pv_998_mm, clean.pv_998_mm);
+        assert!(
+            is_about(found.pv_998_mm, clean.pv_998_mm, 1e-2 * clean.pv_mm),
+            "{} {}",
+            found.pv_998_mm,
+            clean.pv_998_mm
+        );
         assert_eq!((found.highest.value_mm, found.highest.at_mm), (1e-2, smooth[middle].place_mm));
         assert_eq!(found.lowest, clean.lowest);
         // PVr by hand: three times the rms of the rest and the range of the fit.
@@ -171,7 +180,8 @@ fn what_is_removed_is_gone_and_recorded() {
     let form = |x: f64, y: f64| 1.0 + 0.2 * x - 0.1 * y + 1e-2 * (x * x + y * y) + 1e-3 * x * y;
     let samples = sampled(&rectangle(), 1.0, form);
     let of = |removed: Vec<RemovedForm>| {
-        compute_figures(&samples, &FormOptions { removed, aperture: Some(rectangle()), ..FormOptions::default() }).unwrap()
+        compute_figures(&samples, &FormOptions { removed, aperture: Some(rectangle()), ..FormOptions::default() })
+            .unwrap()
     };
     use RemovedForm::{Astigmatism, Piston, Power, Tilt};
     let found = of(vec![Power, Tilt, Piston, Tilt]);
@@ -183,7 +193,8 @@ fn what_is_removed_is_gone_and_recorded() {
         found.pv_mm
     );
     assert!(of(vec![Piston, Tilt, Power, Astigmatism]).pv_mm < 1e-11);
-    let taken_out = RemovedParts { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
+    let taken_out =
+        RemovedParts { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
     let rows = label_figures(&found, &taken_out);
     assert!(rows.iter().all(|row| !row.removed.is_empty() && !row.direction.is_empty() && !row.cut_off.is_empty()));
     let pv = rows.iter().find(|row| row.name == "PV of the points").unwrap();
@@ -232,7 +243,10 @@ fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
     let told = compute_figures(three, &FormOptions::default()).unwrap_err();
     assert_eq!(told, FormError::TooFewPoints { points: 3, min_points: 4 });
     assert!(told.to_string().contains("measure more"));
-    assert!(matches!(fit_polynomials(&basis, 36, &samples[..35]), Err(FormError::TooFewPoints { points: 35, min_points: 36 })));
+    assert!(matches!(
+        fit_polynomials(&basis, 36, &samples[..35]),
+        Err(FormError::TooFewPoints { points: 35, min_points: 36 })
+    ));
     // Five columns tell no sixth power of x, however many points they hold.
     let columns: Vec<DeviationSample> = (0..2000)
         .map(|k| [f64::from(k % 5) - 2.0, f64::from(k / 5) * 0.01])
@@ -246,9 +260,11 @@ fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
 
 #[test]
 fn what_has_no_area_or_no_number_is_refused() {
-    let line: Vec<DeviationSample> = (0..50).map(|k| DeviationSample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
+    let line: Vec<DeviationSample> =
+        (0..50).map(|k| DeviationSample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
     assert_eq!(compute_figures(&line, &FormOptions::default()), Err(FormError::NoArea));
-    let slant: Vec<DeviationSample> = (0..50).map(|k| DeviationSample { place_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
+    let slant: Vec<DeviationSample> =
+        (0..50).map(|k| DeviationSample { place_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
     assert!(matches!(compute_figures(&slant, &FormOptions::default()), Err(FormError::Undetermined { .. })));
     let place = vec![DeviationSample { place_mm: [1.0, 1.0], deviation_mm: 0.0 }; 9];
     assert_eq!(compute_figures(&place, &FormOptions::default()), Err(FormError::NoArea));
@@ -265,7 +281,8 @@ fn what_has_no_area_or_no_number_is_refused() {
 fn coverage_is_the_share_of_the_aperture_with_points() {
     let full = figures_over(&sampled(&circle(), 0.5, planted), circle());
     assert!(full.coverage.share > 0.99, "{:?}", full.coverage);
-    let half: Vec<DeviationSample> = sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.place_mm[0] > CENTRE[0]).collect();
+    let half: Vec<DeviationSample> =
+        sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.place_mm[0] > CENTRE[0]).collect();
     let half = figures_over(&half, circle());
     assert!(is_about(half.coverage.share, 0.5, 0.06), "{:?}", half.coverage);
     // Without an aperture there is nothing beyond the points.

@@ -41,7 +41,12 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
                 let scatter = random_waves(&mut random, NOISE_MM);
                 let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
                 let error = ErrorMap::exact(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
-                known = known.updated(&PassObservation { correction: &correction, error: &error, response: None, explained: None });
+                known = known.updated(&PassObservation {
+                    correction: &correction,
+                    error: &error,
+                    response: None,
+                    explained: None,
+                });
                 correction = correction.compensating(&known, None);
                 let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
                 *left += rms(&rest).powi(2) / WORLDS as f64;

@@ -126,7 +126,11 @@ fn a_gap_of_the_nominal_is_called_one() {
     let found = register(&nominal, &cloud(WHOLE, [60, 30]), &Options::new(RADIUS_MM)).unwrap();
     let off = statuses(&found, PointStatus::OffPart);
     assert!(!off.is_empty() && off.iter().all(|&k| found.deviations[k].point.coords.xy().norm() < 8.5));
-    assert!(has_warning(&found, "over a gap") && !has_warning(&found, "beyond the edge"), "{:?}", found.quality.warnings);
+    assert!(
+        has_warning(&found, "over a gap") && !has_warning(&found, "beyond the edge"),
+        "{:?}",
+        found.quality.warnings
+    );
 }
 
 #[test]
@@ -189,7 +193,12 @@ fn a_nominal_that_scatters_is_reported_and_a_smooth_one_is_not() {
     for (noise_mm, is_told) in [(0.0, false), (1e-3, true)] {
         let nominal = Nominal::from_points(scattered(|_| 0.5, noise_mm), PlaneProjection::Xy).unwrap();
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
-        assert_eq!(has_warning(&found, "nominal points have a noise"), is_told, "{noise_mm}: {:?}", found.quality.warnings);
+        assert_eq!(
+            has_warning(&found, "nominal points have a noise"),
+            is_told,
+            "{noise_mm}: {:?}",
+            found.quality.warnings
+        );
     }
 }
 

@@ -3,20 +3,20 @@
 mod accuracy;
 mod common;
 mod defects;
+mod degenerate;
 mod distance;
-mod plausibility;
 mod exact;
 mod form;
 mod learning;
+mod limitations;
 mod map;
 mod model;
-mod degenerate;
 mod paper;
 mod parameters;
+mod part_priors;
 mod part_shapes;
+mod plausibility;
 #[path = "../../../../tests/common/sample.rs"]
 mod sample;
 mod search;
-mod part_priors;
 mod stopping;
-mod limitations;

@@ -6,9 +6,9 @@ use crate::common::normal;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{
-    ErrorMap, MapError, MapOptions, FilterOrder, SplineSmoothness, Smoothing, error_map, filter_grid, map_from_model,
+    ErrorMap, FilterOrder, MapError, MapOptions, Smoothing, SplineSmoothness, error_map, filter_grid, map_from_model,
 };
-use regrind_core::geometry::{Grid, GridError, DeviationSample};
+use regrind_core::geometry::{DeviationSample, Grid, GridError};
 
 /// Readings at the nodes of a grid about the origin, of a function of the place.
 fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
@@ -33,7 +33,10 @@ fn scattered(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) ->
 
 fn with_noise(readings: &[DeviationSample], sigma_mm: f64, seed: u64) -> Vec<DeviationSample> {
     let mut rng = StdRng::seed_from_u64(seed);
-    readings.iter().map(|r| DeviationSample { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
+    readings
+        .iter()
+        .map(|r| DeviationSample { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r })
+        .collect()
 }
 
 fn fitted_map(readings: &[DeviationSample], options: &MapOptions) -> ErrorMap {
@@ -164,12 +167,16 @@ fn what_the_order_lets_pass_passes_to_the_edges() {
 fn the_filter_does_not_care_where_the_part_lies() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
-        let here = with_noise(&scattered(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
-        let there: Vec<DeviationSample> =
-            here.iter().map(|r| DeviationSample { place_mm: [r.place_mm[0] + 1234.5, r.place_mm[1] - 777.25], ..*r }).collect();
+        let here =
+            with_noise(&scattered(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
+        let there: Vec<DeviationSample> = here
+            .iter()
+            .map(|r| DeviationSample { place_mm: [r.place_mm[0] + 1234.5, r.place_mm[1] - 777.25], ..*r })
+            .collect();
         let mut turned = here.clone();
         turned.reverse();
-        let (map, moved, back) = (fitted_map(&here, &options), fitted_map(&there, &options), fitted_map(&turned, &options));
+        let (map, moved, back) =
+            (fitted_map(&here, &options), fitted_map(&there, &options), fitted_map(&turned, &options));
         let apart = |a: &ErrorMap, b: &ErrorMap| {
             a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
@@ -199,7 +206,8 @@ fn spiked(readings: &mut [DeviationSample], height_mm: f64, seed: u64) -> Vec<us
     let mut spikes: Vec<usize> = Vec::new();
     for k in (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01) {
         let [x, y] = readings[k].place_mm;
-        let is_near = |other: &usize| (readings[*other].place_mm[0] - x).hypot(readings[*other].place_mm[1] - y) < APART_MM;
+        let is_near =
+            |other: &usize| (readings[*other].place_mm[0] - x).hypot(readings[*other].place_mm[1] - y) < APART_MM;
         if !spikes.iter().any(is_near) {
             spikes.push(k);
         }
@@ -252,7 +260,9 @@ fn the_robust_form_passes_less_than_half_of_a_wave_that_stands_alone() {
     for phase in [0.0, 0.7, 1.9] {
         let wave = |[x, _]: [f64; 2]| 1e-3 * (TAU * x / CUTOFF_MM + phase).cos();
         let readings = sampled(103, 63, [1.0, 1.0], |x, y| wave([x, y]));
-        let of = |smoothing| transmission(&fitted_map(&readings, &MapOptions { smoothing, ..plain(CUTOFF_MM, 1.0) }), wave, inside);
+        let of = |smoothing| {
+            transmission(&fitted_map(&readings, &MapOptions { smoothing, ..plain(CUTOFF_MM, 1.0) }), wave, inside)
+        };
         let [plain, robust] = [Smoothing::Gaussian, Smoothing::RobustGaussian].map(of);
         println!("Gaussian {plain:.4}, robust {robust:.4}");
         assert!((plain - 0.5).abs() < 0.003 && (0.465..0.495).contains(&robust), "{plain} {robust}");
@@ -300,8 +310,9 @@ fn a_place_that_is_touched_again_does_not_agree_with_itself() {
     let wave = |x: f64, y: f64| 0.1 * (x / 900.0).sin() * (y / 700.0).cos();
     let beside = [[0.0, 0.0], [0.3, -0.2], [-0.1, 0.4]];
     let touched = sampled(22, 24, [260.0, 260.0], wave);
-    let thrice =
-        touched.iter().flat_map(|r| beside.map(|[x, y]| DeviationSample { place_mm: [r.place_mm[0] + x, r.place_mm[1] + y], ..*r }));
+    let thrice = touched
+        .iter()
+        .flat_map(|r| beside.map(|[x, y]| DeviationSample { place_mm: [r.place_mm[0] + x, r.place_mm[1] + y], ..*r }));
     let mut readings = with_noise(&thrice.collect::<Vec<_>>(), 0.02, 3);
     let options = MapOptions::new(1200.0, 100.0);
     let before = fitted_map(&readings, &options);
@@ -324,7 +335,12 @@ fn the_top_of_a_low_bump_is_kept() {
 }
 
 /// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
-fn observed_over_stated_sigma(readings: &[DeviationSample], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
+fn observed_over_stated_sigma(
+    readings: &[DeviationSample],
+    options: &MapOptions,
+    noise_mm: f64,
+    draws: u64,
+) -> (f64, f64, f64) {
     let clean = fitted_map(readings, options);
     let mut squares = vec![0.0; clean.grid.len()];
     let mut point = 0.0;
@@ -377,7 +393,8 @@ fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
     }
     // A planted truth under noise: cross-validation comes closer to it than the noise by far.
     let readings = with_noise(&scattered(2500, [60.0, 40.0], 4, form), 1e-3, 3);
-    let options = |roughness| MapOptions { smoothing: Smoothing::Spline, spline_smoothness: roughness, ..plain(5.0, 1.0) };
+    let options =
+        |roughness| MapOptions { smoothing: Smoothing::Spline, spline_smoothness: roughness, ..plain(5.0, 1.0) };
     let off = |roughness| {
         let map = fitted_map(&readings, &options(roughness));
         rms(map.samples_mm().into_iter().map(|[x, y, e]| e - form(x, y)))
@@ -432,7 +449,10 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
     let robust_form = filter_grid(&grid, &values, &valid, 5.0, FilterOrder::Plane, true).unwrap();
     assert!(robust_form.rounds > 1);
     assert!(rms(nodes().map(|k| robust_form.values[k] - exact[k])) < 1e-4);
-    assert!(matches!(filter_grid(&grid, &values[1..], &valid, 5.0, FilterOrder::Plane, true), Err(MapError::Shape { .. })));
+    assert!(matches!(
+        filter_grid(&grid, &values[1..], &valid, 5.0, FilterOrder::Plane, true),
+        Err(MapError::Shape { .. })
+    ));
     assert!(matches!(
         filter_grid(&grid, &values, &vec![true; grid.len()], 5.0, FilterOrder::Plane, true),
         Err(MapError::NotFinite { .. })
@@ -447,10 +467,12 @@ fn what_makes_no_map_is_said() {
     assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..options };
-        let line: Vec<DeviationSample> = (0..100).map(|k| DeviationSample { place_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
+        let line: Vec<DeviationSample> =
+            (0..100).map(|k| DeviationSample { place_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let slanted: Vec<DeviationSample> =
-            (0..100).map(|k| DeviationSample { place_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
+        let slanted: Vec<DeviationSample> = (0..100)
+            .map(|k| DeviationSample { place_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 })
+            .collect();
         assert!(matches!(error_map(&slanted, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
         let one_place = vec![DeviationSample { place_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
         assert!(error_map(&one_place, &options).is_err(), "{smoothing:?}");

@@ -184,7 +184,8 @@ fn a_probe_that_drifts_along_its_path_is_not_taken_for_form() {
         }
     }
     println!("of {} parts RMS held in {rms}, PV in {pv}; a drift was seen in {seen}", parts());
-    let held = rms + allowed_misses(3) >= parts() && pv + allowed_misses(4) >= parts() && seen + allowed_misses(4) >= parts();
+    let held =
+        rms + allowed_misses(3) >= parts() && pv + allowed_misses(4) >= parts() && seen + allowed_misses(4) >= parts();
     assert!(held, "{rms} {pv} {seen}");
 }
 
@@ -287,8 +288,8 @@ fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
         });
         let base = motions.qr().q();
         let truth = figures((&form - &base * base.tr_mul(&form)).as_slice());
-        let [sure, blind] =
-            [given, ModelInputs { locked_sigmas: Some([0.0; 6]), ..given }].map(|of| Form::estimate(&found, &of).unwrap());
+        let [sure, blind] = [given, ModelInputs { locked_sigmas: Some([0.0; 6]), ..given }]
+            .map(|of| Form::estimate(&found, &of).unwrap());
         for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
             held[0] += u32::from(contains(told.figures.rms, truth[0]));
             held[1] += u32::from(contains(told.figures.pv, truth[1]));
@@ -395,8 +396,8 @@ fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
     let [z, z_doubted] = [&part.model, &doubted].map(|form| form.frame_covariance[(2, 2)].sqrt());
     assert!((z_doubted / 2e-2 - 1.0).abs() < 0.2 && z < 3e-4, "{z} {z_doubted}");
     // A wrong radius would show in points that have no form; in a form it may hide.
-    let [sure, doubted] =
-        [ModelInputs::default(), given].map(|given| Form::estimate(&with_form.registration, &given).unwrap().figures.rms);
+    let [sure, doubted] = [ModelInputs::default(), given]
+        .map(|given| Form::estimate(&with_form.registration, &given).unwrap().figures.rms);
     let width = |of: Interval| of.high_mm - of.low_mm;
     println!("RMS {:.2} times as wide beside an unknown radius", width(doubted) / width(sure));
     assert!(width(doubted) > 2.0 * width(sure), "{sure:?} {doubted:?}");
@@ -491,7 +492,8 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
     let given = ModelInputs { probe_noise_mm: [0.5 * NOISE_MM, 0.1], ..ModelInputs::default() };
     for seed in 0..2 {
         let part = part(seed, 5e-3);
-        let FormFigures { pv, pv_998: pv_most_points, .. } = Form::estimate(&part.registration, &given).unwrap().figures;
+        let FormFigures { pv, pv_998: pv_most_points, .. } =
+            Form::estimate(&part.registration, &given).unwrap().figures;
         println!("seed {seed}: touched up to {:.2e}, the aperture up to {:.2e} mm", pv.high_mm, pv_most_points.high_mm);
         assert!(pv_most_points.high_mm < 1.2 * pv.high_mm && pv_most_points.low_mm >= pv.low_mm, "{pv_most_points:?}");
     }

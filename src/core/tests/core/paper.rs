@@ -49,7 +49,8 @@ fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
         let measured = points(&placed(&placement, &exact));
         for distance in [DistanceModel::Curved, DistanceModel::Triangle] {
             let case = format!("{shift_mm:?} mm, {degrees:?} degrees, {distance:?}");
-            let found = register(&nominal, &measured, &Options { distance_model: distance, ..as_in_the_paper() }).expect(&case);
+            let found =
+                register(&nominal, &measured, &Options { distance_model: distance, ..as_in_the_paper() }).expect(&case);
             let pv_nm = 1e6 * found.quality.pv_mm;
             assert!(pv_nm <= 1e-6, "{case}: {pv_nm:e} nm");
             assert_eq!(found.quality.inliers, measured.len(), "{case}");

@@ -4,7 +4,8 @@ use crate::common::normal;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use regrind_core::compensation::{
-    SurfacePoint, EstimatedParameter, ParameterError, ParameterKind, ParameterOptions, ParameterEstimation, ParameterCorrections, WheelTerm, estimate_parameters,
+    EstimatedParameter, ParameterCorrections, ParameterError, ParameterEstimation, ParameterKind, ParameterOptions,
+    SurfacePoint, WheelTerm, estimate_parameters,
 };
 use regrind_core::geometry::{Point, Vector};
 use regrind_sim::form::FormError;
@@ -32,8 +33,12 @@ fn contacts_on(shape: &dyn Shape, off: impl Fn(&SurfacePoint, f64) -> f64) -> Ve
 }
 
 fn estimates(contacts: &[SurfacePoint], free_motions: [bool; 6]) -> ParameterEstimation {
-    estimate_parameters(contacts, None, &ParameterOptions { free_motions, locked_sigmas: EXACT, ..ParameterOptions::new(WHEEL_MM) })
-        .unwrap()
+    estimate_parameters(
+        contacts,
+        None,
+        &ParameterOptions { free_motions, locked_sigmas: EXACT, ..ParameterOptions::new(WHEEL_MM) },
+    )
+    .unwrap()
 }
 
 fn estimate_of(found: &ParameterEstimation, kind: ParameterKind) -> &EstimatedParameter {
@@ -66,8 +71,16 @@ fn what_is_planted_is_found_without_form() {
     {
         let parameter = estimate_of(&found, kind);
         println!("{}: own share {}", parameter.message, parameter.own_share);
-        assert!((parameter.value - value).abs() < 3.0 * parameter.sigma && parameter.is_offered, "{}", parameter.message);
-        assert!(parameter.sigma < 1e-4 && parameter.compensated == 0.0 && !parameter.exceeds_tolerance, "{}", parameter.message);
+        assert!(
+            (parameter.value - value).abs() < 3.0 * parameter.sigma && parameter.is_offered,
+            "{}",
+            parameter.message
+        );
+        assert!(
+            parameter.sigma < 1e-4 && parameter.compensated == 0.0 && !parameter.exceeds_tolerance,
+            "{}",
+            parameter.message
+        );
     }
     assert!(found.residual_rms_mm < 1e-5 && found.rms_mm > 1e-3);
     let radius = &estimate_of(&found, ParameterKind::WheelRadius).message;
@@ -94,12 +107,17 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
     assert_eq!(ParameterCorrections::from_values([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
     // On a free form it is told beside a form of 0.3 um, and all but its uncertainty is taken, 0.1 (1 + s^2 / 0.1^2)^-1.
     let form = FormError::with_rms(&mut regrind_sim::rng(3), 14.0, 3e-4);
-    let contacts = contacts_on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));
+    let contacts =
+        contacts_on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));
     let found = estimate_parameters(&contacts, None, &options).unwrap();
     let radius = estimate_of(&found, ParameterKind::WheelRadius);
     println!("{}", radius.message);
     let by_hand = radius.value / (1.0 + (radius.sigma / 0.1).powi(2));
-    assert!(radius.is_offered && (radius.compensated - by_hand).abs() < 1e-12 && !radius.exceeds_tolerance, "{}", radius.message);
+    assert!(
+        radius.is_offered && (radius.compensated - by_hand).abs() < 1e-12 && !radius.exceeds_tolerance,
+        "{}",
+        radius.message
+    );
     assert!((radius.value - 0.1).abs() < 3.0 * radius.sigma, "{}", radius.message);
     // Of a recipe that knows its wheel to 10 um a person is asked.
     let sure = ParameterOptions { tolerances: options.tolerances.map(|of| of.map(|_| 0.01)), ..options };
@@ -132,7 +150,8 @@ fn a_datum_tells_no_better_than_it_holds() {
     let scatter = tiny_noise();
     let contacts = contacts_on(&FreeForm::default(), |c, _| planted(c, 0.0, 0.012, 0.0) + scatter());
     let told = |datum| {
-        let options = ParameterOptions { free_motions: FREE_MOTIONS, locked_sigmas: datum, ..ParameterOptions::new(WHEEL_MM) };
+        let options =
+            ParameterOptions { free_motions: FREE_MOTIONS, locked_sigmas: datum, ..ParameterOptions::new(WHEEL_MM) };
         estimate_of(&estimate_parameters(&contacts, None, &options).unwrap(), ParameterKind::SettingX).clone()
     };
     let unknown = told(None);
@@ -181,7 +200,9 @@ fn coverage(
 #[ignore = "worlds are drawn, for .ci/long"]
 fn values_are_within_what_is_stated_of_them() {
     use ParameterKind::{SettingX, SettingY, WheelRadius};
-    for (free, world) in [(FREE_MOTIONS, [0.9, 18.0, 0.3]), (FREE_MOTIONS, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])] {
+    for (free, world) in
+        [(FREE_MOTIONS, [0.9, 18.0, 0.3]), (FREE_MOTIONS, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])]
+    {
         let kinds: &[ParameterKind] = if free[0] { &[WheelRadius] } else { &[WheelRadius, SettingX, SettingY] };
         for (kind, (z, far, sigma)) in kinds.iter().zip(coverage(free, kinds, world)) {
             println!("{world:?} {kind:?}: off by {z:.2} sigma (rms), {far} beyond three, sigma {:.3} um", 1e3 * sigma);
@@ -224,7 +245,11 @@ fn what_looks_alike_is_said() {
         .map(|c| SurfacePoint { normal: tilted, point: Point::new(c.point.x, c.point.y, -0.3 * c.point.x), ..c })
         .collect();
     let radius = estimate_of(&estimates(&leaning, [true; 6]), ParameterKind::WheelRadius).clone();
-    assert!(!radius.is_offered && radius.inseparable_from.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
+    assert!(
+        !radius.is_offered && radius.inseparable_from.iter().any(|a| a.starts_with("a shift")),
+        "{}",
+        radius.message
+    );
 }
 
 /// Progress along a path that winds to and fro.
@@ -235,7 +260,8 @@ fn winding(contact: &SurfacePoint) -> f64 {
 #[test]
 fn the_other_term_of_the_wheel_and_a_given_progress_are_followed() {
     let scatter = tiny_noise();
-    let contacts = contacts_on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
+    let contacts =
+        contacts_on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
     let progress: Vec<f64> = contacts.iter().map(winding).collect();
     let options = ParameterOptions { wheel_term: WheelTerm::AlongNormal, ..ParameterOptions::new(WHEEL_MM) };
     let found = estimate_parameters(&contacts, Some(&progress), &options).unwrap();
@@ -255,7 +281,10 @@ fn what_cannot_be_separated_is_refused() {
     let mut hanging = contacts.clone();
     hanging[3].normal.z = -1.0;
     assert_eq!(error(&hanging), ParameterError::Normal { index: 3, nz: -1.0 });
-    assert!(matches!(estimate_parameters(&contacts, Some(&[0.5]), &options), Err(ParameterError::Progress { found: 1, .. })));
+    assert!(matches!(
+        estimate_parameters(&contacts, Some(&[0.5]), &options),
+        Err(ParameterError::Progress { found: 1, .. })
+    ));
     let flat = ParameterOptions::new(0.0);
     assert!(matches!(estimate_parameters(&contacts, None, &flat), Err(ParameterError::WheelRadius { .. })));
     let broken = ParameterOptions { tolerances: [Some(-1.0), None, None, None, None, None, None], ..options };

@@ -117,7 +117,10 @@ fn simulated(hyperparameters: &Hyperparameters, seed: u64) -> Observations {
     let mut rng = StdRng::seed_from_u64(seed);
     let deviations = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normal(&mut rng));
     let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-    Observations { fixed_effects: effects, ..Observations::without_effects(places, deviations.iter().copied().collect()) }
+    Observations {
+        fixed_effects: effects,
+        ..Observations::without_effects(places, deviations.iter().copied().collect())
+    }
 }
 
 #[test]
@@ -154,7 +157,9 @@ fn what_parts_taught_is_believed_as_far_as_it_is_true() {
     let mut taught = PartPriors::default();
     for seed in 0..4 {
         let part = Part::new(seed, 15.0, 2e-3);
-        if let Some(field) = Form::estimate(&part.registration, &inputs_with_prior(None)).unwrap().hyperparameters_without_prior {
+        if let Some(field) =
+            Form::estimate(&part.registration, &inputs_with_prior(None)).unwrap().hyperparameters_without_prior
+        {
             taught.update(true, &field);
         }
     }

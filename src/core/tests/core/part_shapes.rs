@@ -4,14 +4,15 @@ use crate::common::{RADIUS_MM, centres, placed, points, pose};
 use regrind_core::geometry::{Point, Pose, Vector};
 use regrind_core::registration::{Method, Options, ProbeSide, Registration, RegistrationError, Start, register};
 use regrind_core::surface::{
-    DefinedSurface, Nominal, NominalKind, OffsetSurface, FacetIndex, PlaneProjection, Side, SurfaceError,
+    DefinedSurface, FacetIndex, Nominal, NominalKind, OffsetSurface, PlaneProjection, Side, SurfaceError,
 };
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{Biconic, OffAxisAsphere, Shape, Sphere, Wave};
 
 fn gridded(shape: &dyn Shape, size_mm: [f64; 2], nodes: [usize; 2]) -> Nominal {
-    Nominal::from_points(points(&shape.grid(size_mm[0], size_mm[1], nodes[0], nodes[1])), PlaneProjection::Auto).unwrap()
+    Nominal::from_points(points(&shape.grid(size_mm[0], size_mm[1], nodes[0], nodes[1])), PlaneProjection::Auto)
+        .unwrap()
 }
 
 /// Centres over a rectangle, placed and noisy.
@@ -190,8 +191,10 @@ fn a_hyper_hemisphere_to_a_polar_angle_of_120_degrees() {
         })
         .collect();
     let surface = OffsetSurface::new(&nominal, RADIUS_MM, Side::Normal).unwrap();
-    let worst =
-        exact.iter().map(|c| surface.project(&Point::from(*c), FacetIndex::UNKNOWN).distance_mm.abs()).fold(0.0, f64::max);
+    let worst = exact
+        .iter()
+        .map(|c| surface.project(&Point::from(*c), FacetIndex::UNKNOWN).distance_mm.abs())
+        .fold(0.0, f64::max);
     assert!(worst < 2e-6, "{worst} mm");
     let placement = Placement::new([100.0, -40.0, 7.0], [30.0, 160.0, -70.0]);
     let found = register(&nominal, &points(&placed(&placement, &exact)), &Options::new(RADIUS_MM)).unwrap();

@@ -22,8 +22,9 @@ fn mirror() -> XyPolynomial {
 
 fn nominal() -> &'static Nominal {
     static NOMINAL: OnceLock<Nominal> = OnceLock::new();
-    NOMINAL
-        .get_or_init(|| Nominal::from_points(points(&mirror().grid(102.0, 62.0, 205, 125)), PlaneProjection::Auto).unwrap())
+    NOMINAL.get_or_init(|| {
+        Nominal::from_points(points(&mirror().grid(102.0, 62.0, 205, 125)), PlaneProjection::Auto).unwrap()
+    })
 }
 
 /// 1,800 centres of a part with 20 um of form error, within a rectangle.
@@ -82,7 +83,8 @@ fn a_diameter_and_half_a_radius_are_told() {
 fn contact_points_that_were_taken_for_centres_are_told() {
     for seed in 1..=4 {
         let right = with_radius(RADIUS_MM, &whole(seed));
-        let contacts: Vec<Point> = right.deviations.iter().map(|d| right.cmm_from_model.transform_point(&d.point)).collect();
+        let contacts: Vec<Point> =
+            right.deviations.iter().map(|d| right.cmm_from_model.transform_point(&d.point)).collect();
         let words = warnings(&with_radius(RADIUS_MM, &contacts));
         assert!(words.contains("look like contact points") && words.contains("`contact`"), "{words}");
         let found = register(nominal(), &contacts, &Options { method: Method::Contact, ..Options::new(0.0) }).unwrap();

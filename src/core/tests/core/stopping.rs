@@ -223,8 +223,14 @@ fn batches_have_an_end() {
         touched.iter().for_each(|&k| tried[k] = Some(0));
         tried[touched[0]] = Some(last);
         let so_far = PartialMeasurement { targets: &part.targets, tried: &tried, touched: &touched };
-        decide(&part.measured(&touched), &inputs(), &so_far, &StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT }, 1)
-            .unwrap()
+        decide(
+            &part.measured(&touched),
+            &inputs(),
+            &so_far,
+            &StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT },
+            1,
+        )
+        .unwrap()
     };
     assert_ne!(looked(MAX_BATCHES - 2).reason, Reason::MaxBatchesReached);
     let late = looked(MAX_BATCHES - 1);
@@ -295,7 +301,11 @@ fn a_batch_that_was_not_expected_is_followed_by_another() {
         .map(|on_right| (0..part.targets.len()).filter(|&k| (part.targets[k].0.x > 10.0) == on_right).collect());
     let some = |of: &[usize], count: usize| -> Vec<usize> { of.iter().step_by(of.len() / count).copied().collect() };
     let decision = part.decide(&some(&left, 100), &some(&right, 30), &LOOSE);
-    assert!(matches!(decision.reason, Reason::LargeInnovations | Reason::UnconfirmedOutlier | Reason::NarrowFeature), "{:?}", decision.reason);
+    assert!(
+        matches!(decision.reason, Reason::LargeInnovations | Reason::UnconfirmedOutlier | Reason::NarrowFeature),
+        "{:?}",
+        decision.reason
+    );
     assert!(!decision.next.is_empty());
 }
 

@@ -16,16 +16,16 @@
 //!
 //! It stands in for a disk of Unix; elsewhere there are the drawn numbers alone.
 
-mod seeded_numbers;
 #[cfg(unix)]
 mod image;
 #[cfg(unix)]
 mod plan;
+mod seeded_numbers;
 #[cfg(unix)]
 mod vfs;
 
-pub use seeded_numbers::SeededNumbers;
 #[cfg(unix)]
 pub use image::{Cut, Outcome};
 #[cfg(unix)]
 pub use plan::{Disk, Fault, Operation, Stall};
+pub use seeded_numbers::SeededNumbers;

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
-use crate::seeded_numbers::SeededNumbers;
 use crate::image::{Cut, Image};
+use crate::seeded_numbers::SeededNumbers;
 use crate::vfs;
 
 /// What SQLite asks of its files.

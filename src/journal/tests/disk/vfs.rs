@@ -9,8 +9,8 @@ use std::sync::{Arc, OnceLock};
 
 use rusqlite::ffi::{self, sqlite3, sqlite3_file, sqlite3_io_methods, sqlite3_vfs};
 
-use crate::seeded_numbers::SeededNumbers;
 use crate::plan::{Fault, Operation, Shared, Verdict, disk_of};
+use crate::seeded_numbers::SeededNumbers;
 
 /// The system's own files.
 struct System(*mut sqlite3_vfs);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use regrind_disk::{Disk, SeededNumbers, Fault, Operation};
+use regrind_disk::{Disk, Fault, Operation, SeededNumbers};
 use regrind_journal::{AuditKey, Journal, verify};
 
 use crate::life::{CHECKPOINT_PAGES, Home, Life, draws, header, mode, short};

@@ -9,7 +9,7 @@ use rusqlite::{Connection, OpenFlags};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::keep::Kept;
+use crate::keep::KeepRunFolders;
 
 /// A short life brings its log into the database some times.
 pub const CHECKPOINT_PAGES: u32 = 24;
@@ -17,14 +17,14 @@ pub const CHECKPOINT_PAGES: u32 = 24;
 /// A folder in memory where there is one: what lasts is decided by the disk of the test. The journals in it are kept for the other
 /// verifier, where that is wanted.
 pub struct Home {
-    _kept: Kept,
+    _kept: KeepRunFolders,
     home: TempDir,
 }
 
 impl Home {
     pub fn new() -> Self {
         let home = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
-        Self { _kept: Kept(home.path().to_owned()), home }
+        Self { _kept: KeepRunFolders(home.path().to_owned()), home }
     }
 
     pub fn folder(&self, name: &str) -> PathBuf {
@@ -180,11 +180,27 @@ impl<'d> Life<'d> {
             Step::Store(letters) => {
                 let (name, bytes) = (format!("cycle-1/{number}.csv"), words(number, letters));
                 self.until_written(|| journal.store(&name, bytes.as_bytes(), number, 1));
-                (AcknowledgedRecord { kind: Kind::Artefact, mono_ns: number, command_id: None, payload: json!(name) }, self.id)
+                (
+                    AcknowledgedRecord {
+                        kind: Kind::Artefact,
+                        mono_ns: number,
+                        command_id: None,
+                        payload: json!(name),
+                    },
+                    self.id,
+                )
             }
             Step::End => {
                 self.until_written(|| journal.end(number, 1, json!("accepted")));
-                (AcknowledgedRecord { kind: Kind::End, mono_ns: number, command_id: None, payload: json!("accepted") }, self.id)
+                (
+                    AcknowledgedRecord {
+                        kind: Kind::End,
+                        mono_ns: number,
+                        command_id: None,
+                        payload: json!("accepted"),
+                    },
+                    self.id,
+                )
             }
         };
         self.acknowledged.push(told);

@@ -2,13 +2,14 @@
 
 use std::path::Path;
 
-use regrind_disk::{Cut, Disk, SeededNumbers, Fault, Operation, Outcome};
+use regrind_disk::{Cut, Disk, Fault, Operation, Outcome, SeededNumbers};
 use regrind_journal::{AuditKey, Entry, Journal, JournalError, Kind, Reader, verify};
 use rusqlite::Connection;
 use serde_json::json;
 
 use crate::life::{
-    CHECKPOINT_PAGES, Home, Life, AcknowledgedRecord, draws, header, is_gone_on_with, long, records, short, read_acknowledged, verified,
+    AcknowledgedRecord, CHECKPOINT_PAGES, Home, Life, draws, header, is_gone_on_with, long, read_acknowledged, records,
+    short, verified,
 };
 
 /// What was acknowledged before a cut is there afterwards, and of what was under way all or nothing. Returns whether there is a run to go on with.
@@ -42,7 +43,15 @@ fn outcomes(drawn: &mut SeededNumbers) -> Vec<Outcome> {
 }
 
 /// Tries one cut: restores what is left, looks through it and goes on.
-fn is_survived(home: &Home, cut: &Cut, told: &[AcknowledgedRecord], key: Option<&AuditKey>, outcome: Outcome, at: &str, seed: u64) {
+fn is_survived(
+    home: &Home,
+    cut: &Cut,
+    told: &[AcknowledgedRecord],
+    key: Option<&AuditKey>,
+    outcome: Outcome,
+    at: &str,
+    seed: u64,
+) {
     let after = home.empty("after");
     cut.restore(&after, outcome, &mut SeededNumbers::new(seed)).unwrap();
     if is_sound(&after, cut, told, at) {

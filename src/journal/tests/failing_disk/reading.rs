@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use regrind_disk::{Disk, SeededNumbers, Fault, Operation};
+use regrind_disk::{Disk, Fault, Operation, SeededNumbers};
 use regrind_journal::{AuditKey, JournalError, Reader, Record, Verified, verify};
 
 use crate::life::{CHECKPOINT_PAGES, Home, Life, draws, records, short};

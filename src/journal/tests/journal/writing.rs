@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind_journal::{ExternalEvidence, AuditKey, Entry, Journal, JournalError, Kind, Reader, verify, verify_against};
+use regrind_journal::{AuditKey, Entry, ExternalEvidence, Journal, JournalError, Kind, Reader, verify, verify_against};
 use rusqlite::Connection;
 use serde_json::json;
 
