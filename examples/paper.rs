@@ -386,7 +386,7 @@ fn shift_and_turn(twist: &Twist) -> String {
 /// Repeats the method that section 1 advises against: pairs the centres with the closest points of the offset cloud
 /// (Besl and McKay, 1992). The two sampling grids slide along each other.
 fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registration)) -> Outcome {
-    const MOST_TURNS: usize = 500;
+    const MAX_TURNS: usize = 500;
     heading("section 1: centres to the closest points of the offset cloud");
     let cloud: Vec<Point> = nominal.offset_points(PROBE_RADIUS_MM).collect();
     let tree = KDTree::new(&cloud.iter().map(Entry::from).collect::<Vec<_>>());
@@ -398,7 +398,7 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
         let nearest: Vec<(Point, f64)> =
             measured.centres.par_iter().map(nearest).map(|n| (cloud[n.index as usize], *n.dist2)).collect();
         let objective = nearest.iter().map(|n| n.1).sum::<f64>();
-        if 1.0 - objective / before <= 1e-9 || turns == MOST_TURNS {
+        if 1.0 - objective / before <= 1e-9 || turns == MAX_TURNS {
             break;
         }
         let closest: Vec<Point> = nearest.iter().map(|n| n.0).collect();

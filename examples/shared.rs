@@ -16,7 +16,7 @@ use study::others::{Differ, Pair, TAUGHT_BY, TransferResult};
 use study::{After, Bench, RECIPES};
 
 /// Maximum ratio of the first pass to the floor.
-const MOST: f64 = 1.3;
+const MAX: f64 = 1.3;
 
 fn main() {
     let number = |k: usize, otherwise: u64| std::env::args().nth(k).map_or(otherwise, |n| n.parse().expect("a number"));
@@ -69,7 +69,7 @@ fn print_line(name: &str, all: &[TransferResult]) {
     let with = sorted(&|of| ratio(&of.with[0]));
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
     let at = |values: &[f64], share: f64| values[((share * n as f64) as usize).min(n - 1)];
-    let near = with.iter().filter(|ratio| **ratio <= MOST).count();
+    let near = with.iter().filter(|ratio| **ratio <= MAX).count();
     let (bands, differ) = (mean(&sorted(&|of| of.bands as f64)), at(&sorted(&|of| of.differ), 0.5));
     print!(
         "{name:18}{:>7.2}{:>7.2}{:>8.2}{:>8.2}{:>7.2}{:>6.0} % |{:>8.2} |{bands:>6.1}{:>7.0} % |",

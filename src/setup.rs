@@ -784,7 +784,7 @@ pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u3
 /// Checks that the resources of a machine exist, such as its exchange folders. Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`machines`].
+/// Those of [`create_drivers`].
 pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
     let link = match device {
         Device::Cmm => &cell.cmm.link,
@@ -802,7 +802,7 @@ pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverErro
 /// Builds the driver of the measuring machine without a part, for inspection only. Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`machines`].
+/// Those of [`create_drivers`].
 pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.cmm.link;
@@ -816,7 +816,7 @@ pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
 /// Builds the driver of the grinder without a part, for inspection only. Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`machines`].
+/// Those of [`create_drivers`].
 pub fn create_grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.grinder.link;

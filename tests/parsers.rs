@@ -24,7 +24,7 @@ mod parsers;
 static MEMORY: PeakAlloc = PeakAlloc;
 
 /// Memory limit for all tests of this file together, in MB. A parser that trusts a false claim exceeds it.
-const MOST_MEMORY_MB: f64 = 400.0;
+const MAX_MEMORY_MB: f64 = 400.0;
 
 /// Returns the samples of a parser, in the order of their names.
 fn samples(parser: &str) -> Vec<(PathBuf, Vec<u8>)> {
@@ -123,7 +123,7 @@ macro_rules! survives {
                 damage.iter().for_each(|damage| damage.to(&mut bytes));
                 parsers::$parser(&bytes);
                 parsers::$parser(&noise);
-                prop_assert!(MEMORY.peak_usage_as_mb() < MOST_MEMORY_MB as f32, "{} MB", MEMORY.peak_usage_as_mb());
+                prop_assert!(MEMORY.peak_usage_as_mb() < MAX_MEMORY_MB as f32, "{} MB", MEMORY.peak_usage_as_mb());
             }
         })*
 
@@ -142,7 +142,7 @@ macro_rules! survives {
                 }
             })*
             assert!(wrong.is_empty(), "{wrong:?}");
-            assert!(MEMORY.peak_usage_as_mb() < MOST_MEMORY_MB as f32, "{} MB", MEMORY.peak_usage_as_mb());
+            assert!(MEMORY.peak_usage_as_mb() < MAX_MEMORY_MB as f32, "{} MB", MEMORY.peak_usage_as_mb());
         }
     };
 }

@@ -51,7 +51,7 @@ pub(super) struct FailureSeries {
     pub(super) reported: bool,
 }
 
-/// Cell in the middle of a run. Large parts are shared by its copies, of which [`super::table()`] makes millions.
+/// Cell in the middle of a run. Large parts are shared by its copies, of which [`super::transition_table()`] makes millions.
 #[derive(Clone, Debug)]
 pub struct Cell {
     pub(super) plan: Arc<CellPlan>,

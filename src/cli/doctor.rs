@@ -145,14 +145,14 @@ fn open_runs(runs: &Path) -> Option<Finding> {
 /// Checks that the clock is not before the recorded times.
 fn clock(runs: &Path) -> Finding {
     /// Date of this code. A correct clock shows no earlier time.
-    const LEAST: &str = "2026-01-01T00:00:00Z";
+    const MIN: &str = "2026-01-01T00:00:00Z";
     let now = utc(SystemTime::now());
     let last = control::folders(runs)
         .filter_map(|folder| run_summary(&folder).ok())
         .map(|run| run.ended.unwrap_or(run.began))
         .max();
     let last = last.unwrap_or_default();
-    if now.as_str() < LEAST || now < last {
+    if now.as_str() < MIN || now < last {
         let words = format!(
             "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the numbers of the \
              records keep their order"

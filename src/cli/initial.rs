@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::failure::Failure;
 
 /// Maximum size of the file: far more than the result of a registration.
-const MOST_BYTES: u64 = 64 << 20;
+const MAX_BYTES: u64 = 64 << 20;
 
 type Rows = [[f64; 4]; 4];
 
@@ -27,10 +27,10 @@ struct Earlier {
 pub(super) fn read_pose(path: &Path) -> Result<Pose, Failure> {
     let failed = |reason: String| Failure::Initial { path: path.to_owned(), reason };
     let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(MOST_BYTES + 1).read_to_end(&mut bytes));
+    let read = File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
     read.map_err(|e| failed(format!("cannot be read: {e}")))?;
-    if bytes.len() as u64 > MOST_BYTES {
-        return Err(failed(format!("the file is larger than {MOST_BYTES} bytes")));
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(failed(format!("the file is larger than {MAX_BYTES} bytes")));
     }
     let text = String::from_utf8(bytes).map_err(|_| failed("the file is not text".into()))?;
     let rows = parse(&text).map_err(failed)?;

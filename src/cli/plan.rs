@@ -41,7 +41,7 @@ pub(super) struct Arguments {
 }
 
 /// Duration of a shift in minutes. No pass and no measurement is meant to take longer.
-const MOST_MINUTES: f64 = 480.0;
+const MAX_MINUTES: f64 = 480.0;
 
 #[derive(Serialize)]
 struct Document {
@@ -329,22 +329,22 @@ fn min_measuring_minutes(task: &Task) -> Option<f64> {
 fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes: Option<f64>) -> Vec<String> {
     let n = three_digits;
     let mut warnings = Vec::new();
-    if grinding_minutes > MOST_MINUTES {
+    if grinding_minutes > MAX_MINUTES {
         warnings.push(format!(
             "a pass takes {} h, more than a shift of {} h: {} mm of path at {} mm/min; see that grinding.feed_mm_min is not in mm/s and that \
              grinding.track_mm is not too small",
             n(grinding_minutes / 60.0),
-            MOST_MINUTES / 60.0,
+            MAX_MINUTES / 60.0,
             n(path_mm),
             n(task.pass.feed_mm_min),
         ));
     }
-    if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MOST_MINUTES) {
+    if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MAX_MINUTES) {
         warnings.push(format!(
             "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; see measure.speed_mm_s and how many \
              points are asked for",
             n(minutes / 60.0),
-            MOST_MINUTES / 60.0,
+            MAX_MINUTES / 60.0,
             counted(task.targets.len(), "point"),
             n(task.probing.approach_mm),
             n(task.probing.speed_mm_s),

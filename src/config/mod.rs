@@ -205,7 +205,7 @@ pub fn json_schema() -> &'static serde_json::Value {
 }
 
 impl CellConfig {
-    /// Reads a cell file. [`BUILT_IN`] is not a file; it names the built-in simulated cell.
+    /// Reads a cell file. [`BUILT_IN_CELL`] is not a file; it names the built-in simulated cell.
     ///
     /// # Errors
     /// Returns an error if the file cannot be read, and all errors of its text.

@@ -252,7 +252,7 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
     Reply { taken: false, message, status: status.borrow().clone() }
 }
 
-/// Sends the state of the cell after every change, and repeats it after [`MOST_BETWEEN_LINES`] without a change, so
+/// Sends the state of the cell after every change, and repeats it after [`MAX_LINE_INTERVAL`] without a change, so
 /// that silence means that the cell is gone.
 async fn stream_status(write: &mut ClientWriter, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
@@ -301,7 +301,7 @@ pub fn send_request(folder: &Path, request: &Request) -> io::Result<Reply> {
 /// Sends a request to a running cell on behalf of another person, and blocks until its reply.
 ///
 /// # Errors
-/// Those of [`ask`].
+/// Those of [`send_request`].
 pub fn send_request_on_behalf(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
     let text = endpoint::exchange_line(folder, &encode_line(request, by)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)

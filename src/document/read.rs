@@ -16,10 +16,10 @@ use super::shown::{countable, misleading};
 use super::{Problem, Problems, RenamedKey, line_and_column};
 
 /// Maximum size of a file: far more than a person writes.
-const MOST_BYTES: usize = 256 << 10;
+const MAX_BYTES: usize = 256 << 10;
 
 /// Maximum number of reported problems: more than a person reads at once.
-const MOST_PROBLEMS: usize = 200;
+const MAX_PROBLEMS: usize = 200;
 
 /// One step from a table to a value in it.
 #[derive(Clone, Debug)]
@@ -44,9 +44,9 @@ pub struct Document<'t> {
 pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
-    let read = open(path).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
+    let read = open(path).and_then(|file| file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes));
     read.map_err(|e| failed(format!("the file cannot be read: {e}"), "check the path and the rights"))?;
-    if bytes.len() > MOST_BYTES {
+    if bytes.len() > MAX_BYTES {
         return Err(too_large(path));
     }
     String::from_utf8(bytes).map_err(|e| {
@@ -66,7 +66,7 @@ fn open(path: &Path) -> std::io::Result<File> {
 }
 
 fn too_large(path: &Path) -> Problems {
-    let found = format!("the file is larger than {} KiB", MOST_BYTES >> 10);
+    let found = format!("the file is larger than {} KiB", MAX_BYTES >> 10);
     Problems::whole(path, "", found, "check that it is a recipe or a cell file; put large data into separate files")
 }
 
@@ -81,7 +81,7 @@ impl<'t> Document<'t> {
     /// # Errors
     /// Returns every place where the text is not valid TOML.
     pub fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
-        if text.len() > MOST_BYTES {
+        if text.len() > MAX_BYTES {
             return Err(too_large(file));
         }
         let (places, errors) = DeTable::parse_recoverable(text);
@@ -204,9 +204,9 @@ impl<'t> Document<'t> {
         let mut problems = self.problems;
         problems.sort_by_key(|problem| problem.span.start);
         problems.dedup();
-        if let Some(more) = problems.len().checked_sub(MOST_PROBLEMS).filter(|&more| more > 0) {
-            problems.truncate(MOST_PROBLEMS);
-            let last = problems[MOST_PROBLEMS - 1].span.end;
+        if let Some(more) = problems.len().checked_sub(MAX_PROBLEMS).filter(|&more| more > 0) {
+            problems.truncate(MAX_PROBLEMS);
+            let last = problems[MAX_PROBLEMS - 1].span.end;
             problems.push(Problem {
                 span: last..last,
                 key: String::new(),
@@ -419,7 +419,7 @@ impl Shape<'_, '_> {
             // A misspelled key is reported as misspelled, and not also as missing.
             let meant = |other: &str| nearest(other, properties.keys().map(String::as_str)) == Some(key);
             let misspelt = |other: &str| !properties.contains_key(other) && meant(other);
-            if !table.contains_key(key) && !table.keys().take(MOST_PROBLEMS).any(|other| misspelt(other.as_ref())) {
+            if !table.contains_key(key) && !table.keys().take(MAX_PROBLEMS).any(|other| misspelt(other.as_ref())) {
                 self.missing(key, &properties[key]);
             }
         }

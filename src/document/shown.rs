@@ -3,8 +3,8 @@
 use std::fmt::Write;
 
 /// Maximum number of digits before the decimal point, or of zeros after it, that a person still counts.
-const MOST_DIGITS: usize = 15;
-const MOST_ZEROS: usize = 9;
+const MAX_DIGITS: usize = 15;
+const MAX_ZEROS: usize = 9;
 
 /// Returns the first character that is invisible or that changes how the rest of the text is displayed: control
 /// characters, direction marks, and characters of zero width.
@@ -57,7 +57,7 @@ pub fn countable(text: &str) -> String {
 fn is_long(number: &str) -> bool {
     let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
     let zeros = fraction.len() - fraction.trim_start_matches('0').len();
-    whole.len() > MOST_DIGITS || (whole == "0" && zeros > MOST_ZEROS && zeros < fraction.len())
+    whole.len() > MAX_DIGITS || (whole == "0" && zeros > MAX_ZEROS && zeros < fraction.len())
 }
 
 #[cfg(test)]

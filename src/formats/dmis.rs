@@ -13,7 +13,7 @@ use super::result::{Content, ResultFile, Statements};
 use regrind_core::geometry::Point;
 
 /// Maximum number of points that are read.
-const MOST_POINTS: usize = 5_000_000;
+const MAX_POINTS: usize = 5_000_000;
 /// Millimetres per inch.
 const INCH_MM: f64 = 25.4;
 /// Words that begin a DMIS file.
@@ -196,8 +196,8 @@ impl Reading {
                 field.parse::<f64>().ok().map(|number| number * unit_mm).filter(|number| is_believable(*number));
             *value = number.ok_or_else(|| unexpected(path, statement, "a coordinate", field))?;
         }
-        if self.points.len() == MOST_POINTS {
-            let (found, limit) = (MOST_POINTS as u64 + 1, MOST_POINTS as u64);
+        if self.points.len() == MAX_POINTS {
+            let (found, limit) = (MAX_POINTS as u64 + 1, MAX_POINTS as u64);
             return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "points" });
         }
         let name = before.split_once('(').and_then(|(_, rest)| rest.split_once(')')).map_or("", |(name, _)| name);

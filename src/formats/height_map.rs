@@ -7,7 +7,7 @@ use super::number::{LIMIT_MM, is_believable};
 use regrind_core::geometry::{Grid, Point};
 
 /// Maximum number of samples of a map that is read: 450 MB of them.
-pub(super) const MOST_SAMPLES: u64 = 50_000_000;
+pub(super) const MAX_SAMPLES: u64 = 50_000_000;
 
 /// Heights over a regular grid in x and y; some samples can be missing.
 ///
@@ -169,9 +169,9 @@ pub(super) fn check_size(path: &Path, columns: u64, rows: u64) -> Result<(), For
     let samples = columns.saturating_mul(rows);
     match samples {
         0 => Err(FormatError::NoData { path: path.to_owned(), expected: "samples (a side of the map is 0)" }),
-        1..=MOST_SAMPLES => Ok(()),
+        1..=MAX_SAMPLES => Ok(()),
         found => {
-            Err(FormatError::TooLarge { path: path.to_owned(), found, limit: MOST_SAMPLES, unit: "samples of a map" })
+            Err(FormatError::TooLarge { path: path.to_owned(), found, limit: MAX_SAMPLES, unit: "samples of a map" })
         }
     }
 }

@@ -15,7 +15,7 @@ use regrind_core::model::PartPriors;
 /// Name of the file in a run folder.
 pub const LEARNED: &str = "learned.json";
 /// Maximum size of the file, in bytes; a larger file is not one of Regrind's.
-const MOST_BYTES: u64 = 256 << 20;
+const MAX_BYTES: u64 = 256 << 20;
 
 /// Version of the file's layout; a file of another version is not read.
 const LAYOUT: u32 = 2;
@@ -136,13 +136,13 @@ impl Learned {
     pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
         let broken = |why| LearnedError::Broken { path: path.clone(), why };
-        let text = match read_whole(&path, MOST_BYTES) {
+        let text = match read_whole(&path, MAX_BYTES) {
             Ok(text) => text,
             Err(FormatError::Unreadable { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
                 return Ok(None);
             }
             Err(FormatError::TooLarge { found, .. }) => {
-                return Err(broken(format!("{found} bytes, more than the limit of {MOST_BYTES}")));
+                return Err(broken(format!("{found} bytes, more than the limit of {MAX_BYTES}")));
             }
             Err(error) => return Err(error.into()),
         };

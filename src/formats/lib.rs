@@ -75,7 +75,7 @@ use measured_map::map_format;
 use regrind_core::geometry::Point;
 
 /// Largest surface definition that is read, in bytes.
-const MOST_DEFINITION_BYTES: u64 = 1 << 20;
+const MAX_DEFINITION_BYTES: u64 = 1 << 20;
 
 /// Nominal surface in one of the forms that a file can have.
 #[derive(Clone, Debug, PartialEq)]
@@ -283,7 +283,7 @@ fn is_toml(head: &[u8]) -> bool {
 }
 
 fn read_definition(path: &Path) -> Result<String, FormatError> {
-    let bytes = whole::open(path)?.read_all(path, MOST_DEFINITION_BYTES)?;
+    let bytes = whole::open(path)?.read_all(path, MAX_DEFINITION_BYTES)?;
     if bytes.trim_ascii().is_empty() {
         return Err(FormatError::Empty { path: path.to_owned(), expected: "a surface definition" });
     }

@@ -18,7 +18,7 @@ const NOT_MEASURED: i32 = 2_147_483_640;
 /// Valid combinations of magic number, header format and header length.
 const HEADERS: [(u32, u16, u32); 3] = [(0x881b_036f, 1, 834), (0x881b_0370, 2, 834), (0x881b_0371, 3, 4096)];
 /// Bytes of a header that contain all fields that are read.
-const LEAST_HEADER: usize = 834;
+const MIN_HEADER: usize = 834;
 
 /// MetroPro format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
@@ -87,8 +87,8 @@ impl Header {
             expected: expected.to_owned(),
             found,
         };
-        let Some(head) = bytes.get(..LEAST_HEADER) else {
-            let expected = format!("a header of {LEAST_HEADER} bytes");
+        let Some(head) = bytes.get(..MIN_HEADER) else {
+            let expected = format!("a header of {MIN_HEADER} bytes");
             return Err(FormatError::Cut { path: path.to_owned(), place: format!("byte {}", bytes.len()), expected });
         };
         let half = |at: usize| u16::from_be_bytes([head[at], head[at + 1]]);

@@ -20,9 +20,9 @@ use super::system;
 use regrind_core::geometry::Point;
 
 /// Largest text file that is read, in bytes.
-const MOST_BYTES: u64 = 2 << 30;
+const MAX_BYTES: u64 = 2 << 30;
 /// Maximum number of points that are read: 2.4 GB of them.
-const MOST_POINTS: u64 = 100_000_000;
+const MAX_POINTS: u64 = 100_000_000;
 /// Longest line that is read, in bytes.
 const LONGEST_LINE: usize = 64 << 10;
 /// Bytes that are checked before anything is parsed.
@@ -223,7 +223,7 @@ impl<'p> Cloud<'p> {
     fn note_of_end(&self, text: &[u8]) -> Option<PointNote> {
         /// Number of lines above whose digits are compared with the last line, and the minimum number required.
         const ABOVE: usize = 1000;
-        const LEAST: usize = 3;
+        const MIN: usize = 3;
         let (layout, point) = (self.layout.as_ref()?, *self.points.last().filter(|_| self.empty_from.is_none())?);
         let mut lines = text.rsplit(|&b| b == b'\n');
         let last =
@@ -235,7 +235,7 @@ impl<'p> Cloud<'p> {
         let found = number(last);
         let here = digits_after(found);
         let fewer = |k: usize| above.iter().map(|digits| digits[k]).min().filter(|least| here[k] < *least);
-        let fewer_digits = (0..2).filter(|_| above.len() >= LEAST).find_map(|k| fewer(k).map(|least| [here[k], least]));
+        let fewer_digits = (0..2).filter(|_| above.len() >= MIN).find_map(|k| fewer(k).map(|least| [here[k], least]));
         let (path, line, found) = (self.path.to_owned(), self.lines, excerpt(found));
         Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
@@ -288,7 +288,7 @@ impl<'p> Cloud<'p> {
             self.points.reserve(expected_points(found, bytes_so_far, self.length));
         }
         shares.iter().for_each(|share| self.points.extend_from_slice(&share.points));
-        let (found, limit) = (self.points.len() as u64, MOST_POINTS);
+        let (found, limit) = (self.points.len() as u64, MAX_POINTS);
         let too_many = || FormatError::TooLarge { path: self.path.to_owned(), found, limit, unit: "points" };
         if found > limit { Err(too_many()) } else { Ok(()) }
     }
@@ -330,7 +330,7 @@ impl<'p> Cloud<'p> {
     }
 
     fn check_size(&self, bytes: u64) -> Result<(), FormatError> {
-        let (path, limit) = (self.path, MOST_BYTES);
+        let (path, limit) = (self.path, MAX_BYTES);
         let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit: "bytes" };
         if bytes > limit { Err(too_large()) } else { Ok(()) }
     }
@@ -379,7 +379,7 @@ fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     let ratio = length.max(bytes_so_far) as f64 / bytes_so_far.max(1) as f64;
     // Without this bound, a batch of very short points would reserve many times the memory that a file with a long tail
     // of comments needs.
-    ((found as f64 * ratio * 1.02) as usize).min(MOST_POINTS as usize / 4)
+    ((found as f64 * ratio * 1.02) as usize).min(MAX_POINTS as usize / 4)
 }
 
 /// Splits text into shares of whole lines, one for each thread.

@@ -19,7 +19,7 @@ use super::xml::{Beyond, beyond_bounds};
 use regrind_core::geometry::Point;
 
 /// Maximum number of nodes of a document.
-const MOST_NODES: u32 = 10_000_000;
+const MAX_NODES: u32 = 10_000_000;
 /// Namespace of QIF 3.
 const NAMESPACE: &str = "http://qifstandards.org/xsd/qif3";
 /// Prefix of the names of Regrind's attributes.
@@ -60,7 +60,7 @@ fn with_root<T>(
         let place = format!("line {line}");
         return Err(FormatError::Unexpected { path: path.to_owned(), place, expected: allowed, found });
     }
-    let options = ParsingOptions { allow_dtd: false, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+    let options = ParsingOptions { allow_dtd: false, nodes_limit: MAX_NODES, ..ParsingOptions::default() };
     let document = Document::parse_with_options(text, options).map_err(|source| FormatError::Xml {
         path: path.to_owned(),
         entry: "the document".to_owned(),

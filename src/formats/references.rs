@@ -15,7 +15,7 @@ use super::whole;
 use regrind_core::geometry::Point;
 
 /// Largest file of reference points.
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 /// Deepest nesting that is followed.
 const DEEPEST: usize = 32;
 
@@ -52,7 +52,7 @@ impl References {
 /// A file that cannot be read; a group that does not exist; a point whose coordinates are not finite numbers in
 /// millimetres.
 pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, FormatError> {
-    let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
+    let bytes = whole::open(path)?.read_all(path, MAX_BYTES)?;
     parse_references(path, &bytes, group)
 }
 

@@ -33,7 +33,7 @@ use super::{FormatError, dmis, ply, qif, whole};
 use regrind_core::geometry::Point;
 
 /// Largest result file that is read, in bytes.
-const MOST_BYTES: u64 = 512 << 20;
+const MAX_BYTES: u64 = 512 << 20;
 /// Bytes at the beginning of a file in which statements are searched.
 const PREAMBLE_BYTES: usize = 64 << 10;
 
@@ -144,7 +144,7 @@ pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
 /// # Errors
 /// A file that is not readable or too large.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
-    whole::open(path)?.read_all(path, MOST_BYTES)
+    whole::open(path)?.read_all(path, MAX_BYTES)
 }
 
 /// Reads the statements of a file, without its points.

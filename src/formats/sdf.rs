@@ -10,7 +10,7 @@ use std::path::Path;
 use super::error::{FormatError, excerpt};
 use super::foreign::check_is_ours;
 use super::height_map::{HeightMap, MapFormat, check_size};
-use super::whole::{MOST_BYTES, open};
+use super::whole::{MAX_BYTES, open};
 use regrind_core::geometry::Grid;
 
 /// Length of the binary header.
@@ -36,7 +36,7 @@ pub fn read_sdf(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
     check_version(path, &opened.head)?;
-    parse_sdf(path, &opened.read_all(path, MOST_BYTES)?)
+    parse_sdf(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
 /// Parses the bytes of an SDF file; `path` only names the file in messages.

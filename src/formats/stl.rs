@@ -10,7 +10,7 @@ use std::path::Path;
 use super::columns::{Unit, check_stated_unit};
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
-use super::whole::{MOST_BYTES, is_degenerate, open};
+use super::whole::{MAX_BYTES, is_degenerate, open};
 use regrind_core::geometry::Point;
 
 /// Number of bytes before the first facet, and of one facet, in binary.
@@ -42,11 +42,11 @@ pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
     if opened.length > opened.head.len() as u64 {
         // The beginning and the length decide, so that a large file of other content is not read.
         return match kind(path, &opened.head, opened.length)? {
-            Kind::Binary => parse_stl(path, &opened.read_all(path, MOST_BYTES)?),
+            Kind::Binary => parse_stl(path, &opened.read_all(path, MAX_BYTES)?),
             Kind::Ascii => opened.parse(path, parse_ascii),
         };
     }
-    parse_stl(path, &opened.read_all(path, MOST_BYTES)?)
+    parse_stl(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
 /// Parses the bytes of an STL file; `path` only names the file in messages.

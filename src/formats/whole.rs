@@ -10,7 +10,7 @@ use super::system;
 use regrind_core::geometry::Point;
 
 /// Largest mesh file that is read, in bytes.
-pub(super) const MOST_BYTES: u64 = 1 << 30;
+pub(super) const MAX_BYTES: u64 = 1 << 30;
 /// Number of bytes that must be valid before the rest is read.
 const HEAD: usize = 64 << 10;
 
@@ -70,7 +70,7 @@ impl Opened {
                 _ => {}
             }
         }
-        parse(path, &self.read_all(path, MOST_BYTES)?)
+        parse(path, &self.read_all(path, MAX_BYTES)?)
     }
 }
 

@@ -2,9 +2,9 @@
 //! length is rejected.
 
 /// Maximum number of attributes of an element, of namespace declarations in a document, and of nested elements.
-const MOST_ATTRIBUTES: usize = 256;
-const MOST_NAMESPACES: usize = 64;
-const MOST_DEPTH: usize = 128;
+const MAX_ATTRIBUTES: usize = 256;
+const MAX_NAMESPACES: usize = 64;
+const MAX_DEPTH: usize = 128;
 
 /// Exceeded limit of a document: the line, the limit and the value found.
 #[derive(Debug, PartialEq)]
@@ -41,9 +41,9 @@ pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
         namespaces += declarations;
         depth += usize::from(!is_empty);
         let found = [
-            (attributes, MOST_ATTRIBUTES, "attributes of an element"),
-            (namespaces, MOST_NAMESPACES, "declarations of namespaces"),
-            (depth, MOST_DEPTH, "elements within each other"),
+            (attributes, MAX_ATTRIBUTES, "attributes of an element"),
+            (namespaces, MAX_NAMESPACES, "declarations of namespaces"),
+            (depth, MAX_DEPTH, "elements within each other"),
         ];
         if let Some((found, most, what)) = found.into_iter().find(|(found, most, _)| found > most) {
             return beyond(next, most, what, found);
@@ -83,7 +83,7 @@ fn tag(bytes: &[u8], from: usize) -> Tag {
             (None, _) => {}
         }
         // An element that is rejected need not be counted to its end.
-        if tag.attributes > MOST_ATTRIBUTES {
+        if tag.attributes > MAX_ATTRIBUTES {
             break;
         }
     }

@@ -20,7 +20,7 @@ use super::system;
 const FIRST_LINE: &str =
     "# Audit key of Regrind (Ed25519). Secret: who has this file can sign records in this computer's name.";
 /// Maximum length of a key file, in bytes.
-const MOST_BYTES: u64 = 4096;
+const MAX_BYTES: u64 = 4096;
 
 /// Public half of an audit key. A record names it, and the quality department keeps it. Displayed as 64 lowercase
 /// hexadecimal digits.
@@ -130,7 +130,7 @@ impl AuditKey {
             io::ErrorKind::NotFound => broken("the file does not exist"),
             _ => failed(error),
         })?;
-        if !found.is_file() || found.len() > MOST_BYTES {
+        if !found.is_file() || found.len() > MAX_BYTES {
             return Err(broken("it is not a small file"));
         }
         if let Some(system::OpenToOthers { how, remedy }) = system::readable_by_others(path).map_err(&failed)? {

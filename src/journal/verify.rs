@@ -139,7 +139,7 @@ pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError>
 /// Maximum length of an anchor file, in bytes.
 const MAX_ANCHOR_BYTES: u64 = 4096;
 
-/// Reads at most [`MOST_OF_ANCHOR`] bytes of a file. Rejects a path that is not a regular file, which could have no
+/// Reads at most [`MAX_ANCHOR_BYTES`] bytes of a file. Rejects a path that is not a regular file, which could have no
 /// end.
 fn read_few(path: &Path) -> io::Result<Vec<u8>> {
     if !fs::metadata(path)?.is_file() {

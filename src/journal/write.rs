@@ -291,7 +291,7 @@ impl Journal {
         self.adopt_known(Artefact::from_file(&self.folder, name)?, mono_ns, cycle)
     }
 
-    /// Records a file that [`Artefact::of`] has already synced to the disk and read.
+    /// Records a file that [`Artefact::from_file`] has already synced to the disk and read.
     ///
     /// # Errors
     /// Those of [`Journal::store`].

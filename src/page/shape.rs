@@ -21,7 +21,7 @@ use tokio::task::spawn_blocking;
 use super::Shared;
 
 /// Maximum number of nodes of a map that is drawn.
-const MOST_NODES: usize = 4 << 20;
+const MAX_NODES: usize = 4 << 20;
 
 pub(crate) async fn map(State(page): State<Shared>, Path((run, cycle)): Path<(String, u32)>) -> Response {
     respond(move || {
@@ -73,7 +73,7 @@ fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
     let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
     let (columns, rows) = (columns as usize, rows as usize);
-    if columns.checked_mul(rows)? > MOST_NODES {
+    if columns.checked_mul(rows)? > MAX_NODES {
         return None;
     }
     let mut values = vec![f32::NAN; 2 * columns * rows];

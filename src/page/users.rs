@@ -27,7 +27,7 @@ const LONGEST_NAME: usize = 64;
 const SHORTEST_PASSWORD: usize = 10;
 const LONGEST_PASSWORD: usize = 256;
 /// Maximum size of the file in bytes. A longer file cannot be a list of the users of a cell.
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Role of a person at the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -144,7 +144,7 @@ impl Users {
         let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
         let found = std::fs::metadata(path).map_err(failed)?;
         let broken = |what: String| UsersError::Broken { path: path.to_owned(), what };
-        if !found.is_file() || found.len() > MOST_BYTES {
+        if !found.is_file() || found.len() > MAX_BYTES {
             return Err(broken("it is no small file".into()));
         }
         if let Some(open) = readable_by_others(path).map_err(failed)? {

@@ -17,7 +17,7 @@ use super::link::Link;
 use super::settings::ArtefactSettings;
 
 /// Maximum size of a file of learned results, the same as in the layout of the database.
-const MOST_BYTES: u64 = 4 << 20;
+const MAX_BYTES: u64 = 4 << 20;
 
 /// Prior knowledge of the plant for a first part of a kind.
 #[derive(Default)]
@@ -126,10 +126,10 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
 /// Reads a file up to the maximum size of a result, whatever size the database gives.
 fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
-    fs::File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut content)?;
+    fs::File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut content)?;
     match content.len() as u64 {
-        0..=MOST_BYTES => Ok(content),
-        _ => Err(io::Error::other(format!("it is larger than the limit of {MOST_BYTES} bytes"))),
+        0..=MAX_BYTES => Ok(content),
+        _ => Err(io::Error::other(format!("it is larger than the limit of {MAX_BYTES} bytes"))),
     }
 }
 

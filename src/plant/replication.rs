@@ -28,8 +28,8 @@ use super::link::Link;
 use super::settings::ArtefactSettings;
 
 /// Maximum number of records, and of bytes of text, in one batch.
-const MOST_RECORDS: usize = 1000;
-const MOST_BYTES: usize = 1 << 20;
+const MAX_RECORDS: usize = 1000;
+const MAX_BYTES: usize = 1 << 20;
 /// Maximum size of a content in the database.
 const MAX_CONTENT_BYTES: u64 = 256 << 20;
 
@@ -281,7 +281,7 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
         let record = record?;
         bytes += record.payload.len() + 300;
         batch.push(record);
-        if batch.len() == MOST_RECORDS || bytes > MOST_BYTES {
+        if batch.len() == MAX_RECORDS || bytes > MAX_BYTES {
             break;
         }
     }

@@ -18,7 +18,7 @@ const LETTERS: [(char, [u8; 7]); 9] = [
 const ADVANCE: usize = 6;
 const BAND: usize = 11;
 /// Minimum width of a picture with the word on it, in pixels.
-const LEAST_WIDTH: usize = 120;
+const MIN_WIDTH: usize = 120;
 const INK: [u8; 4] = [0, 0, 0, 255];
 const GROUND: [u8; 4] = [0xff, 0xc8, 0x00, 255];
 
@@ -33,9 +33,9 @@ pub(super) struct Marked {
 /// several pixels.
 pub(super) fn marked(pixels: &[[u8; 4]], columns: usize) -> Marked {
     let rows = pixels.len() / columns;
-    let enlarged = LEAST_WIDTH.div_ceil(columns);
+    let enlarged = MIN_WIDTH.div_ceil(columns);
     let width = columns * enlarged;
-    let scale = width / LEAST_WIDTH;
+    let scale = width / MIN_WIDTH;
     let band = BAND * scale;
     let mut rgba = Vec::with_capacity(4 * width * (band + rows * enlarged));
     let left = (width - (WORD.len() * ADVANCE - 1) * scale) / 2;

@@ -85,10 +85,10 @@ impl Plot {
 
     /// Returns the maximum number of ticks of the x axis. Counts get no ticks at fractions.
     fn max_x_ticks(&self) -> usize {
-        const MOST: usize = 10;
+        const MAX: usize = 10;
         let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
         let [low, high] = super::range(all());
-        if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MOST) } else { MOST }
+        if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MAX) } else { MAX }
     }
 
     /// Checks one coordinate of all points and maps their range to the pixels of the page.

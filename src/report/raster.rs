@@ -13,7 +13,7 @@ pub(super) struct Raster {
 }
 
 /// Maximum number of pixels on the longer side: finer than a screen shows a figure, and small enough for a page.
-const MOST_PIXELS: usize = 480;
+const MAX_PIXELS: usize = 480;
 
 /// Reach in pixels: gaps of up to twice this width within the cloud are filled from their sides.
 const REACH: usize = 2;
@@ -22,7 +22,7 @@ const REACH: usize = 2;
 const LINES_REACH: usize = 8;
 
 /// Minimum weight of a pixel. A pixel that gets less than this share of a sample has no value of its own.
-const LEAST_WEIGHT: f64 = 1e-3;
+const MIN_WEIGHT: f64 = 1e-3;
 
 impl Raster {
     /// Distributes each sample (x, y, value) among the four pixels around it and computes the weighted mean of each
@@ -34,7 +34,7 @@ impl Raster {
         check(title, samples)?;
         let (low, size) = extent(samples);
         let points = samples.len();
-        let spacing = spacing(size, points).max(size[0].max(size[1]) / (MOST_PIXELS - 1) as f64);
+        let spacing = spacing(size, points).max(size[0].max(size[1]) / (MAX_PIXELS - 1) as f64);
         if !(spacing > 0.0 && spacing.is_finite()) {
             return Err(ReportError::NoExtent { figure: title.into(), points });
         }
@@ -63,7 +63,7 @@ impl Raster {
                 }
             }
         }
-        sums.into_iter().map(|[sum, total]| if total >= LEAST_WEIGHT { sum / total } else { f64::NAN }).collect()
+        sums.into_iter().map(|[sum, total]| if total >= MIN_WEIGHT { sum / total } else { f64::NAN }).collect()
     }
 
     /// Fills gaps narrower than the reach with the mean of the neighbours, from the sides inwards.

@@ -17,7 +17,7 @@ use rustls::{ClientConfig, RootCertStore};
 use thiserror::Error;
 
 /// Maximum length of a password file, in bytes.
-const MOST_BYTES: u64 = 4096;
+const MAX_BYTES: u64 = 4096;
 
 /// Error of a password or of certificates.
 #[derive(Debug, Error)]
@@ -70,9 +70,9 @@ pub fn read_password(path: &Path) -> Result<String, TrustError> {
         return Err(TrustError::PasswordIsOpen { path: path.to_owned(), open });
     }
     let mut text = String::new();
-    File::open(path).and_then(|file| file.take(MOST_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
-    if text.len() as u64 > MOST_BYTES {
-        let why = format!("it is longer than {MOST_BYTES} bytes, which no password is");
+    File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
+    if text.len() as u64 > MAX_BYTES {
+        let why = format!("it is longer than {MAX_BYTES} bytes, which no password is");
         return Err(unread(io::Error::new(io::ErrorKind::InvalidData, why)));
     }
     Ok(text.trim_end_matches(['\r', '\n']).to_owned())

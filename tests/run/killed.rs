@@ -17,7 +17,7 @@ use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::seen::HandshakeEvent;
 
 /// Maximum number of kills of a part's program.
-const MOST_KILLS: usize = 3;
+const MAX_KILLS: usize = 3;
 
 /// Starts a cell whose machines outlive the program, and writes the files that the program needs to run it.
 async fn cell_that_stays() -> (Rig, PathBuf) {
@@ -44,7 +44,7 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     let folder = || run_folders(&home.join(&runs)).pop();
     let mut kills = 0;
     loop {
-        let lines = if kills < MOST_KILLS { chance.random_range(1..50) } else { usize::MAX };
+        let lines = if kills < MAX_KILLS { chance.random_range(1..50) } else { usize::MAX };
         let ended = follow(&mut running, &folder, lines);
         match ended {
             Some(0) => return (folder().unwrap(), kills),

@@ -19,7 +19,7 @@ use crate::net::Weather;
 use crate::part::Wanted;
 
 /// Maximum number of lives of the program that are cut short.
-const MOST_DEATHS: usize = 3;
+const MAX_DEATHS: usize = 3;
 
 /// First seed of the schedules whose machines have other protocols than Modbus.
 pub const OTHER_WIRES: u64 = 1_000_000;
@@ -249,7 +249,7 @@ impl Schedule {
         let speed = [2000.0, 400.0, 60.0, 10.0][chance.random_range(0..4)];
         let trusting = chance.random::<f64>() < 0.5;
         let baud = (chance.random::<f64>() < 0.25).then(|| [115_200, 57_600][chance.random_range(0..2)]);
-        let deaths = if chance.random::<f64>() < 0.4 { chance.random_range(1..=MOST_DEATHS) } else { 0 };
+        let deaths = if chance.random::<f64>() < 0.4 { chance.random_range(1..=MAX_DEATHS) } else { 0 };
         let deaths = (0..deaths).map(|_| chance.random_range(1..700)).collect::<Vec<u64>>();
         let drawn = Self { seed, speed, trusting, baud, deaths, ..Self::with_deaths(seed, Vec::new()) };
         let drawn = Self { wanted: Wanted::Good, ..drawn };

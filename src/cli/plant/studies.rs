@@ -20,7 +20,7 @@ use super::{Where, is_below, open};
 /// Time between two queries of a worker while there is no job.
 const ROUND: Duration = Duration::from_secs(5);
 /// Maximum number of jobs of one study.
-const MOST_JOBS: usize = 1_000_000;
+const MAX_JOBS: usize = 1_000_000;
 /// Quantile of the normal distribution for a 95 % interval.
 const Z: f64 = 1.96;
 
@@ -144,8 +144,8 @@ fn seeds(text: &str) -> Result<(u64, u64), String> {
     let (first, last) = text.split_once("..").ok_or_else(words)?;
     let number = |of: &str| of.trim().parse::<u64>().map_err(|_| words());
     match (number(first)?, number(last)?) {
-        (first, last) if first <= last && last - first < MOST_JOBS as u64 => Ok((first, last)),
-        _ => Err(format!("the last is at or behind the first, and there are no more than {MOST_JOBS}")),
+        (first, last) if first <= last && last - first < MAX_JOBS as u64 => Ok((first, last)),
+        _ => Err(format!("the last is at or behind the first, and there are no more than {MAX_JOBS}")),
     }
 }
 
@@ -208,9 +208,9 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
     }
     let (first, last) = arguments.seeds;
     let seeds: Vec<u64> = (first..=last).collect();
-    if seeds.len() * sets.len() > MOST_JOBS {
+    if seeds.len() * sets.len() > MAX_JOBS {
         let what =
-            format!("{} jobs are more than the {MOST_JOBS} of one study; take fewer seeds", seeds.len() * sets.len());
+            format!("{} jobs are more than the {MAX_JOBS} of one study; take fewer seeds", seeds.len() * sets.len());
         return Err(PlantError::Recipe(what).into());
     }
     let study = Study {

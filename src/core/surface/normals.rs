@@ -310,7 +310,7 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
-/// Returns at least `wanted` neighbours of a vertex, ring by ring: fewer if there are no more, and at most `MOST`.
+/// Returns at least `wanted` neighbours of a vertex, ring by ring: fewer if there are no more, and at most `MAX`.
 pub(super) fn ring_around(mesh: &MeshTopology, vertex: u32, wanted: usize) -> Vec<u32> {
     let mut ring = [0; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);

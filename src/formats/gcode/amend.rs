@@ -29,16 +29,16 @@ use regrind_core::compensation::path::{HeightField, TargetSurface, ball_displace
 use regrind_core::geometry::{Point, Vector};
 
 /// Largest program that is read, in bytes.
-const MOST_BYTES: u64 = 1 << 30;
+const MAX_BYTES: u64 = 1 << 30;
 /// Maximum number of pieces that one line is divided into.
-const MOST_POINTS: f64 = 2e6;
+const MAX_POINTS: f64 = 2e6;
 
 /// Maximum share of a program that can lie outside the map; a larger share means that the map belongs to another
 /// program or has another unit.
 const MAX_SHARE_OUTSIDE_MAP: f64 = 0.95;
 
 /// An arc stays an arc if its ends are displaced equally to within this, in millimetres.
-const MOST_WOUND_MM: f64 = 1e-3;
+const MAX_WOUND_MM: f64 = 1e-3;
 /// Rounding error of three coordinates with six decimals, in millimetres.
 const ROUNDING_MM: f64 = 2e-6;
 
@@ -102,7 +102,7 @@ pub struct Amended {
 /// one the map is based on; a program with content that cannot be corrected; a program without a move at feed, or with
 /// almost none over the map; corrected lines that do not match the base program and the map; errors of files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
-    let bytes = read_whole(base, MOST_BYTES)?;
+    let bytes = read_whole(base, MAX_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
     let text = decoded(&bytes)
         .ok_or_else(|| program("the program is not plain text", "give the program as the controller reads it"))?;
@@ -372,7 +372,7 @@ impl<'a> Rewriter<'a> {
         self.measure(way, length, &shifts)?;
         let arc = arc.filter(|_| {
             // Controls reject an arc with two radii.
-            let alike = (0.5 * tolerance).min(MOST_WOUND_MM);
+            let alike = (0.5 * tolerance).min(MAX_WOUND_MM);
             shifts.iter().all(|shift| (shift - shifts[0]).norm() <= alike)
         });
         // After a rapid move the tool is where the base program has it. A move brings it to the start of the corrected
@@ -412,7 +412,7 @@ impl<'a> Rewriter<'a> {
         let changes = if self.amendment.along_normals.is_some() { length } else { lateral };
         let mut pieces = (changes / grain).ceil().max(1.0).max(chords);
         loop {
-            if pieces > MOST_POINTS {
+            if pieces > MAX_POINTS {
                 let found = format!("the move of {length:.1} mm would be divided into {pieces:.0} pieces");
                 return Err((found, "allow a larger tolerance, or use a coarser map"));
             }

@@ -15,7 +15,7 @@ use regrind_core::geometry::{Point, Vector};
 const DIGITS_MM: f64 = 4.0 / PER_MM;
 
 /// Maximum difference between the radii at the ends of an arc, in millimetres; controls reject a larger one.
-const MOST_WOUND_MM: f64 = 0.0127 + DIGITS_MM;
+const MAX_WOUND_MM: f64 = 0.0127 + DIGITS_MM;
 
 /// Base program and corrected program, read side by side.
 pub(super) struct Check<'a> {
@@ -204,7 +204,7 @@ impl Machine {
         if begin.norm() == 0.0 {
             return Err("an arc about its own beginning".into());
         }
-        if (begin.norm() - end.norm()).abs() > MOST_WOUND_MM {
+        if (begin.norm() - end.norm()).abs() > MAX_WOUND_MM {
             return Err(format!("an arc of two radii, {:.4} and {:.4} mm", begin.norm(), end.norm()));
         }
         Ok(Round { from, to, centre: [centre.x, centre.y], axes, angle })

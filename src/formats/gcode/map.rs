@@ -11,7 +11,7 @@ use regrind_core::geometry::grid_recognition::NO_POINT;
 use regrind_core::geometry::{Grid, Point, recognise_grid};
 
 /// Largest map that is read, in bytes.
-const MOST_BYTES: u64 = 512 << 20;
+const MAX_BYTES: u64 = 512 << 20;
 
 /// Meaning of the values of a map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -75,7 +75,7 @@ impl ProgramMap {
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
     let file = crate::system::open_to_read(path).map_err(unreadable)?;
-    let mut reader = BufReader::new(file.take(MOST_BYTES + 1));
+    let mut reader = BufReader::new(file.take(MAX_BYTES + 1));
     let (mut lines, mut line, mut number, mut bytes) = (MapLines::default(), Vec::new(), 0u64, 0u64);
     loop {
         line.clear();
@@ -85,8 +85,8 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
             return lines.into_map(path);
         }
         (number, bytes) = (number + 1, bytes + taken as u64);
-        if bytes > MOST_BYTES {
-            let (path, found, limit, unit) = (path.to_owned(), bytes, MOST_BYTES, "bytes");
+        if bytes > MAX_BYTES {
+            let (path, found, limit, unit) = (path.to_owned(), bytes, MAX_BYTES, "bytes");
             return Err(GcodeError::File(FormatError::TooLarge { path, found, limit, unit }));
         }
         lines.read_line(&line).map_err(|what| {

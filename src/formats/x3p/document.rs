@@ -5,11 +5,11 @@ use std::path::Path;
 use roxmltree::{Document, Node, ParsingOptions};
 
 use crate::error::{FormatError, excerpt};
-use crate::height_map::{MOST_SAMPLES, check_size};
+use crate::height_map::{MAX_SAMPLES, check_size};
 use crate::xml::{Beyond, beyond_bounds};
 
 /// Maximum number of nodes of the document: three for each sample that it contains.
-const MOST_NODES: u32 = 10_000_000;
+const MAX_NODES: u32 = 10_000_000;
 
 /// Parts of `main.xml` that are used.
 pub(super) struct Main {
@@ -162,7 +162,7 @@ impl Main {
             let place = format!("{entry}, line {line}");
             return Err(FormatError::Unexpected { path: path.to_owned(), place, expected: allowed, found });
         }
-        let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+        let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
         let document = Document::parse_with_options(source.trim_start_matches('\u{feff}'), options)
             .map_err(|source| FormatError::Xml { path: path.to_owned(), entry: entry.to_owned(), source })?;
         Self::from_root(&place, document.root_element())
@@ -299,8 +299,8 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
     let list = child(third, "DataList").ok_or_else(|| place.missing("DataLink or DataList"))?;
     let mut records = Vec::new();
     for datum in list.children().filter(|n| n.is_element() && n.tag_name().name() == "Datum") {
-        if records.len() as u64 >= MOST_SAMPLES {
-            let (found, limit) = (records.len() as u64 + 1, MOST_SAMPLES);
+        if records.len() as u64 >= MAX_SAMPLES {
+            let (found, limit) = (records.len() as u64 + 1, MAX_SAMPLES);
             return Err(FormatError::TooLarge { path: place.path.to_owned(), found, limit, unit: "samples of a map" });
         }
         records.push(record(place, datum, axes)?);

@@ -23,19 +23,19 @@ use zip::ZipArchive;
 use super::error::{FormatError, excerpt};
 use super::height_map::{HeightMap, MapFormat, MapPoints};
 use super::number::is_believable;
-use super::whole::{MOST_BYTES, open};
+use super::whole::{MAX_BYTES, open};
 use document::{Axis, Extent, Main, Record, Samples, Sealed, is_sum};
 use regrind_core::geometry::{Grid, Point};
 pub use write::{MapRecord, escaped, write_error_map_x3p, write_x3p};
 
 /// Largest `main.xml` including heights, in bytes.
-const MOST_XML_BYTES: u64 = 64 << 20;
+const MAX_XML_BYTES: u64 = 64 << 20;
 /// Entry with the checksum of `main.xml`, if the document does not name another one.
 const SEAL: &str = "md5checksum.hex";
 /// Largest entry with a checksum, in bytes.
-const MOST_SEAL_BYTES: u64 = 4096;
+const MAX_SEAL_BYTES: u64 = 4096;
 /// Maximum number of entries of a container.
-const MOST_ENTRIES: usize = 10_000;
+const MAX_ENTRIES: usize = 10_000;
 
 /// Content of an X3P file.
 #[derive(Clone, Debug, PartialEq)]
@@ -76,7 +76,7 @@ pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
         let (place, expected) = ("byte 0".to_owned(), "a zip container".to_owned());
         return Err(FormatError::Unexpected { path: path.to_owned(), place, expected, found });
     }
-    parse_x3p(path, &opened.read_all(path, MOST_BYTES)?)
+    parse_x3p(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
 /// Parses the bytes of an X3P file; `path` only names the file in messages.
@@ -85,7 +85,7 @@ pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
 /// The same as for [`read_x3p`].
 pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
     let mut container = Container::open(path, bytes)?;
-    let xml = container.entry("main.xml", MOST_XML_BYTES)?;
+    let xml = container.entry("main.xml", MAX_XML_BYTES)?;
     // A modified document is reported as modified, before its content is used.
     container.check_sealed(SEAL, &xml)?;
     let (main, samples) = Main::parse(path, &container.name("main.xml"), &xml)?;
@@ -206,8 +206,8 @@ impl<'a> Container<'a> {
     fn open(path: &'a Path, bytes: &'a [u8]) -> Result<Self, FormatError> {
         let zip = ZipArchive::new(Cursor::new(bytes))
             .map_err(|source| FormatError::Container { path: path.to_owned(), source })?;
-        if zip.len() > MOST_ENTRIES {
-            let (found, limit) = (zip.len() as u64, MOST_ENTRIES as u64);
+        if zip.len() > MAX_ENTRIES {
+            let (found, limit) = (zip.len() as u64, MAX_ENTRIES as u64);
             return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "entries of a container" });
         }
         let mut folders: Vec<String> = Vec::new();
@@ -286,7 +286,7 @@ impl<'a> Container<'a> {
         if self.find(seal).is_none() {
             return Ok(());
         }
-        let text = String::from_utf8_lossy(&self.entry(seal, MOST_SEAL_BYTES)?).into_owned();
+        let text = String::from_utf8_lossy(&self.entry(seal, MAX_SEAL_BYTES)?).into_owned();
         match text.split_whitespace().find(|word| is_sum(word)) {
             Some(expected) => check_sum(self.path, "main.xml", xml, expected),
             None => Ok(()),
