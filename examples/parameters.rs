@@ -5,7 +5,7 @@
 //! cargo run --release --example parameters [WORLDS [FIRST [RECIPE]]]
 //! ```
 //! The program runs WORLDS (200) worlds from seed FIRST (1) on, of RECIPE (freeform-mirror). Wheel, setting and part
-//! have the errors that `tests/run/told_apart.rs` states. There are three registrations: free, with x, y and z locked,
+//! have the errors that `tests/run/identifiability.rs` states. There are three registrations: free, with x, y and z locked,
 //! and with the tilts locked. Every part is made twice from the same blank on the same machines: with parameters, and
 //! by the map alone.
 
@@ -13,7 +13,7 @@
 mod study;
 
 use rayon::prelude::*;
-use study::told_apart::{Compared, Machine, ParameterResult, corrections};
+use study::identifiability::{Compared, Machine, ParameterResult, corrections};
 use study::{After, Bench};
 
 const PASSES: u16 = 4;

@@ -12,7 +12,7 @@
 mod study;
 
 use rayon::prelude::*;
-use study::others::{Differ, Pair, TAUGHT_BY, TransferResult};
+use study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
 use study::{After, Bench, RECIPES};
 
 /// Maximum ratio of the first pass to the floor.

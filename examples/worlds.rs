@@ -10,7 +10,7 @@
 mod study;
 
 use rayon::prelude::*;
-use study::made::{Made, Measured};
+use study::made_part::{Made, Measured};
 use study::{Bench, RECIPES};
 
 fn main() {

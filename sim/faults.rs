@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_comes_once_at_its_place_after_those_that_go_well() {
+    fn pending_fault_fires_once_at_its_place() {
         let faults = PendingFaults::<String, u8>::none();
         faults.add("a", 1, 1);
         faults.add("a", 1, 2);

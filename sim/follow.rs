@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_leaves_what_its_centre_says_at_the_edge_too() {
+    fn followed_heights_match_to_the_edge() {
         let left = |x: f64, y: f64| 0.02 + 0.005 * (0.1 * x).sin() * (0.1 * y).cos();
         let (part, heights) = followed(0.5, left);
         for ([x, y], found) in part.height.nodes().zip(heights) {
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn where_it_does_not_come_it_leaves_nothing_that_is_a_number() {
+    fn unreached_heights_are_nan() {
         let part = Part::blank(&WorldSpec::default().part, 1);
         assert!(heights_mm(&part, &Program::default(), 10.0, 0.5).iter().all(|h| h.is_nan()));
     }

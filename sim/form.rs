@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_net_holds_what_the_places_do() {
+    fn form_error_grid_matches_pointwise() {
         let form = FormError::with_rms(&mut crate::rng(3), 8.0, 0.5);
         let mut values = vec![1.0; 300 * 7];
         form.add_to_grid([-40.0, 3.0], [0.5, 2.5], 300, &mut values);

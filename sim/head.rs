@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn by_hand() {
+    fn head_centre_matches_hand_calculation() {
         let head = |letter, left_handed| Head {
             letter,
             left_handed,

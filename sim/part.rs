@@ -698,7 +698,7 @@ mod tests {
     }
 
     #[test]
-    fn contact_agrees_with_a_search_over_the_surface() {
+    fn contact_matches_surface_search() {
         let part = rough_part();
         for (x, y) in [(0.1, 0.2), (37.0, -22.6), (-50.2, 30.1), (12.25, 8.75), (-20.0, -5.0)] {
             for tilt in [[0.0, 0.0, 0.0], [0.15, -0.1, 0.0]] {
@@ -723,7 +723,7 @@ mod tests {
     }
 
     #[test]
-    fn a_defect_has_its_height_in_its_middle_and_none_beyond_its_edge() {
+    fn defect_height_profile() {
         let chip =
             DefectSpec { at_mm: [10.0, -5.0], size_mm: [3.0, 4.0], height_um: -50.0, round: false, after_pass: 1 };
         let at = |defect: &DefectSpec, x: f64, y: f64| defect.height_mm([10.0 + x, -5.0 + y]);
@@ -736,7 +736,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_touches_grooves_and_ridges_and_cuts_nothing() {
+    fn contact_on_grooves_does_not_cut() {
         // A ball of 1.5 mm lies in the grooves of a wheel of 12.5 mm, hardly in those of 1.6 mm, and rides on the
         // ridges of one of 1 mm.
         for (wheel_radius_mm, spacing_mm, rides) in [(12.5, 0.5, false), (1.6, 0.3, false), (1.0, 0.2, true)] {
@@ -773,7 +773,7 @@ mod tests {
     }
 
     #[test]
-    fn grooves_are_as_the_wheel_bends_more_than_the_part() {
+    fn groove_curvature_wheel_minus_part() {
         let flat = crate::shape::Wave { height_mm: 1e-9 };
         assert!((Grooves::bend_at(&flat, 12.5, [3.0, 4.0]) - 0.08).abs() < 1e-9);
         // At the bottom of a bowl and at the top of a dome; no groove if the bowl is narrower than the wheel.
@@ -782,7 +782,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_finds_nothing_beyond_the_edge_or_the_search_and_hits_what_stands_in_its_way() {
+    fn contact_missed_or_unexpected() {
         let part = rough_part();
         let n = part.shape.normal(0.0, 0.0);
         let plain = way(&part, 0.0, 0.0, n);
@@ -795,7 +795,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_far_outside_the_domain_of_a_sphere_finds_nothing() {
+    fn contact_missed_outside_sphere_domain() {
         let spec = PartSpec {
             shape: ShapeSpec::Sphere { radius_mm: 40.0 },
             aperture: Aperture::Circle { radius_mm: 30.0 },
@@ -813,7 +813,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reference_sphere_is_touched_like_a_sphere() {
+    fn contact_on_reference_sphere() {
         let way = Approach {
             point_mm: [13.0, 0.5, 0.0],
             direction: [1.0, 0.0, 0.0],
@@ -832,7 +832,7 @@ mod tests {
     }
 
     #[test]
-    fn the_grid_has_a_true_gradient_and_passes_through_its_nodes() {
+    fn height_grid_gradient_and_node_values() {
         let part = rough_part();
         let grid = &part.height;
         for (k, [x, y]) in grid.nodes().enumerate() {

@@ -120,7 +120,7 @@ mod tests {
     use crate::shape::{FreeForm, Sphere};
 
     #[test]
-    fn a_ball_on_a_sphere_has_its_centre_on_the_concentric_sphere() {
+    fn probe_centre_concentric_on_sphere() {
         let sphere = Sphere { radius_mm: -50.0 };
         for (x, y) in [(0.0, 0.0), (10.0, -20.0), (-30.0, 5.0)] {
             let c = centre(&sphere, &FormError::none(), 1.5, x, y);
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ball_touches_and_does_not_cut() {
+    fn probe_ball_touches_without_cutting() {
         let (shape, form) = (FreeForm::default(), FormError::new(7, 30.0, 6.657e-3, 102.0, 62.0));
         let c = centre(&shape, &form, 1.5, 12.0, -8.0);
         let mut nearest = f64::INFINITY;

@@ -607,7 +607,7 @@ mod tests {
     }
 
     #[test]
-    fn every_control_reads_its_own() {
+    fn control_parses_own_dialect() {
         for (control, text) in [
             (Control::Linuxcnc, "(x)\nG21 G90 G94 G17\nG64 P0.001 Q0\nG0 Z5.0\nX1.0Y2.0\nG1 Z0.5F600\nX3.0\nM2\n"),
             (
@@ -631,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn a_head_that_stays_upright_changes_nothing_of_an_arc() {
+    fn upright_head_leaves_arc_unchanged() {
         let head =
             Head { letter: 'B', left_handed: false, range_deg: [-60.0, 60.0], pivot_mm: Some([0.0, 0.0, 180.0]) };
         for (control, text) in ARCS {
@@ -664,7 +664,7 @@ mod tests {
     ];
 
     #[test]
-    fn every_control_turns_where_the_standard_has_it() {
+    fn arc_geometry_in_each_control() {
         for (control, text) in ARCS {
             let program = control.read(text).unwrap_or_else(|why| panic!("{control:?}: {why}"));
             let rises = if control == Control::Heidenhain { 0.0 } else { 0.5 };
@@ -689,7 +689,7 @@ mod tests {
     }
 
     #[test]
-    fn arcs_that_a_control_does_not_take_are_refused() {
+    fn control_refuses_malformed_arcs() {
         for (control, from, to) in [
             (Control::Linuxcnc, "G91.1 ", ""),
             (Control::Linuxcnc, "G91.1", "G90.1"),
@@ -713,7 +713,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_go_elsewhere_is_refused() {
+    fn control_refuses_ambiguous_programs() {
         for (control, text) in [
             (Control::Linuxcnc, "G21 G90 G94\nG64\nG0 Z5\nM2\n"),
             (Control::Linuxcnc, "G21 G90 G94\nG0 Z5\nM2\n"),

@@ -317,7 +317,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gradients_and_hessians_are_the_derivatives_of_the_heights() {
+    fn shape_derivatives_match_differences() {
         let polynomial = XyPolynomial {
             normalisation_radius_mm: 50.0,
             terms: vec![(2, 0, 3.0), (1, 1, -0.7), (0, 3, 0.4), (4, 2, 0.2)],
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn the_free_form_has_slopes_to_about_thirty_degrees() {
+    fn freeform_max_slope_30_degrees() {
         let steepest = FreeForm::default()
             .grid(102.0, 62.0, 205, 125)
             .iter()

@@ -157,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_stand_high_word_first_or_low_word_first() {
+    fn word_order_encodes_u32_and_f64() {
         assert_eq!(WordOrder::Big.from_u32(0x1234_5678), [0x1234, 0x5678]);
         assert_eq!(WordOrder::Little.from_u32(0x1234_5678), [0x5678, 0x1234]);
         assert_eq!(WordOrder::Big.from_f64(-2.5e-7), [0xBE90, 0xC6F7, 0xA0B5, 0xED8D]);
@@ -168,13 +168,13 @@ mod tests {
     }
 
     #[test]
-    fn the_crc_of_modbus_is_that_of_its_specification() {
+    fn crc16_matches_modbus_specification() {
         assert_eq!(crc16(b"123456789"), 0x4B37);
         assert_eq!(crc16(&[]), 0xFFFF);
     }
 
     #[test]
-    fn the_fields_of_a_payload_add_up_to_the_lengths_of_the_map() {
+    fn payload_fields_sum_to_length() {
         let sum = |fields: &[isize]| fields.iter().map(|f| f.unsigned_abs()).sum::<usize>();
         for (kind, format, header, record) in
             [(1, 1, 64, 56), (2, 1, 96, 8), (3, 1, 128, 0), (4, 1, 0, 32), (4, 2, 0, 20), (5, 1, 0, 64)]
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_a_payload_twice_gives_it_back() {
+    fn turn_payload_twice_is_identity() {
         for (kind, format) in [(1, 1), (2, 1), (3, 1), (4, 1), (4, 2), (5, 1), (9, 1)] {
             for length in [0, 1, 7, 63, 64, 127, 128, 321] {
                 let bytes: Vec<u8> = (0..length).map(|i| i as u8).collect();
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_a_record_turns_its_words_and_not_its_bytes() {
+    fn turn_payload_swaps_words_not_bytes() {
         let mut bytes: Vec<u8> = (0..20).collect();
         turn_payload(4, 2, &mut bytes);
         assert_eq!(bytes, [2, 3, 0, 1, 4, 5, 6, 7, 10, 11, 8, 9, 14, 15, 12, 13, 18, 19, 16, 17]);

@@ -56,9 +56,9 @@ const SYSTEMS: [&str; 16] = [
     "src/cli/outside/mod.rs",
     "src/cli/outside/unix.rs",
     "src/cli/outside/windows.rs",
-    "src/control/door/mod.rs",
-    "src/control/door/unix.rs",
-    "src/control/door/windows.rs",
+    "src/control/endpoint/mod.rs",
+    "src/control/endpoint/unix.rs",
+    "src/control/endpoint/windows.rs",
     "src/device/modbus/port/mod.rs",
     "src/formats/system/mod.rs",
     "src/formats/system/unix.rs",
@@ -195,7 +195,7 @@ fn is_in(source: &Source, room: &str) -> bool {
 }
 
 #[test]
-fn no_room_names_one_that_it_must_not_know() {
+fn room_dependencies_follow_arrows() {
     let rooms = || ARROWS.iter().map(|(room, ..)| *room).chain(["cli"]);
     for (room, place, may) in ARROWS {
         // Rooms that are crates name their own files by `crate`.
@@ -213,7 +213,7 @@ fn no_room_names_one_that_it_must_not_know() {
 }
 
 #[test]
-fn every_folder_of_the_sources_is_a_room() {
+fn every_source_folder_is_a_room() {
     for folder in ["src", "src/core"] {
         for entry in fs::read_dir(root().join(folder)).unwrap().map(|entry| entry.unwrap().path()) {
             let name = entry.file_stem().unwrap().to_string_lossy().into_owned();
@@ -225,13 +225,13 @@ fn every_folder_of_the_sources_is_a_room() {
 }
 
 #[test]
-fn names_are_found_in_lists_and_paths() {
+fn named_reads_use_lists_and_paths() {
     let code = "use crate::{a::{self, X}, b, c::Y};\nlet d = crate::d::e(regrind_core::f::G);";
     assert_eq!(named(code, &["crate", "regrind_core"]), ["a", "b", "c", "d", "f"]);
 }
 
 #[test]
-fn the_core_and_the_machine_that_decides_have_no_file_no_clock_no_chance_and_no_log() {
+fn core_and_cell_are_pure() {
     for room in ["src/core", "src/cell"] {
         assert_absent(&sources(room), &IMPURE);
     }
@@ -247,7 +247,7 @@ fn dependencies(manifest: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_crates_depend_on_nothing_above_them() {
+fn crates_depend_downwards_only() {
     for (manifest, may) in [
         ("src/core/Cargo.toml", &[][..]),
         ("src/cell/Cargo.toml", &[]),
@@ -291,7 +291,7 @@ fn the_crates_depend_on_nothing_above_them() {
 }
 
 #[test]
-fn what_needs_unsafe_is_a_crate_for_tests_and_one_for_windows() {
+fn unsafe_only_in_disk_and_windows() {
     const APART: [&str; 2] = ["src/journal/tests/disk", "src/windows"];
     let workspace: toml::Table = fs::read_to_string(root().join("Cargo.toml")).unwrap().parse().unwrap();
     assert_eq!(workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(), Some("forbid"));
@@ -308,21 +308,21 @@ fn what_needs_unsafe_is_a_crate_for_tests_and_one_for_windows() {
 }
 
 #[test]
-fn only_the_command_line_prints_or_exits() {
+fn only_cli_prints_or_exits() {
     let words =
         ["println!", "print!", "eprint", "io::stdout", "io::stderr", "process::exit", "ExitCode::", "anyhow", "miette"];
     assert_absent(sources("src").iter().filter(|s| !is_in(s, "src/cli") && !is_in(s, "src/main.rs")), &words);
 }
 
 #[test]
-fn only_formats_report_journal_and_the_file_exchange_write_files() {
+fn only_four_rooms_write_files() {
     let words = ["File::create", "OpenOptions", "fs::write", "fs::rename", "fs::remove", "fs::create_dir"];
     let may = ["src/formats", "src/report", "src/journal", "src/device/exchange"];
     assert_absent(sources("src").iter().filter(|s| !may.iter().any(|room| is_in(s, room))), &words);
 }
 
 #[test]
-fn which_system_it_is_is_asked_at_few_places() {
+fn platform_code_in_listed_files() {
     let found: Vec<_> = sources("src").into_iter().chain(sources("sim")).collect();
     let (twins, others): (Vec<_>, _) = found.iter().partition(|s| SYSTEMS.iter().any(|place| is_in(s, place)));
     assert_absent(others, &OF_ONE_SYSTEM);
@@ -334,7 +334,7 @@ fn which_system_it_is_is_asked_at_few_places() {
 }
 
 #[test]
-fn the_library_does_not_know_its_command_line() {
+fn library_does_not_use_cli() {
     let found = sources("src");
     let others = found.iter().filter(|s| !is_in(s, "src/cli") && !is_in(s, "src/main.rs"));
     assert_absent(others, &["clap", "crate::cli", "mod cli"]);

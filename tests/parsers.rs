@@ -129,7 +129,7 @@ macro_rules! survives {
 
         /// Parses each sample, which succeeds unless it claims data that are not there, and each of its truncations.
         #[test]
-        fn samples_are_read_and_claims_are_not_believed() {
+        fn samples_and_truncations_parse() {
             let mut wrong = Vec::new();
             $(for (path, sample) in samples(stringify!($parser)) {
                 let claims = path.file_name().unwrap().to_string_lossy().starts_with("claims_");
@@ -154,7 +154,7 @@ survives! {
 
 /// Checks that unlimited nesting is refused before the stack overflows.
 #[test]
-fn depth_is_refused() {
+fn parsers_survive_deep_nesting() {
     for (open, inner, close) in [
         ("[", "", "]"),
         ("{\"a\":", "1", "}"),

@@ -74,7 +74,7 @@ fn one(words: &mut Vec<&str>, may: &BTreeSet<&str>) -> bool {
 }
 
 #[test]
-fn expressions_of_licences_are_understood() {
+fn licence_expressions_are_parsed() {
     let may = BTreeSet::from(["MIT", "Apache-2.0", "Unicode-3.0"]);
     for (expression, allowed) in [
         ("MIT", true),
@@ -92,13 +92,13 @@ fn expressions_of_licences_are_understood() {
 }
 
 #[test]
-fn every_crate_comes_under_a_licence_that_is_allowed() {
+fn licences_allowed_for_linux() {
     every_licence_is_allowed(&format!("{}-unknown-linux-gnu", std::env::consts::ARCH));
 }
 
 #[test]
 #[ignore = "needs the crates of Windows: cargo fetch --target x86_64-pc-windows-gnu"]
-fn every_crate_for_windows_comes_under_a_licence_that_is_allowed() {
+fn licences_allowed_for_windows() {
     every_licence_is_allowed("x86_64-pc-windows-gnu");
 }
 
@@ -123,7 +123,7 @@ fn every_licence_is_allowed(platform: &str) {
 }
 
 #[test]
-fn no_crate_is_banned_and_all_come_from_one_registry() {
+fn no_banned_crate_and_one_registry() {
     let (deny, lock) = (table("deny.toml"), table("Cargo.lock"));
     let banned = words(&deny["bans"]["deny"]);
     // One registry, or a mirror of it, and no repository.
@@ -160,7 +160,7 @@ fn files_below(folder: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_package_has_every_cell_file_dialect_and_recipe_and_may_run_what_is_run() {
+fn package_contains_shipped_files() {
     let manifest = table("Cargo.toml");
     let assets = manifest["package"]["metadata"]["deb"]["assets"].as_array().unwrap();
     let assets: Vec<[&str; 2]> = assets.iter().map(|asset| [0, 2].map(|k| asset[k].as_str().unwrap())).collect();

@@ -202,7 +202,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_read_and_refused_by_number() {
+    fn dme_line_parses_or_gives_error_code() {
         let (tag, command) = read("00014 PtMeas(X(10), Y(20.5) ,IJK(0,0,1))").unwrap();
         assert_eq!(tag.to_string(), "00014");
         let point = Argument::Name("X".into(), Some(vec![10.0]));

@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_list_is_its_rows_and_half_a_list_is_none() {
+    fn target_list_refuses_truncation() {
         let text = "# job: 3\nindex,x,y,z,nx,ny,nz,what\n7,1,2,3,0,0,1,1\n8,4,5,6,1,0,0,2\n";
         let list = List::read(text).unwrap();
         assert_eq!(list.targets[0].point_mm, [1.0, 2.0, 3.0]);

@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_eight_formats_are_written_as_their_page_has_them() {
+    fn hit_line_prints_eight_formats() {
         for (letters, whole, rotary_deg, line) in [
             (false, false, None, "100.000,200.000,300.000\r\n"),
             (false, true, None, "100000,200000,300000\r\n"),

@@ -213,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_program_says_runs_ahead_of_its_motion_but_for_an_input() {
+    fn log_precedes_motion_until_input_wait() {
         let text = "(LOG,a)\nG21 G90\nG64 P0.0001 Q0\nG0 Z5\nG1 X1.5Y-2Z0.25F600\n(LOG,b)\nM66 P0 L0\n(LOG,c)\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         let log = |word: &str| LogAction::Log(word.to_owned());
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn arcs_are_gone_along_in_their_plane_and_refused_where_they_do_not_close() {
+    fn rsh_arc_stays_in_plane_or_refused() {
         let text = "G91.1\nG0 X3Y1Z9\nG18 G3 X3Z5I0K-2F600\nG90.1 G2 X3Z9I3K7\nG91.1 X4Z5K-2\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         let mut ahead = VecDeque::new();
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loop_is_gone_through_as_often_as_it_says() {
+    fn rsh_repeat_loop_expands() {
         let text = "o<regrind> repeat [3]\nG1 X1 F60\no<regrind> endrepeat\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         program.read_on(&mut steps);

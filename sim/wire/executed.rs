@@ -212,7 +212,7 @@ mod tests {
     use crate::world::World;
 
     #[test]
-    fn a_line_is_whole_or_none() {
+    fn servo_cycle_parse_refuses_partial() {
         let cycle = ServoCycle { number: 7, place_mm: [1.5, -2.0, 30.000001], homed: true, mark: 3 };
         assert_eq!(ServoCycle::parse("7 1.500000 -2.000000 30.000001 1 3 "), Some(cycle));
         for broken in ["", "overrun", "7 1 2 3 1", "7 1 2 nan 1 0", "7 1 2 3 2 0", "-7 1 2 3 1 0", "7 1 2 3 1 0 0"] {
@@ -221,13 +221,13 @@ mod tests {
     }
 
     #[test]
-    fn a_controller_that_is_away_is_asked_for_less_and_less() {
+    fn pause_after_doubles_to_2_s() {
         assert_eq!([0, 1, 2, 3, 4, u32::MAX].map(|n| pause_after(n).as_millis()), [200, 400, 800, 1600, 2000, 2000]);
     }
 
     #[cfg(unix)]
     #[test]
-    fn a_program_that_has_nothing_to_tell_says_so_once() {
+    fn helper_error_printed_once() {
         let folder = tempfile::tempdir().unwrap();
         let [begun, said] = ["begun", "said"].map(|name| folder.path().join(name));
         assert!(Command::new("mkfifo").arg(&begun).status().unwrap().success());
@@ -245,7 +245,7 @@ mod tests {
 
     #[cfg(unix)]
     #[tokio::test]
-    async fn who_has_caught_up_has_seen_what_was_before() {
+    async fn caught_up_follows_prior_motion() {
         // A controller that prints lines only when asked: first a motion, then the mark.
         let told = "n=0; while read mark; do for z in 90 80 70; do n=$((n+1)); echo $n 0 0 $z 1 0; done; n=$((n+1)); echo $n 0 0 60 1 $mark; done";
         let mut command = Command::new("sh");

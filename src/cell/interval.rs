@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_deviates_are_those_of_their_probabilities() {
+    fn interval_deviates_match_probabilities() {
         for (p, z) in RecordedInterval::PROBABILITIES.iter().zip(RecordedInterval::DEVIATES) {
             assert!((normal_probability(z) - p).abs() < 1e-7, "{z} {p}");
             assert!((normal_deviate(*p) - z).abs() < 1e-4, "{z} {p}");
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_normal_figure_is_within_its_limit_as_the_table_says() {
+    fn probability_within_normal_interval() {
         // u = 1, so the expanded uncertainty is 1.96.
         let of = RecordedInterval::from_expanded(10.0, 1.959_963_984_540_054_2);
         for (limit, probability) in [(10.0, 0.5), (11.0, 0.841_344_7), (12.0, 0.977_249_9), (8.5, 0.066_807_2)] {
@@ -160,14 +160,14 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_without_uncertainty_is_within_or_it_is_not() {
+    fn probability_within_zero_uncertainty() {
         let of = RecordedInterval::from_expanded(5.0, 0.0);
         assert_eq!([4.9, 5.0, 5.1].map(|limit| of.probability_within(limit)), [0.001, 0.999, 0.999]);
         assert_eq!(of.quantile_mm(0.6), 5.0);
     }
 
     #[test]
-    fn what_is_on_record_decides_where_it_is_there() {
+    fn probability_within_recorded_quantiles() {
         // Only an upper bound is known: all quantiles below the median are 0.
         let quantiles: [f64; RecordedInterval::COUNT] = std::array::from_fn(|k| if k < 7 { 0.0 } else { k as f64 });
         let of = RecordedInterval { quantiles_mm: Some(quantiles), median_mm: 7.0, low_mm: 0.0, high_mm: 11.0 };

@@ -75,7 +75,7 @@ mod tests {
     use crate::table::sample_events;
 
     #[test]
-    fn every_event_comes_back_from_the_record_as_it_was() {
+    fn event_serde_round_trip() {
         let recorded = |event: &Event| serde_json::to_string(event).unwrap();
         for event in sample_events(3) {
             let text = recorded(&event);
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_missing_stays_missing() {
+    fn figures_none_and_nan_round_trip() {
         let Some(Event::Registered { figures, .. }) =
             sample_events(1).into_iter().find(|event| matches!(event, Event::Registered { .. }))
         else {

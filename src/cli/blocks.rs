@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_map_is_painted_as_it_lies_and_no_larger_than_asked() {
+    fn blocks_orientation_and_size() {
         // Above the surface on the right, below it on the left.
         let node = |i, j| node([f64::from(i), f64::from(j)], 1e-4 * f64::from(i + j) - 2.9e-3);
         let nodes: Vec<MapNode> = (0..40).flat_map(|i| (0..20).map(move |j| node(i, j))).collect();
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_extent_is_not_painted() {
+    fn blocks_refuse_map_without_extent() {
         let painted = |places: &[[f64; 2]], most| {
             Blocks::paint_error(&places.iter().map(|at_mm| node(*at_mm, 0.0)).collect::<Vec<_>>(), most)
         };
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sparkline_goes_down_with_its_figures() {
+    fn sparkline_follows_values() {
         assert_eq!(sparkline([100.0, 10.0, 1.0].into_iter()), "\u{2588}\u{2585}\u{2581}");
         assert_eq!(sparkline([5.0].into_iter()), "\u{2588}");
         assert_eq!(sparkline([].into_iter()), "");

@@ -230,7 +230,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_picture_has_place_line_marker_limit_and_remedy() {
+    fn picture_shows_place_marker_and_remedy() {
         let text = "[measure]\nprobe_radius_mm = 1500\n".to_owned();
         let problem = Problem {
             span: 28..32,

@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn words_and_their_help_are_those_of_the_enum() {
+    fn possible_values_match_enum() {
         let words = words::<Loss>();
         assert_eq!(words.iter().map(PossibleValue::get_name).collect::<Vec<_>>(), ["none", "huber", "tukey"]);
         assert!(words.iter().all(|word| word.get_help().is_some_and(|help| help.to_string().starts_with("As "))));

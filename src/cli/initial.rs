@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pose_is_read_in_every_form() {
+    fn pose_parse_accepts_every_form() {
         let rows = [[0.0, -1.0, 0.0, 5.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 1.0, 7.0], [0.0, 0.0, 0.0, 1.0]];
         let array = serde_json::to_string(&rows).unwrap();
         assert_eq!(parse(&array), Ok(rows));
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn pose_parse_refuses_malformed() {
         let wrong = |text: &str| parse(text).unwrap_err();
         assert_eq!(wrong(""), "the file is empty");
         assert_eq!(wrong("1 2 3"), "there are 3 numbers");

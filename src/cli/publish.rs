@@ -306,7 +306,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_flood_of_orders_is_a_few_lines_a_minute() {
+    fn quota_limits_lines_per_minute() {
         let began = Instant::now();
         let mut quota = Quota::new(began);
         let (mut lines, mut counted) = (0, 0);

@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_time_that_is_left_is_said_as_a_range() {
+    fn time_left_as_range() {
         let cases = [
             ([50.2, 50.4], "50 s"),
             ([28.0, 81.0], "28 to 81 s"),
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_line_is_broken_between_words_below_its_text() {
+    fn wrapped_breaks_between_words() {
         assert_eq!(wrapped("short\n  also short", 20), "short\n  also short\n");
         assert_eq!(wrapped("ALARM  one two three four", 16), "ALARM  one two\n       three\n       four\n");
         assert_eq!(wrapped("   one two three", 10), "   one two\n   three\n");
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_read_well() {
+    fn count_and_digits_formatting() {
         assert_eq!(count(451_401), "451,401");
         assert_eq!(count(28), "28");
         assert_eq!(counted(1, "point"), "1 point");

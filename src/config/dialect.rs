@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_ships_is_read_by_its_name() {
+    fn built_in_dialects_read_by_name() {
         for name in dialects() {
             let dialect =
                 read_named_dialect(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_wrong_is_told_at_its_place_with_a_remedy() {
+    fn dialect_problems_have_place_and_key() {
         let text = BUILT_IN_DIALECTS[1]
             .1
             .replace("\ndecimals = 4 ", "\ndecimals = 9 ")
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn arcs_without_the_words_of_their_centre_are_told_at_their_place() {
+    fn dialect_arcs_require_centre_words() {
         for (k, missing) in [(1, "centre_words"), (3, "centre_block")] {
             let lines = BUILT_IN_DIALECTS[k].1.lines().filter(|line| !line.starts_with(missing));
             let text = lines.collect::<Vec<_>>().join("\n");

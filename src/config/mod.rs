@@ -1,7 +1,7 @@
 //! A cell: its machines, their wires, the pose of the part in the fixture, and the limits of the machines.
 //!
 //! ```text
-//!  text -> CellFile (as written, src/config/written.rs) -> CellConfig (checked: mm, rad, s; no contradiction)
+//!  text -> CellFile (as written, src/config/tables.rs) -> CellConfig (checked: mm, rad, s; no contradiction)
 //! ```
 //!
 //! All errors of a file are reported together ([`crate::document::Problems`]), each with its line and column.

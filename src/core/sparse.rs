@@ -176,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_entries_are_those_of_the_full_inverse() {
+    fn selected_inverse_matches_full() {
         // A band matrix with a few far entries, 40 columns.
         const N: usize = 40;
         let entry = |r: usize, c: usize| match r - c {
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_definite_has_no_factor() {
+    fn indefinite_matrix_has_no_factor() {
         let pattern = SparsityPattern::new(2, vec![0, 2, 3], vec![0, 1, 1]).unwrap();
         assert!(pattern.factor(&[1.0, 2.0, 1.0]).is_none());
     }

@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn the_plan_given_back_is_no_measurement_in_any_number_of_digits() {
+    fn plan_check_refuses_copied_plan() {
         let plan = plan();
         for digits in [3, 4, 6, 9] {
             assert_eq!(plan.check(&measured(&plan, digits, |_| 0.0, |k| k)), Err(PlanMismatch::EqualsPlan), "{digits}");
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn points_in_another_order_are_not_those_of_the_plan() {
+    fn plan_check_refuses_reordered_points() {
         let plan = plan();
         let form = |k: usize| 1e-3 * (k as f64).sin();
         assert_eq!(plan.check(&measured(&plan, 6, form, |k| k)), Ok(()));

@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_begun_is_not_begun_again() {
+    fn job_memory_restores_unresolved() {
         let job = Job { job: 7, cycle: 2, digest: 9 };
         let mut kept = JobMemory { loaded: Some((Arc::new("plan"), 9)), ..JobMemory::new() };
         assert_eq!(kept.arm(job).start_sequence, 1);

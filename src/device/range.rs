@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_of_a_measurement_that_cannot_be_is_named_with_its_range() {
+    fn measurement_range_violation_is_named() {
         assert_eq!(measurement().range_violation(), None);
         let untold = Measurement { temperature_c: None, duration_s: None, probe_radius_mm: None, ..measurement() };
         assert_eq!(untold.range_violation(), None);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_of_a_status_that_cannot_be_is_told_and_the_others_are_kept() {
+    fn plausible_status_drops_bad_value() {
         let machine: Arc<str> = "a machine".into();
         for (temperature_c, progress) in [(Some(20.0), (0, 0)), (None, (7, 7)), (Some(-40.0), (0, 1000))] {
             assert_eq!(plausible_status(temperature_c, progress), (temperature_c, Some(progress), Vec::new()));

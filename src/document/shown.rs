@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_nobody_counts_have_an_exponent() {
+    fn countable_uses_exponents() {
         for (text, expected) in [
             (format!("is {} mm", 1e300), "is 1e300 mm".to_owned()),
             (format!("is {} mm, more than {}", -2.5e22, 0.5), "is -2.5e22 mm, more than 0.5".into()),
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn text_that_reads_otherwise_than_it_is_is_told_and_shown() {
+    fn misleading_finds_hidden_characters() {
         for (text, found) in [
             ("free\u{202e}form", Some('\u{202e}')),
             ("bell\u{7}", Some('\u{7}')),

@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_start_is_answered_by_what_is_known_of_it() {
+    fn answers_matches_start_outcome() {
         let start = Command::StartMachine { device: Device::Grinder, cycle: 2 };
         let by = |event: Event| answers(&event, &start);
         assert!(by(Event::Started { device: Device::Grinder, cycle: 2 }));

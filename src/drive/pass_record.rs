@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ring_needs_half_of_its_own_tracks_and_a_part_without_an_outline_a_quarter_of_its_rectangles() {
+    fn pass_record_path_limit_by_aperture() {
         let ring = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 27.0, outer_radius_mm: 31.0 };
         let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
         // 728.8 mm2 with tracks every 0.5 mm.
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_that_cannot_be_is_named_with_its_limit() {
+    fn pass_record_names_violated_limit() {
         assert_eq!(checked(&record()), None);
         let cases = [
             (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, but map 03030303 was sent"),
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_told_is_not_judged_and_no_number_is_not_believed() {
+    fn pass_record_allows_absent_refuses_nan() {
         let untold = PassRecord {
             path_mm: None,
             removed_mm3: None,

@@ -933,7 +933,7 @@ mod tests {
     }
 
     #[test]
-    fn repeated_touches_replace_outliers_and_keep_controls() {
+    fn repeat_touches_replace_outliers() {
         let (again, points) = first_touches();
         let (all, found) = merge_repeated_touches(&again, &points, &repeated_measurement(heights([1.001; 4]))).unwrap();
         assert_eq!((found, all.repeat_rounds, all.part.len()), (6, 1, 6));
@@ -943,7 +943,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missed_outlier_keeps_its_first_touch() {
+    fn repeat_touches_missed_uses_first() {
         let (again, points) = first_touches();
         let missed = [None, Some(1.0), Some(1.0), Some(1.0), Some(1.0), None];
         let (all, found) = merge_repeated_touches(&again, &points, &repeated_measurement(missed)).unwrap();
@@ -951,7 +951,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_that_moved_between_the_touches_is_refused() {
+    fn repeat_touches_refuse_moved_part() {
         let (again, points) = first_touches();
         // A tilt changes only the far control points.
         for controls in [[1.0021; 4], [0.9979; 4], [1.0, 1.001, 1.0022, 1.0033]] {
@@ -963,7 +963,7 @@ mod tests {
     }
 
     #[test]
-    fn without_two_control_points_the_touches_are_refused() {
+    fn repeat_touches_require_two_controls() {
         let (again, points) = first_touches();
         let missed = [Some(1.0), Some(1.0), None, None, None, Some(1.0)];
         assert!(matches!(
@@ -973,7 +973,7 @@ mod tests {
     }
 
     #[test]
-    fn centres_and_contact_points_are_not_mixed() {
+    fn repeat_touches_refuse_mixed_kinds() {
         let (again, points) = first_touches();
         let contacts = Measurement { coordinates: Coordinates::Contacts, ..repeated_measurement(heights([1.0; 4])) };
         assert!(matches!(merge_repeated_touches(&again, &points, &contacts), Err(GateFailure::Broken(_))));

@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_is_told_along_the_normals_without_the_sphere_and_what_was_not_touched() {
+    fn preview_statistics_along_normals() {
         let mut touching = PreviewAccumulator::default();
         assert_eq!(touching.statistics(), None);
         touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_follow_or_is_of_another_plan_makes_it_nothing() {
+    fn preview_statistics_reset_on_mismatch() {
         for wrong in [
             centres(3, &[0.001]),
             PreliminaryPoints { job: Job { job: 2, ..JOB }, ..centres(2, &[0.001]) },

@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_job_is_left_what_is_left_of_it() {
+    fn progress_estimator_steady_job() {
         let mut pace = ProgressEstimator::default();
         assert_eq!(pace.progress(), None);
         for k in 0..=500_u32 {
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_job_that_slows_down_is_left_a_range() {
+    fn progress_estimator_slowing_job() {
         let mut pace = ProgressEstimator::default();
         for k in 0..100_u32 {
             pace.record_progress(ms(100 * u64::from(k)), JOB, k, 200);
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_has_no_pace_and_what_is_over_no_progress() {
+    fn progress_estimator_hold_and_next_job() {
         let mut pace = ProgressEstimator::default();
         for k in 0..20_u32 {
             pace.record_progress(ms(100 * u64::from(k)), JOB, k, 100);
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_job_without_parts_is_at_its_end() {
+    fn progress_estimator_empty_job() {
         let mut pace = ProgressEstimator::default();
         pace.record_progress(ms(0), JOB, 0, 0);
         pace.record_progress(ms(1000), JOB, 0, 0);

@@ -1140,7 +1140,7 @@ mod tests {
     use super::*;
 
     #[tokio::test(start_paused = true)]
-    async fn a_loop_that_hangs_is_not_felt() {
+    async fn watchdog_detects_hung_loop() {
         let pulse = LoopWatchdog::new();
         assert!(pulse.is_alive());
         tokio::time::advance(WATCHDOG_TIMEOUT).await;

@@ -623,7 +623,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_comment_states_a_unit() {
+    fn comment_states_unit() {
         let cases = [
             ("Units : Inch, made by hand", Some("inch")),
             ("unit = mm", Some("mm")),
@@ -651,7 +651,7 @@ mod tests {
     }
 
     #[test]
-    fn a_comment_states_the_unit_of_the_heights() {
+    fn comment_states_height_unit() {
         for (text, of_heights, of_all) in [
             ("height in um", "um", None),
             ("Heights: microns", "microns", None),
@@ -670,7 +670,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_are_written_as_they_are_read() {
+    fn columns_display_round_trip() {
         for text in ["x=x act,y=y act,z=z act", "x=4,y=5,z=6", "x=2,y=b,z=1"] {
             assert_eq!(text.parse::<Columns>().unwrap().to_string(), text);
         }
@@ -682,7 +682,7 @@ mod tests {
     }
 
     #[test]
-    fn an_axis_is_named_with_the_points_it_belongs_to() {
+    fn axis_of_recognizes_groups() {
         for (name, axis, group) in [
             ("x", 0, Group::Plain),
             ("z coordinate", 2, Group::Plain),
@@ -704,7 +704,7 @@ mod tests {
     }
 
     #[test]
-    fn one_group_of_columns_is_read_and_two_are_a_question() {
+    fn chosen_axes_require_one_group() {
         assert_eq!(axes("x,y,z").chosen(false), Ok([0, 1, 2]));
         assert_eq!(axes("Y_act,X_act,Z_act").chosen(false), Ok([1, 0, 2]));
         assert_eq!(axes("Nr,X_nom,Y_nom,Z_nom").chosen(true), Ok([1, 2, 3]));
@@ -724,7 +724,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_are_given_by_name_or_number() {
+    fn columns_by_name_or_number() {
         let names = ["nr", "x_nom", "x_act [mm]", "y_act", "z_act", "y_act"].map(str::to_owned);
         let places = |text: &str| text.parse::<Columns>().unwrap().places(&names, 6);
         assert_eq!(places("z=Z_act,x=X_act,y=4"), Ok([2, 3, 4]));
@@ -740,7 +740,7 @@ mod tests {
     }
 
     #[test]
-    fn a_unit_is_asked_for_by_any_of_its_words() {
+    fn unit_parses_synonyms() {
         for (word, in_mm) in
             [("mm", 1.0), ("Inch", 25.4), ("zoll", 25.4), ("\u{b5}m", 1e-3), ("microns", 1e-3), ("m", 1000.0)]
         {
@@ -750,7 +750,7 @@ mod tests {
     }
 
     #[test]
-    fn a_unit_is_split_off_the_name() {
+    fn split_unit_from_column_name() {
         assert_eq!(split_unit("x_inch"), ("x", Some("inch".to_owned())));
         assert_eq!(split_unit("x (nominal)"), ("x (nominal)", None));
     }

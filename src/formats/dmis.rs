@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn the_actual_points_come_with_their_targets_and_what_the_file_is_about() {
+    fn dmis_reads_points_and_targets() {
         let found = parsed(&file()).unwrap();
         assert_eq!(found.points, [Point::new(1.5, -2.25, 3.0), Point::new(4.0, 5.0, 6.0)]);
         assert_eq!((found.indices.as_deref(), found.coordinates), (Some(&[7, 9][..]), Some(Coordinates::Centres)));
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_no_number_is_told_with_its_line() {
+    fn dmis_errors_name_their_line() {
         for (of, with, why) in [
             ("ENDFIL\n", "", "expected ENDFIL at the end"),
             ("UNITS/MM, ANGDEC\n", "", "line 8: expected UNITS above the first point"),

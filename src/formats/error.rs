@@ -218,7 +218,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_piece_of_a_file_cannot_disturb_a_terminal() {
+    fn excerpt_escapes_control_characters() {
         assert_eq!(excerpt(b"abc \r\n"), "abc");
         assert_eq!(excerpt(b"\x1b[2J\xff"), "\\u{1b}[2J\u{fffd}");
         assert_eq!(excerpt(&[b'a'; 1000]).len(), 43);

@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_created_goes_away_unless_it_is_kept() {
+    fn result_folder_dropped_without_keep() {
         let home = tempfile::tempdir().unwrap();
         let deep = home.path().join("a/b/c");
         drop(ResultFolder::prepare(&deep).unwrap());
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_in_the_way_is_an_error() {
+    fn result_folder_refuses_file_in_path() {
         let file = tempfile::NamedTempFile::new().unwrap();
         for path in [file.path().to_owned(), file.path().join("below")] {
             assert!(matches!(ResultFolder::prepare(&path), Err(FormatError::Unwritable { .. })), "{path:?}");

@@ -169,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn other_files_are_called_by_their_names() {
+    fn foreign_recognizes_formats() {
         let step = b"ISO-10303-21;\nHEADER;\n";
         let iges = format!("{:72}S      1\n1H,,1H;\n", "case");
         let wide: Vec<u8> = b"VERS 1\nMODE SEQ\nSURF 0\n".iter().flat_map(|b| [*b, 0]).collect();
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_read_is_not_foreign() {
+    fn foreign_ignores_supported_files() {
         let x3p = b"PK\x03\x04\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x08\0\0\0main.xml";
         let dense = b"5 5 5 5 0 0 0\n5 5 5 5 0 0 0\n";
         for head in [&x3p[..], b"1,2,3\n", b"aISO-1.0\n", b"x,y,z\n1,2,3\n", b"ply\n", dense, b"", b"DIM x y\n", b"S"] {

@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_measured_is_no_point() {
+    fn height_map_skips_unmeasured() {
         let some = |k: i32| (k != 4).then(|| f64::from(k));
         let map = map(&(0..6).map(some).collect::<Vec<_>>()).unwrap();
         let points = map.points();
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn one_height_far_from_all_others_is_a_mark() {
+    fn check_marks_refuses_fill_values() {
         let told = |heights: &[f64]| check_marks(Path::new("m"), heights.iter().copied()).map_err(|e| e.to_string());
         let form = [0.0, 1e-3, 2e-3, 0.5e-3, 1e-3];
         for mark in [-9.999, 9.999, -0.05] {
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_map_is_refused() {
+    fn height_map_refuses_bad_input() {
         let full = [Some(0.0); 6];
         assert!(map(&full).is_ok());
         let told = |made: Result<HeightMap, FormatError>| made.unwrap_err().to_string();

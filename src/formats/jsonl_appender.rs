@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_added_behind_those_that_are_there() {
+    fn jsonl_appender_appends_lines() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lines");
         for line in 1..=2 {

@@ -456,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_is_split_at_separators_outside_quotes() {
+    fn fields_split_outside_quotes() {
         assert_eq!(fields(" 1 , \"2,5\",3", Separator::Comma), ["1", "2,5", "3"]);
         assert_eq!(fields("\ta b\t\t", Separator::Tab), ["", "a b", "", ""]);
         assert_eq!(fields("  1 \t 2   3  ", Separator::Blank), ["1", "2", "3"]);
@@ -465,7 +465,7 @@ mod tests {
     }
 
     #[test]
-    fn the_separator_is_the_one_that_gives_a_point() {
+    fn data_separator_yields_a_point() {
         let cases = [
             ("1,2,3", Separator::Comma),
             ("1, 2, 3", Separator::Comma),

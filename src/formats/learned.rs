@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read_back_with_its_text() {
+    fn learned_read_round_trip() {
         let text = serde_json::to_string(&learned()).unwrap();
         let (back, bytes) = read(&text).unwrap().unwrap();
         assert_eq!(back.correction, learned().correction);
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_found_is_begun_with_and_says_where_it_came_from() {
+    fn learned_from_others_names_sources() {
         let mut alike = MachineSimilarity::default();
         alike.add_statement(0.1);
         let of = |cell: &str| {
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_are_kept_and_a_file_without_them_has_taught_nothing_of_them() {
+    fn learned_fields_round_trip() {
         let mut fields = PartPriors::default();
         fields.update(
             true,
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn what_another_part_or_version_left_is_in_nobodys_way() {
+    fn learned_ignores_other_settings() {
         let text = serde_json::to_string(&learned()).unwrap();
         for (from, to) in
             [("a part", "another"), ("\"simulation\":true", "\"simulation\":false"), ("\"layout\":2,", "")]
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_refused_with_its_place() {
+    fn learned_refuses_impossible_values() {
         let text = serde_json::to_string(&learned()).unwrap();
         let broken = |from: &str, to: &str| {
             assert!(text.contains(from), "no {from} in {text}");

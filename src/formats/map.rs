@@ -169,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_map_is_read_back_without_the_nodes_where_nothing_was_measured() {
+    fn error_map_read_skips_unmeasured() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("error_map.csv");
         let read = |text: &str| {

@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_notation_has_one_meaning_or_none() {
+    fn coordinate_notations() {
         let point = |text: &str| coordinate(text.as_bytes(), Decimal::Point);
         let comma = |text: &str| coordinate(text.as_bytes(), Decimal::Comma);
         for (text, value) in [("1", 1.0), ("+.5", 0.5), ("-3.", -3.0), ("1e3", 1000.0), ("-2,512.1218", -2512.1218)] {
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn the_digits_behind_the_mark_and_in_the_exponent_are_counted() {
+    fn digits_after_mark_and_exponent() {
         let cases = [
             ("12", [0, 0]),
             ("-1.25", [2, 0]),
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn blanks_group_thousands_only_in_threes() {
+    fn without_blanks_groups_thousands() {
         let without = |text: &str| without_blanks(text.as_bytes()).map(|t| String::from_utf8(t).unwrap());
         assert_eq!(without("1 234,56").as_deref(), Some("1234,56"));
         assert_eq!(without("-1\u{a0}234\u{202f}567.5").as_deref(), Some("-1234567.5"));
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_tells_the_mark_only_if_it_can() {
+    fn evidence_of_decimal_mark() {
         let says = |text: &str| evidence(text.as_bytes());
         assert_eq!(says("1.5"), Evidence::Says(Decimal::Point));
         assert_eq!(says("2,512.1"), Evidence::Says(Decimal::Point));

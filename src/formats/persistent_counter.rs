@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_is_kept_and_belongs_to_one() {
+    fn persistent_counter_is_exclusive() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("number");
         let mut number = PersistentCounter::lock(&path).unwrap().unwrap();

@@ -572,7 +572,7 @@ mod tests {
         Layout { separator: Separator::Comma, columns: [0, 1, 2], count: 3, decimal: Decimal::Point, first_line: 1 };
 
     #[test]
-    fn shares_are_whole_lines_and_together_the_text() {
+    fn split_at_lines_loses_nothing() {
         for (line, count) in [("1,2,3\n", 200_000), ("\n", 600_000), ("no end", 90_000)] {
             let text = line.repeat(count).into_bytes();
             let shares = split_at_lines(&text);
@@ -582,7 +582,7 @@ mod tests {
     }
 
     #[test]
-    fn the_quick_way_declines_what_is_not_plain() {
+    fn quick_line_declines_odd_lines() {
         let quick = |line: &str| quick_line(line.as_bytes(), &COMMAS);
         assert_eq!(quick(" 1,2 , 3\r\nrest"), Some((Point::new(1.0, 2.0, 3.0), 10)));
         let others = [
@@ -609,7 +609,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_comments_is_given_up() {
+    fn parse_points_refuses_only_comments() {
         let comments = "# nothing but comments\n".repeat(200_000);
         assert!(matches!(parse_points("c", comments.as_bytes()), Err(FormatError::TooLarge { .. })));
         let mut blank = vec![b'\n'; 5 << 20];

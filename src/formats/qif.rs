@@ -293,7 +293,7 @@ mod tests {
                        <Compensated>false</Compensated><ProbeRadius>1.5</ProbeRadius></MeasuredPointSet>";
 
     #[test]
-    fn a_point_set_is_read_in_its_unit_with_what_its_points_are() {
+    fn qif_reads_point_set() {
         let found = parsed(&document(SET)).unwrap();
         assert_eq!(found.points, [Point::new(1.5, -2.25, 3.0), Point::new(4.0, 5.0, 6.0)]);
         assert_eq!(
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn point_features_have_the_targets_of_their_names() {
+    fn qif_point_features_name_targets() {
         let features = "<FeatureItems><PointFeatureItem id=\"3\"><FeatureName>P17</FeatureName></PointFeatureItem></FeatureItems>\
             <MeasuredFeatures n=\"1\"><PointFeatureMeasurement id=\"4\"><FeatureItemId>3</FeatureItemId>\
             <Location>1 2 3</Location></PointFeatureMeasurement></MeasuredFeatures>";
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_no_number_is_told_with_its_line_and_element() {
+    fn qif_errors_name_line_and_element() {
         for (of, with, why) in [
             ("4 5 6", "4 5", "line 6, element Points: expected three numbers for each point"),
             ("4 5 6", "4 five 6", "line 6, element Points: expected a coordinate, found `five`"),

@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn nested_lists_and_names_are_understood() {
+    fn references_from_nested_yaml() {
         let bare =
             yaml("primary:\n- - 2401.1\n  - -2698.6\n  - 4819.4\n- - -2397.5\n  - 1\n  - 2e3\n", Some("primary"))
                 .unwrap();
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_point_is_refused_with_its_line() {
+    fn references_errors_name_their_line() {
         for (text, expected) in [
             ("p:\n- [1, 2]\n", "line 2: expected three finite numbers in mm, found 2 entries"),
             ("p:\n- [1, 2, 3]\n- [1, .nan, 3]\n", "line 3: expected three finite numbers in mm, found `.nan`"),
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn point_files_give_names_by_a_column() {
+    fn references_names_from_column() {
         let file = parse_references(Path::new("r.csv"), b"name,x,y,z\nleft,1,2,3\nright,4,5,6\n", None).unwrap();
         assert_eq!(file.name(1), "right");
         let file = parse_references(Path::new("r.txt"), b"1 2 3\n4 5 6\n", None).unwrap();

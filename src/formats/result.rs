@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tracker_export_is_read_as_it_is() {
+    fn tracker_export_is_read() {
         let text = "Enabled\tFeature\tID\tx         \ty          \tz         \ti\tj\tk\tDev From Fit\tDevice Position  \tProbe\tDevice Name\r\n\
              Checked\tM1_1   \t1  \t2,512.1218\t2,217.6752 \t2,370.7970\t \t \t \t21.4291     \tDevice Position 1\t38.1 \tV2\r\n\
              Unchecked\tM1_1   \t2  \t2,512.3458\t2,217.6435 \t2,370.7684\t \t \t \t21.4669     \tDevice Position 1\t38.1 \tV2\r\n\
@@ -478,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn a_probe_has_the_decimal_mark_of_its_file() {
+    fn probe_radius_uses_decimal_mark() {
         let text = "# a comment\nname;x;y;z;probe\na;1,5;2,5;3,5;38,1\nb;4;5;6;38,1\n";
         let comma = Content { decimal: DecimalMark::Comma, ..Content::default() };
         for content in [&Content::default(), &comma] {
@@ -490,7 +490,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_file_says_of_itself_is_read_and_held_against_the_cell() {
+    fn statements_checked_against_cell() {
         let text = "# Part: SN 7\n# cycle = 2\n# coordinates: probe centres\n# Probe_radius_mm: 1.5\n# temperature c: 20.5\n\
                     index,x,y,z\n4,1,2,3\n9,4,5,6\n";
         let found = parse(text, &Content::default()).unwrap();
@@ -518,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn inches_are_converted_only_where_the_cell_says_so() {
+    fn inches_require_cell_unit() {
         let text = "# units: inch\n1,2,4\n";
         assert!(matches!(parse(text, &Content::default()), Err(FormatError::Contradiction { key: "the unit", .. })));
         let inch = Content { unit: Unit::Inch, ..Content::default() };
@@ -529,7 +529,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cell_says_which_columns_are_read_and_in_which_unit() {
+    fn cell_selects_columns_and_units() {
         let text = "index,X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n4,1,2,3,1.5,2.5,3.5\n9,4,5,6,4.5,5.5,6.5\n";
         assert!(matches!(parse(text, &Content::default()), Err(FormatError::HeaderNames { line: 1, .. })));
         let columns = "x=X_act,y=Y_act,z=Z_act".parse().ok();
@@ -546,7 +546,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_of_every_country_are_read_once_for_the_whole_file() {
+    fn decimal_marks_of_every_locale() {
         let read = |text: &str| parse(text, &Content::default()).map(|f| f.points);
         let expected = [Point::new(1234.56, -2.5, 3.0), Point::new(7.25, 8.5, 1e6)];
         for text in [
@@ -566,7 +566,7 @@ mod tests {
     }
 
     #[test]
-    fn a_last_line_without_an_end_is_not_the_end() {
+    fn check_ended_requires_line_end() {
         let is_ended = |text: &str| check_ended(Path::new("r.csv"), text.as_bytes()).is_ok();
         assert!(is_ended("1,2,3\n") && !is_ended("1,2,3") && !is_ended(""));
     }

@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_parser_would_take_long_for_is_refused_with_its_line() {
+    fn beyond_bounds_refuses_costly_xml() {
         let attributes = |count: usize| (0..count).map(|k| format!(" a{k}='>'")).collect::<String>();
         let namespaces = |count: usize| (0..count).map(|k| format!("<e xmlns:n{k} = \"x\"/>")).collect::<String>();
         let nested = |count: usize| "<e>".repeat(count) + &"</e>".repeat(count);

@@ -22,7 +22,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_time_has_nine_digits_behind_its_second() {
+    fn utc_has_nanoseconds() {
         let at = SystemTime::UNIX_EPOCH + Duration::new(1_783_166_400, 120_000_000);
         assert_eq!(utc(at), "2026-07-04T12:00:00.120000000Z");
         assert_eq!(utc_to_the_second(at), "2026-07-04T12:00:00Z");
@@ -30,7 +30,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_was_never_set_is_told_as_its_beginning() {
+    fn utc_before_epoch_is_epoch() {
         assert_eq!(utc(SystemTime::UNIX_EPOCH - Duration::from_secs(1)), "1970-01-01T00:00:00.000000000Z");
     }
 }

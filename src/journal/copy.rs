@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_comes_back_is_proven_as_it_was() {
+    fn restored_run_verifies() {
         let home = tempfile::tempdir().unwrap();
         let [from, to] = ["there", "here"].map(|name| home.path().join(name));
         let key = AuditKey::new();
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_that_the_journal_does_not_write_is_no_record() {
+    fn of_text_refuses_other_spellings() {
         let home = tempfile::tempdir().unwrap();
         drop(Journal::create(home.path().join("run"), header("run")).unwrap());
         let record = Reader::open(home.path().join("run")).unwrap().records(1).next().unwrap().unwrap();

@@ -191,7 +191,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn signatures_are_those_of_rfc_8032() {
+    fn signatures_match_rfc_8032() {
         // RFC 8032, section 7.1, test 2.
         let seed = unhex("4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb").unwrap();
         let key = AuditKey::from_seed(seed);

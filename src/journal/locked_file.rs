@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_free_at_once_though_a_program_that_was_just_started_has_it_open_still() {
+    fn held_file_released_despite_child() {
         let folder = tempfile::tempdir().unwrap();
         let open = || File::create(folder.path().join("lock")).unwrap();
         let file = open();
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn who_only_looks_turns_nobody_away_and_who_holds_does() {
+    fn held_file_waits_for_shared_lock() {
         let folder = tempfile::tempdir().unwrap();
         let open = || File::create(folder.path().join("lock")).unwrap();
         let looking = open();

@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_a_kill_left_is_whole_and_one_that_is_damaged_or_gone_is_told() {
+    fn may_be_lost_detects_damaged_wal() {
         let (_home, folder, log) = broken_off(12);
         assert_eq!(may_be_lost(&folder).unwrap(), None);
         let path = folder.join("journal.sqlite-wal");
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_cycle_is_that_of_the_highest_number() {
+    fn newest_cycle_by_number() {
         let home = tempfile::tempdir().unwrap();
         assert_eq!(newest_cycle(home.path()), 0);
         for name in ["cycle-2", "cycle-10", "cycle-x", "other-30"] {

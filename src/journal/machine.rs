@@ -154,7 +154,7 @@ impl MachineLock {
                 Ok(file) => file,
                 Err(what) => return Ok(Err(what)),
             };
-            let told = file.told.as_ref().unwrap_or(&file.lock);
+            let told = file.holder_file.as_ref().unwrap_or(&file.lock);
             let held = match LockedFile::lock(again(&file.lock, &path)?) {
                 Ok(held) => held,
                 Err(TryLockError::WouldBlock) => {
@@ -176,7 +176,7 @@ impl MachineLock {
                 self.believe(&text_of(told), &path);
             }
             self.held.push(held);
-            self.holder_files.extend(file.told);
+            self.holder_files.extend(file.holder_file);
             return Ok(Ok(()));
         }
         Ok(Err("it is removed repeatedly".to_owned()))
@@ -226,7 +226,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_machine_is_taken_once_and_who_has_it_is_named() {
+    fn machine_lock_names_its_owner() {
         let folder = tempfile::tempdir().unwrap();
         let take = |address, run| MachineLock::acquire_in(folder.path(), address, Path::new(run));
         let first = take("grinder at 10.0.0.6:502, unit 1", "runs/a").unwrap();
@@ -240,7 +240,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_cell_is_found_by_its_lock_where_a_door_lies_beside_it() {
+    fn doors_in_finds_running_cells() {
         let place = tempfile::tempdir().unwrap();
         let run = Path::new("/home/anna/runs, old/a, process 7");
         let lock = MachineLock::acquire_in(place.path(), "grinder at 10.0.0.6:502, unit 1", run).unwrap();
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn an_epoch_rises_for_each_machine_whatever_the_clock_does() {
+    fn epoch_is_monotonic_per_machine() {
         let folder = tempfile::tempdir().unwrap();
         let take = |address: &str| MachineLock::acquire_in(folder.path(), address, Path::new("runs/a")).unwrap();
         let epoch = |addresses: &[&str], clock| {
@@ -313,7 +313,7 @@ mod strangers {
     }
 
     #[test]
-    fn a_link_another_name_a_pipe_or_a_large_file_in_place_of_a_lock_is_left_alone() {
+    fn machine_lock_ignores_unsafe_file() {
         type Lays = fn(&Path, &Path);
         let lays: [(&str, Lays); 5] = [
             ("it is a link", |lock, precious| symlink(precious, lock).unwrap()),
@@ -338,7 +338,7 @@ mod strangers {
     }
 
     #[test]
-    fn a_folder_that_is_a_link_or_lets_others_take_files_away_is_refused_with_what_to_do() {
+    fn lock_folder_refused_if_unsafe() {
         let refused = |lay: &dyn Fn(&Path, &Path)| {
             let (place, folder, precious) = place();
             lay(&folder, place.path());
@@ -368,7 +368,7 @@ mod strangers {
     }
 
     #[test]
-    fn what_was_there_keeps_its_mode_and_what_is_made_is_for_all() {
+    fn lock_folder_and_file_modes() {
         let (place, folder, _) = place();
         fs::set_permissions(&folder, fs::Permissions::from_mode(0o700)).unwrap();
         drop(MachineLock::acquire_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap());
@@ -384,7 +384,7 @@ mod strangers {
     }
 
     #[test]
-    fn an_epoch_that_no_client_had_is_told_and_not_outbid() {
+    fn epoch_ignores_implausible_values() {
         for poison in ["4294967295", "2147483647", "-1", "x"] {
             let (place, folder, precious) = place();
             fs::write(folder.join(name()), format!("somebody\nepoch 900\nepoch {poison}\n")).unwrap();
@@ -405,7 +405,7 @@ mod strangers {
     }
 
     #[test]
-    fn a_lock_that_another_user_holds_is_a_machine_that_is_taken_and_his_process_is_named() {
+    fn machine_lock_of_another_user() {
         use std::io::{BufRead, BufReader};
         use std::process::Stdio;
         if !rustix::process::geteuid().is_root() {
@@ -428,7 +428,7 @@ mod strangers {
     }
 
     #[test]
-    fn nobody_else_can_hold_spoil_or_take_away_what_keeps_the_runs_of_a_user_apart() {
+    fn own_lock_resists_other_users() {
         if !rustix::process::geteuid().is_root() {
             return;
         }
@@ -460,7 +460,7 @@ mod strangers {
     }
 
     #[test]
-    fn a_lock_whose_name_was_taken_away_is_taken_anew() {
+    fn machine_lock_recreated_after_removal() {
         let (place, folder, precious) = place();
         drop(taken_again(place.path()));
         fs::remove_file(folder.join(name())).unwrap();

@@ -482,7 +482,7 @@ mod tests {
     }
 
     #[test]
-    fn every_single_bit_of_every_field_of_a_hundred_records_is_found_at_its_record() {
+    fn every_bit_flip_is_located() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path().join("run");
         run_of_a_hundred(&folder);

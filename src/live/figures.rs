@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn every_figure_stands_in_the_book() {
+    fn figures_documented_in_live_md() {
         let book = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/live.md")).unwrap();
         for Figure { name, kind, unit, about, .. } in FIGURES {
             let kind = match kind {
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_knows_has_no_value() {
+    fn unknown_figures_have_no_value() {
         let nothing = on(Snapshot::default());
         for name in
             ["Figures/PV", "Limits/PV", "Job/Progress", "Job/Least Time Left", "Part", "Serial", "Max Cycles", "Phase"]
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_was_left_is_not_called_idle() {
+    fn gone_run_has_no_state() {
         let gone = CellStatus {
             run_status: RunStatus::ProgramGone { run: "a run".into(), machines_within: false },
             last_run: None,

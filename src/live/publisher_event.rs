@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_nobody_hears_is_counted_and_told_later() {
+    fn full_queue_counts_refusals() {
         let (notes, mut heard) = event_queue();
         for k in 0..WAITING + 3 {
             notes.refused("somebody".into(), &format!("order {k}"));
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_from_outside_is_a_short_line_that_is_what_it_seems() {
+    fn in_a_line_cleans_and_truncates() {
         assert_eq!(in_a_line("a\nb\u{202e}c"), "a b<U+202E>c");
         assert_eq!(in_a_line(&"x".repeat(1000)).len(), LONGEST + 4);
     }

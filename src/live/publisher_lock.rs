@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_has_the_turn_and_births_are_counted_over_it() {
+    fn publisher_lock_and_bdseq_counter() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path().join("plant.live");
         for first in [0, 3] {

@@ -388,7 +388,7 @@ mod tests {
     use regrind_cell::Role;
 
     #[test]
-    fn every_alarm_is_said_in_every_language_with_each_remedy_and_the_values_of_its_case() {
+    fn alarms_translated_in_every_language() {
         for &id in AlarmId::ALL {
             let remedy = id.remedy().iter().map(|line| (*line).to_owned()).collect::<Vec<_>>();
             let what = format!("{}: grinder at 12 mm.", id.head());

@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_correction_is_expected_to_leave_is_shown_while_the_run_is_on() {
+    fn chart_forecast_while_run_is_open() {
         let mut cycles = [measured(1, 20.0, 5.0), measured(2, 5.0, 1.0)];
         cycles[0].expected = Some([4.0, 0.9]);
         let of = |cycles: &[CycleSummary], ahead| Line::new(["PV", "pv"], 0, cycles, None, ahead).forecast;
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn every_cycle_lies_on_the_chart() {
+    fn chart_shows_every_cycle() {
         let cycles = [measured(1, 28.79, 5.285), measured(2, 3.6, 0.526)];
         let svg = chart(&cycles, None, true, Language::En).into_string();
         assert_eq!(svg.matches("<circle").count(), 4, "{svg}");
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_measured_is_said() {
+    fn chart_without_measurements() {
         for cycles in [&[][..], &[CycleSummary { cycle: 1, ..CycleSummary::default() }], &[measured(1, f64::NAN, 0.0)]]
         {
             assert!(chart(cycles, None, true, Language::De).into_string().contains("gemessen"));

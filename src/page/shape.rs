@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nodes_come_on_the_grid_that_they_were_written_from() {
+    fn grid_bytes_of_unordered_nodes() {
         // Three columns and two rows, in any order. One node was not measured.
         let nodes = [[2.0, 5.5, 4e-3], [1.0, 5.0, 1e-3], [1.5, 5.0, 2e-3], [1.0, 5.5, 3e-3], [2.0, 5.0, -1e-3]];
         let bytes = grid_bytes(&nodes.map(node)).unwrap();
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_on_no_grid_is_not_drawn() {
+    fn grid_bytes_requires_regular_grid() {
         assert!(grid_bytes(&[]).is_none());
         let of = |places: &[[f64; 2]]| grid_bytes(&places.iter().map(|[x, y]| node([*x, *y, 0.0])).collect::<Vec<_>>());
         assert!(of(&[[1.0, 1.0]]).is_none(), "one node has no spacing");

@@ -421,7 +421,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_text_is_there_in_every_language() {
+    fn texts_exist_in_every_language() {
         for text in Text::ALL {
             for language in Language::ALL {
                 assert!(!text.to(language).trim().is_empty(), "{text:?} in {language:?}");
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_language_that_the_page_speaks_is_taken() {
+    fn first_of_accept_language() {
         for (tags, expected) in [
             ("de-DE,de;q=0.9,en;q=0.8", Some(Language::De)),
             ("fr, zh-Hans-CN;q=0.8", Some(Language::Zh)),

@@ -21,7 +21,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn digits_come_back_as_bytes_and_what_are_none_do_not() {
+    fn hex_round_trip_and_refusals() {
         assert_eq!(unhex(&digits(&[0, 9, 10, 255])), Some(vec![0, 9, 10, 255]));
         assert!(["0", "0A", "0g", "\u{b5}"].iter().all(|bad| unhex(bad).is_none()) && unhex("") == Some(vec![]));
     }

@@ -228,14 +228,14 @@ mod tests {
     }
 
     #[test]
-    fn the_hash_is_that_of_the_lines() {
+    fn recipe_sha256_of_its_lines() {
         let text = sha256_hex(b"[part]\n");
         let lines = format!("regrind recipe 1\nmirror\n3\n{text}\n{} a.csv\n", sha256_hex(b"1,2\n"));
         assert_eq!(recipe().sha256(), sha256_hex(lines.as_bytes()));
     }
 
     #[test]
-    fn two_people_whom_the_cell_knows_must_have_signed_what_came() {
+    fn proven_requires_two_approvers() {
         let [ada, bob, eve] = [AuditKey::new(), AuditKey::new(), AuditKey::new()];
         let known = [approver("Ada", &ada), approver("Bob", &bob)];
         let good = recipe();

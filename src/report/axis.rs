@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn ticks_stand_at_round_numbers() {
+    fn ticks_at_round_numbers() {
         assert_eq!(labels(Scale::Linear, [-51.0, 51.0], 6), ["\u{2212}40", "\u{2212}20", "0", "20", "40"]);
         assert_eq!(labels(Scale::Linear, [0.0, 1.0], 5), ["0", "0.2", "0.4", "0.6", "0.8", "1.0"]);
         assert_eq!(labels(Scale::Linear, [0.0, 3e-7], 3), ["0", "1e\u{2212}7", "2e\u{2212}7", "3e\u{2212}7"]);
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn there_are_never_too_many_and_always_some() {
+    fn tick_count_is_bounded() {
         for power in -9..9 {
             for mantissa in [1.0, 1.7, 3.3, 4.99, 7.2, 9.9] {
                 let extent = mantissa * 10f64.powi(power);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rounded_range_holds_the_given_one() {
+    fn rounded_range_contains_range() {
         let ruler = Ruler::new(Scale::Log, [3e-3, 2e4], [0.0, 80.0]).rounded(8);
         assert_eq!(ruler.range, [-3.0, 5.0]);
         assert!((ruler.pixel(1.0) - 30.0).abs() < 1e-12);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn three_digits_are_three_digits() {
+    fn three_digits_formatting() {
         assert_eq!(["6.90", "27.3", "451", "0.00412", "0"], [6.9, 27.31, 451.4, 0.004123, 0.0].map(three_digits));
     }
 }

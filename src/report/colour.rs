@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn both_arms_of_the_diverging_map_darken_steadily_and_alike() {
+    fn diverging_map_arms_darken_alike() {
         let at = |k: i32| lightness(ColourMap::Diverging.at(0.5 + f64::from(k) / 200.0));
         for k in 0..100 {
             assert!(at(k + 1) < at(k), "red arm at {k}");
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn proud_and_low_material_are_told_apart_by_eyes_that_lack_one_kind_of_cones() {
+    fn diverging_map_for_colour_blindness() {
         for (name, eye) in &EYES {
             let at = |arm: f64| lab(ColourMap::Diverging.at(0.5 + 0.5 * arm), eye);
             for k in 1..=10 {
@@ -199,13 +199,13 @@ mod tests {
     }
 
     #[test]
-    fn the_sequential_map_lightens_steadily() {
+    fn sequential_map_lightness_monotonic() {
         let at = |k: i32| lightness(ColourMap::Sequential.at(f64::from(k) / 100.0));
         assert!((0..100).all(|k| at(k + 1) > at(k)));
     }
 
     #[test]
-    fn the_band_is_a_tint_with_a_step_at_its_ends() {
+    fn tolerance_band_is_tinted() {
         let tones = Tones::symmetric(10.0, Some(4.0));
         assert_eq!((tones.range, tones.at(0.0)), ([-10.0, 10.0], [0xf7; 3]));
         assert_eq!((tones.at(10.0), tones.at(-99.0)), ([0x67, 0x00, 0x1f], [0x05, 0x30, 0x61]));
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_is_near_white_and_what_lies_beyond_takes_the_end() {
+    fn diverging_map_zero_and_ends() {
         assert_eq!(ColourMap::Diverging.at(0.5), [0xf7; 3]);
         assert_eq!(ColourMap::Diverging.at(7.0), [0x67, 0x00, 0x1f]);
         assert_eq!(ColourMap::Diverging.at(-1.0), [0x05, 0x30, 0x61]);

@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_node_is_counted_once_and_the_largest_on_either_side_has_its_bar() {
+    fn histogram_counts_every_node_once() {
         let samples: Vec<[f64; 3]> = (0..=100).map(|k| [f64::from(k), 0.0, f64::from(k) / 10.0 - 5.0]).collect();
         let svg = histogram("a <title>", &samples).unwrap();
         roxmltree::Document::parse(&svg).unwrap();

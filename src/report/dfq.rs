@@ -181,7 +181,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_text_ends_no_line() {
+    fn field_strips_line_ends() {
         let mut file = Fields::default();
         file.field("K1001", "part\r\nK2111/1 9\u{f}\u{14}\u{a4}x");
         file.field("K1002", "\n");

@@ -402,7 +402,7 @@ mod tests {
         [[0.0, 0.0, -2e-3], [1.0, 0.0, 0.0], [2.0, 0.0, 2e-3], [0.0, 1.0, 1e-3], [1.0, 1.0, 0.0], [2.0, 1.0, -1e-3]];
 
     #[test]
-    fn a_known_map_has_known_pixels() {
+    fn png_pixels_of_known_map() {
         let map = HeatMap::of_lengths("known", "height", &SMALL_MAP).unwrap();
         assert_eq!((map.unit.as_str(), map.tones.range), ("µm", [-2.0, 2.0]));
         assert!((map.pv() - 4.0).abs() < 1e-12 && (map.rms() - (10f64 / 6.0).sqrt()).abs() < 1e-12);
@@ -417,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_tolerance_is_a_tint_and_the_bar_says_so() {
+    fn tolerance_band_tinted_and_labelled() {
         let map = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(1.5e-3).unwrap();
         assert_eq!((map.limit(), map.tones.tolerance), (2.0, Some(1.5)));
         let (_, pixels) = decoded(&map.to_png().unwrap());
@@ -435,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_with_one_limit_have_one_scale_and_say_what_they_are_of() {
+    fn with_limit_sets_scale_and_labels() {
         let map = HeatMap::new("Cycle 1", "deviation", "µm", &SMALL_MAP).unwrap().of_nodes();
         let map = map.with_limit(8e-3).unwrap().with_lines(vec!["mirror, SN 7".into()]).with_max_size([200.0, 200.0]);
         assert_eq!((map.limit(), map.tones.tolerance), (8e-3, None));
@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_broken_where_the_picture_ends() {
+    fn lines_wrap_at_picture_width() {
         let line = "PV 4.00 µm, RMS 1.29 µm, 6 points";
         assert_eq!(broken(line, 33), [line]);
         assert_eq!(broken(line, 32), ["PV 4.00 µm, RMS 1.29 µm,", "6 points"]);
@@ -475,7 +475,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_of_the_aperture_nothing_is_drawn() {
+    fn aperture_masks_outside_pixels() {
         // Without an aperture, a narrow slot between two halves would be filled as a gap.
         let half = |sign: f64| (0..400).map(move |k| [sign * (1.2 + f64::from(k % 20)), f64::from(k / 20), 1e-3]);
         let samples: Vec<[f64; 3]> = half(1.0).chain(half(-1.0)).collect();
@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_measured_is_transparent() {
+    fn unmeasured_pixels_are_transparent() {
         let ring = |i: i32, j: i32| (100..=400).contains(&((i - 20).pow(2) + (j - 20).pow(2)));
         let samples: Vec<[f64; 3]> = (0..41)
             .flat_map(|j| (0..41).map(move |i| (i, j)))
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[test]
-    fn the_figure_is_well_formed_and_the_same_each_time() {
+    fn svg_well_formed_and_deterministic() {
         let map = HeatMap::of_lengths("1 < 2 & more", "height", &SMALL_MAP).unwrap();
         let svg = map.to_svg().unwrap();
         assert_eq!(svg, map.to_svg().unwrap());
@@ -518,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn not_a_number_is_refused() {
+    fn heat_map_refuses_nan() {
         let mut samples = SMALL_MAP;
         samples[4][2] = f64::NAN;
         let error = HeatMap::of_lengths("map", "height", &samples).unwrap_err();
@@ -534,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_written_whole_or_refused() {
+    fn heat_map_save_svg_and_png() {
         let folder = tempfile::tempdir().unwrap();
         let map = HeatMap::of_lengths("map", "height", &SMALL_MAP).unwrap();
         map.save_svg(&folder.path().join("a.svg")).unwrap();

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_word_stands_above_the_pixels_whatever_their_number() {
+    fn simulation_mark_above_pixels() {
         for (columns, rows) in [(1, 1), (7, 5), (103, 63), (500, 300)] {
             let pixels: Vec<[u8; 4]> = (0..columns * rows).map(|k| [k as u8, (k >> 8) as u8, 7, 255]).collect();
             let picture = marked(&pixels, columns);

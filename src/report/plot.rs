@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_is_well_formed_and_shows_every_line() {
+    fn plot_svg_shows_every_line() {
         let svg = plot(vec![[0.0, 1e4], [1.0, 1.0], [2.0, 1e-18]]).to_svg().unwrap();
         let document = roxmltree::Document::parse(&svg).unwrap();
         assert_eq!(document.descendants().filter(|n| n.has_tag_name("polyline")).count(), 18);
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_cannot_be_shown_are_refused() {
+    fn plot_refuses_unplottable_values() {
         let refused = |point| plot(vec![[0.0, 1.0], point]).to_svg().unwrap_err();
         assert!(matches!(refused([f64::NAN, 1.0]), ReportError::NotFinite { index: 1, what: "x", .. }));
         assert!(matches!(refused([1.0, f64::INFINITY]), ReportError::NotFinite { index: 1, what: "y", .. }));

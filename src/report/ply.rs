@@ -98,7 +98,7 @@ mod tests {
     const ROWS: [[f64; 4]; 3] = [[0.0, 1.0, 2.0, 1e-3], [3.0, 4.0, 5.5, -2e-3], [6.0, 7.0, 8.0, 0.0]];
 
     #[test]
-    fn points_and_faces_read_back_and_have_their_colours() {
+    fn coloured_ply_round_trip() {
         let bytes = coloured_ply("part\n7", &ROWS, &[[0, 1, 2]], Some(1.5e-3), &["SIMULATION"]).unwrap();
         let read = regrind_formats::parse_ply(Path::new("p.ply"), &bytes).unwrap();
         assert_eq!((read.points[1], &read.triangles[..]), ([3.0, 4.0, 5.5].into(), &[[0, 1, 2]][..]));
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_shown_is_refused() {
+    fn coloured_ply_refuses_bad_input() {
         let made = |rows: &[[f64; 4]], triangles: &[[u32; 3]], band| coloured_ply("p", rows, triangles, band, &[]);
         assert!(matches!(made(&[], &[], None), Err(ReportError::TooFewPoints { .. })));
         assert!(matches!(made(&ROWS, &[[0, 1, 3]], None), Err(ReportError::Corner { corner: 3, points: 3, .. })));

@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_of_samples_becomes_its_own_pixels() {
+    fn raster_of_regular_grid() {
         let raster = Raster::new("grid", &grid(12, 7, |_, _| true)).unwrap();
         assert_eq!((raster.grid.columns, raster.grid.rows), (12, 7));
         assert_eq!(raster.grid.spacing_mm, [0.5, 0.5]);
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_is_filled_from_its_sides_and_a_hole_stays_open() {
+    fn raster_fills_gaps_but_not_holes() {
         let lost = |i: i32, j: i32| (i, j) == (3, 3) || (i, j) == (4, 3);
         let hole = |i: i32, j: i32| (20..30).contains(&i) && (10..20).contains(&j);
         let raster = Raster::new("holes", &grid(40, 30, |i, j| !lost(i, j) && !hole(i, j))).unwrap();
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn scan_lines_become_an_area() {
+    fn raster_of_scan_lines() {
         let samples: Vec<[f64; 3]> =
             (0..20).flat_map(|j| (0..400).map(move |i| [f64::from(i) * 0.05, f64::from(j), f64::from(j)])).collect();
         let raster = Raster::new("lines", &samples).unwrap();
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disc_stays_round() {
+    fn raster_of_disc() {
         let raster = Raster::new("disc", &grid(41, 41, |i, j| (i - 20).pow(2) + (j - 20).pow(2) <= 400)).unwrap();
         assert!(raster.values[0].is_nan() && raster.values.last().unwrap().is_nan());
         let middle = raster.values[raster.grid.rows / 2 * raster.grid.columns + raster.grid.columns / 2];
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_shown_is_refused() {
+    fn raster_refuses_bad_samples() {
         assert!(matches!(Raster::new("", &[[0.0; 3]]), Err(ReportError::TooFewPoints { found: 1, .. })));
         assert!(matches!(Raster::new("", &[[1.0; 3]; 5]), Err(ReportError::NoExtent { points: 5, .. })));
         let bad = [[0.0; 3], [1.0, 0.0, f64::NAN]];

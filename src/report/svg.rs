@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_document_is_well_formed_whatever_the_text() {
+    fn svg_escapes_any_text() {
         let mut svg = Svg::new(100.0, 50.0);
         let odd = "a < b & \"c\" > \u{1} \u{ffff} µm";
         svg.text([1.0, 2.0], Anchor::End, SMALL, odd);

@@ -329,7 +329,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn little_air_is_said_to_be_little() {
+    fn in_air_formats_percentages() {
         let said =
             ["none in air", "< 0.1 % in air", "< 0.1 % in air", "0.1 % in air", "62.5 % in air", "100.0 % in air"];
         assert_eq!([0.0, 8.05e-11, 9.9e-4, 1e-3, 0.625, 1.0].map(in_air), said);

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_stands_in_a_text_breaks_no_document() {
+    fn xml_escapes_any_text() {
         let hostile = "a<b> & \"c\" 'd' \u{0}\u{7}\u{ffff} ]]> <!-- \n \u{e9}";
         let mut xml = Xml::new();
         xml.within("a", &[("of", hostile)], |xml| {

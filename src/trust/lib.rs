@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_server_here_need_not_prove_itself_and_any_other_must() {
+    fn proof_required_for_remote_server() {
         for here in ["localhost", "127.0.0.1", "127.8.0.1", "::1", "/run/postgresql"] {
             assert!(tls_config(here, None, "[database]").unwrap().is_none(), "{here}");
         }
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_without_certificates_proves_nothing_and_is_named() {
+    fn proof_refuses_file_without_pem() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("ca.pem");
         let missing = tls_config("plant", Some(&path), "[database]").unwrap_err().to_string();
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_password_is_its_line_and_nobody_elses() {
+    fn password_reads_one_line() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cell.password");
         assert!(matches!(read_password(&path), Err(TrustError::Password { .. })));
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_is_read_than_a_password_can_be() {
+    fn password_length_limit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cell.password");
         for (bytes, is_read) in [(4095, true), (4096, true), (4097, false), (1 << 20, false)] {
@@ -153,7 +153,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_password_that_others_may_read_is_refused_with_the_remedy() {
+    fn password_refuses_open_permissions() {
         use std::os::unix::fs::PermissionsExt;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cell.password");

@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_and_a_folder_are_their_owners_alone() {
+    fn owners_file_and_folder_are_private() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path().join("own");
         create_owners_folder(&folder).unwrap();
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_has_a_disk_with_some_room() {
+    fn free_bytes_of_folder() {
         let home = tempfile::tempdir().unwrap();
         assert!(free_bytes(home.path()).unwrap() > 0);
         assert!(free_bytes(&home.path().join("absent")).is_err());

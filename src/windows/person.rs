@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_user_of_this_process_has_a_name_and_an_identifier() {
+    fn own_name_and_sid() {
         assert!(!own_name().unwrap().is_empty());
         let sid = own_sid().unwrap();
         assert!(sid.starts_with("S-1-") && !sid.contains('\0'), "{sid}");

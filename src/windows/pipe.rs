@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_pipe_that_is_there_is_not_made_a_first_time_again() {
+    async fn listen_refuses_second_first_instance() {
         let name = name("first");
         let first = listen(&name, true).unwrap();
         assert!(listen(&name, true).is_err(), "somebody has it");
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_ends_of_a_pipe_know_each_other() {
+    async fn pipe_ends_identify_each_other() {
         let name = name("ends");
         let mut server = listen(&name, true).unwrap();
         let mut client = ClientOptions::new().open(&name).unwrap();

@@ -145,7 +145,7 @@ fn assert_pose(document: &Value, within_mm: f64) {
 }
 
 #[test]
-fn a_good_run_leaves_what_the_contract_says() {
+fn register_writes_contract_files() {
     let bench = Bench::new();
     let document = bench.registered("nominal.csv", "measured.csv", &[]);
     assert_pose(&document, FORM_SHIFT_MM);
@@ -168,7 +168,7 @@ fn a_good_run_leaves_what_the_contract_says() {
 }
 
 #[test]
-fn a_part_without_error_is_found_where_it_was_put() {
+fn register_finds_exact_pose() {
     let bench = Bench::new();
     bench.write("exact.csv", rows(&scan(&FreeForm::default(), &FormError::none(), [98.0, 58.0], &placement()), ","));
     let document = bench.registered("nominal.csv", "exact.csv", &[]);
@@ -177,7 +177,7 @@ fn a_part_without_error_is_found_where_it_was_put() {
 }
 
 #[test]
-fn the_trace_tells_the_objective_of_every_step() {
+fn trace_has_objective_of_each_step() {
     let bench = Bench::new();
     let document = bench.registered("nominal.csv", "measured.csv", &[]);
     let trace = document["trace"].as_array().unwrap();
@@ -192,7 +192,7 @@ fn the_trace_tells_the_objective_of_every_step() {
 }
 
 #[test]
-fn deviations_come_in_the_order_given() {
+fn deviations_in_input_order() {
     let bench = Bench::new();
     let order: Vec<usize> = (0..measured().len()).map(|k| (k * 7 + 3) % measured().len()).collect();
     let mixed: Vec<Vec3> = order.iter().map(|&k| measured()[k]).collect();
@@ -222,7 +222,7 @@ fn lengths(document: &Value, keys: [&str; 2]) -> usize {
 }
 
 #[test]
-fn every_form_of_the_input_gives_the_same_pose() {
+fn every_input_format_gives_same_pose() {
     let bench = Bench::new();
     let mut ply = format!("ply\nformat ascii 1.0\nelement vertex {}\n", nominal().len());
     ply += "property double x\nproperty double y\nproperty double z\nend_header\n";
@@ -262,7 +262,7 @@ const LENS: &str = "[surface]\nkind = \"biconic\"\nradius_x_mm = 90.0\nradius_y_
                                 conic_y = 0.0\n\n[aperture]\nkind = \"circle\"\nradius_mm = 25.0\n\n[sampling]\nspacing_mm = 0.5\n";
 
 #[test]
-fn a_definition_is_a_nominal_and_its_aperture_counts() {
+fn register_uses_definition_aperture() {
     let bench = Bench::new();
     bench.write("lens.toml", LENS);
     let shape = regrind_sim::shape::Biconic { radius_mm: [90.0, 140.0], conic: [0.0, 0.0] };
@@ -286,7 +286,7 @@ fn a_definition_is_a_nominal_and_its_aperture_counts() {
 }
 
 #[test]
-fn a_start_is_taken_from_an_earlier_run_or_from_text() {
+fn initial_pose_from_json_or_text() {
     let bench = Bench::new();
     let first = bench.registered("nominal.csv", "measured.csv", &[]);
     fs::rename(bench.path("out/here/registration.json"), bench.path("earlier.json")).unwrap();
@@ -300,7 +300,7 @@ fn a_start_is_taken_from_an_earlier_run_or_from_text() {
 }
 
 #[test]
-fn locked_coordinates_stay_as_they_are() {
+fn locked_coordinates_stay_fixed() {
     let bench = Bench::new();
     let shape = FreeForm::default();
     let place = Placement::new([0.02, 0.01, 0.05], [0.0; 3]);
@@ -317,7 +317,7 @@ fn locked_coordinates_stay_as_they_are() {
 }
 
 #[test]
-fn json_goes_to_the_terminal_and_words_otherwise() {
+fn register_prints_json_or_text() {
     let bench = Bench::new();
     let output = bench.register("nominal.csv", "measured.csv", &["--json"]);
     let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -331,7 +331,7 @@ fn json_goes_to_the_terminal_and_words_otherwise() {
 }
 
 #[test]
-fn every_option_is_understood() {
+fn register_accepts_every_option() {
     let bench = Bench::new();
     for more in [
         ["--distance", "triangle"],
@@ -365,7 +365,7 @@ fn help_has_an_example() {
 }
 
 #[test]
-fn files_that_hold_no_cloud_are_refused() {
+fn register_refuses_malformed_files() {
     let bench = Bench::new();
     let good = rows(measured(), ",");
     let broken = |at: usize, line: &str| -> String {
@@ -391,7 +391,7 @@ fn files_that_hold_no_cloud_are_refused() {
 }
 
 #[test]
-fn files_that_are_no_files_are_refused() {
+fn register_refuses_missing_or_sparse_file() {
     let bench = Bench::new();
     fs::create_dir(bench.path("folder")).unwrap();
     let mut sparse = fs::File::create(bench.path("sparse.csv")).unwrap();
@@ -404,7 +404,7 @@ fn files_that_are_no_files_are_refused() {
 }
 
 #[test]
-fn clouds_that_are_no_surface_are_refused() {
+fn register_refuses_degenerate_clouds() {
     let bench = Bench::new();
     let line: Vec<Vec3> = (0..200).map(|k| [f64::from(k), 2.0 * f64::from(k), 1.0]).collect();
     bench.write("one.csv", "1.0,2.0,3.0\n");
@@ -420,7 +420,7 @@ fn clouds_that_are_no_surface_are_refused() {
 }
 
 #[test]
-fn wrong_units_are_refused() {
+fn register_refuses_wrong_units() {
     let bench = Bench::new();
     for (name, factor, unit) in [("metres", 1e-3, "metres"), ("inches", 1.0 / 25.4, "inches")] {
         bench.write(&format!("nominal-{name}.csv"), rows(&scaled(nominal(), factor), ","));
@@ -432,7 +432,7 @@ fn wrong_units_are_refused() {
 }
 
 #[test]
-fn wrong_radii_are_refused() {
+fn register_refuses_wrong_probe_radius() {
     let bench = Bench::new();
     for radius in ["-1.5", "NaN", "inf", "1,5", "1e3"] {
         bench.refused("nominal.csv", "measured.csv", &["--probe-radius", radius], &["--probe-radius", "above 0"]);
@@ -442,7 +442,7 @@ fn wrong_radii_are_refused() {
 }
 
 #[test]
-fn a_probe_without_a_ball_measures_contact_points() {
+fn zero_probe_radius_means_contact() {
     let bench = Bench::new();
     bench.write("contacts.csv", rows(nominal(), ","));
     for (name, radius) in [("--probe-radius", "0"), ("--probe-radius-mm", "0.0")] {
@@ -453,7 +453,7 @@ fn a_probe_without_a_ball_measures_contact_points() {
 }
 
 #[test]
-fn what_is_doubtful_is_said_as_a_warning() {
+fn register_warns_of_doubtful_input() {
     let bench = Bench::new();
     let warned = |measured: &str, more: &[&str]| {
         let words = text(&bench.register("nominal.csv", measured, more).stdout);
@@ -482,7 +482,7 @@ fn what_is_doubtful_is_said_as_a_warning() {
 }
 
 #[test]
-fn another_part_is_refused() {
+fn register_refuses_other_part() {
     let bench = Bench::new();
     let sphere = scan(&Sphere { radius_mm: -80.0 }, &FormError::none(), [98.0, 58.0], &placement());
     bench.write("sphere.csv", rows(&sphere, ","));
@@ -490,7 +490,7 @@ fn another_part_is_refused() {
 }
 
 #[test]
-fn a_mirror_image_is_refused() {
+fn register_refuses_mirror_image() {
     let bench = Bench::new();
     for axis in 0..3 {
         let mirrored: Vec<Vec3> =
@@ -501,7 +501,7 @@ fn a_mirror_image_is_refused() {
 }
 
 #[test]
-fn bad_arguments_are_refused() {
+fn register_refuses_bad_arguments() {
     let bench = Bench::new();
     let refused = |more: &[&str], words: &[&str]| bench.refused("nominal.csv", "measured.csv", more, words);
     refused(&["--lock", "x,yaw"], &["yaw", "--lock", "rx"]);
@@ -523,7 +523,7 @@ fn bad_arguments_are_refused() {
 }
 
 #[test]
-fn a_place_that_cannot_be_written_is_refused_before_anything_is_read() {
+fn out_folder_checked_before_input() {
     let bench = Bench::new();
     bench.write("file", "in the way");
     for out in ["file", "file/below"] {
@@ -536,7 +536,7 @@ fn a_place_that_cannot_be_written_is_refused_before_anything_is_read() {
 }
 
 #[test]
-fn accuracy_tells_errors_and_spacing() {
+fn accuracy_reports_error_and_spacing() {
     let bench = Bench::new();
     let output = bench.run(&["accuracy", "--nominal", "nominal.csv", "--want", "1", "--json"]);
     assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
@@ -556,7 +556,7 @@ fn accuracy_tells_errors_and_spacing() {
 }
 
 #[test]
-fn accuracy_refuses_what_it_cannot_judge() {
+fn accuracy_refuses_bad_nominal() {
     let bench = Bench::new();
     bench.write("few.csv", rows(&nominal()[..50], ","));
     bench.write("empty.csv", "");
@@ -568,7 +568,7 @@ fn accuracy_refuses_what_it_cannot_judge() {
 }
 
 #[test]
-fn a_run_into_the_same_folder_replaces_the_result() {
+fn register_overwrites_its_result() {
     let bench = Bench::new();
     let first = bench.registered("nominal.csv", "measured.csv", &[]);
     assert!(Path::new(&bench.path("out/here/registration.json")).exists());
@@ -576,7 +576,7 @@ fn a_run_into_the_same_folder_replaces_the_result() {
 }
 
 #[test]
-fn a_model_tells_the_form_with_intervals_for_every_point() {
+fn model_reports_form_intervals() {
     let bench = Bench::new();
     bench.registered("nominal.csv", "measured.csv", &["--model"]);
     let model: Value = serde_json::from_slice(&fs::read(bench.path("out/here/model.json")).unwrap()).unwrap();
@@ -592,7 +592,7 @@ fn a_model_tells_the_form_with_intervals_for_every_point() {
 }
 
 #[test]
-fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
+fn plan_reports_time_and_slow_pass() {
     let bench = Bench::new();
     let shipped = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/recipes/shallow-wave.toml")).unwrap();
     let feed = shipped.lines().find(|line| line.starts_with("feed_mm_min")).unwrap();
@@ -620,7 +620,7 @@ fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
 }
 
 #[test]
-fn names_that_read_otherwise_than_they_are_and_numbers_that_nobody_counts_are_told() {
+fn names_with_hidden_characters_refused() {
     let home = tempfile::tempdir().unwrap();
     let shipped =
         std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/recipes/freeform-mirror.toml")).unwrap();
@@ -648,7 +648,7 @@ fn names_that_read_otherwise_than_they_are_and_numbers_that_nobody_counts_are_to
 }
 
 #[test]
-fn shells_and_man_know_every_command() {
+fn completions_and_man_pages() {
     let bench = Bench::new();
     for (shell, words) in [
         ("bash", "complete -F _regrind"),
@@ -675,7 +675,7 @@ fn shells_and_man_know_every_command() {
 /// Checks a file with nominal and measured points side by side, as most machines write it: a person says which columns
 /// are measured.
 #[test]
-fn columns_of_nominal_points_are_not_read_as_measured_and_a_person_says_which_are() {
+fn columns_option_selects_measured() {
     let bench = Bench::new();
     let plain = bench.registered("nominal.csv", "measured.csv", &[]);
     let beside = |separator: &str| -> String {

@@ -59,7 +59,7 @@ fn place_of(text: &str, needle: &str) -> (usize, usize) {
 }
 
 #[test]
-fn everything_shipped_is_good() {
+fn shipped_recipes_and_cells_are_valid() {
     let (recipes, cells) = (shipped("recipes"), shipped("config"));
     assert!(recipes.len() >= 5 && cells.len() >= 4);
     for path in &recipes {
@@ -78,7 +78,7 @@ fn everything_shipped_is_good() {
 }
 
 #[test]
-fn the_default_recipe_is_what_it_says() {
+fn default_recipe_values() {
     let recipe = recipe(RECIPE).unwrap();
     assert_eq!(recipe.part.name, "free-form mirror");
     assert_eq!(recipe.measure.probe_radius_mm, 1.5);
@@ -107,7 +107,7 @@ fn the_default_recipe_is_what_it_says() {
 /// Checks that the decision never uses a lower probability than the accepted risk for chosen touches allows. The
 /// probability as written in the file counts.
 #[test]
-fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
+fn decision_probability_from_accepted_risk() {
     let with = |measuring: &str| recipe(&changed(RECIPE, "[registration]", &format!("{measuring}\n\n[registration]")));
     let adaptive = |risk: f64| format!("[measuring]\nmode = \"adaptive\"\naccepted_risk = {risk}");
     assert_eq!(recipe(RECIPE).unwrap().required_probability(), 0.975);
@@ -122,7 +122,7 @@ fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
 }
 
 #[test]
-fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
+fn recipe_sets_filter_and_min_coverage() {
     let told = |recipe: &Recipe| {
         let map = &recipe.compensation;
         (map.filter_order, map.roughness, recipe.registration.min_coverage)
@@ -139,7 +139,7 @@ fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
 
 /// Checks that the simulator has the same surface in its own representation.
 #[test]
-fn the_simulated_part_of_every_polynomial_is_the_nominal_one() {
+fn simulated_polynomial_equals_nominal() {
     for name in ["freeform-mirror", "shallow-wave"] {
         let recipe = Recipe::read(&root().join(format!("recipes/{name}.toml"))).unwrap();
         let NominalSource::Surface(surface) = &recipe.nominal else { panic!("a formula") };
@@ -160,7 +160,7 @@ fn the_simulated_part_of_every_polynomial_is_the_nominal_one() {
 }
 
 #[test]
-fn the_points_of_the_biconic_are_its_formula() {
+fn biconic_points_match_formula() {
     let path = root().join("recipes/biconic.csv");
     assert!(fs::metadata(&path).unwrap().len() < 150_000);
     let points = read_points(&path).unwrap();
@@ -181,7 +181,7 @@ fn the_points_of_the_biconic_are_its_formula() {
 /// Checks places of a measuring plan as another program wrote them: in inches, heights in micrometres, in a table that
 /// also has measured values.
 #[test]
-fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
+fn target_file_columns_and_units() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("part.toml");
     let surface = "columns = 60                # 1,800 points\nrows = 30\n";
@@ -212,7 +212,7 @@ fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
 }
 
 #[test]
-fn the_telescope_holds_what_it_cannot_see() {
+fn telescope_locks_weak_directions() {
     let recipe = recipe(TELESCOPE).unwrap();
     assert_eq!(recipe.registration.lock, [Coordinate::X, Coordinate::Y, Coordinate::Rz]);
     assert_eq!(recipe.registration.start, RegistrationStart::Fixture);
@@ -234,7 +234,7 @@ fn the_telescope_holds_what_it_cannot_see() {
 }
 
 #[test]
-fn what_a_file_wire_leaves_out_is_not_guessed() {
+fn file_exchange_defaults() {
     let text = changed(FILES, "coordinates = \"centres\"", "# coordinates");
     let text = changed(
         &text,
@@ -253,7 +253,7 @@ fn what_a_file_wire_leaves_out_is_not_guessed() {
 }
 
 #[test]
-fn registers_and_signals_are_read() {
+fn cell_registers_and_signals() {
     let text = changed(
         TCP,
         "# status = 64",
@@ -635,17 +635,17 @@ fn place_of_byte(text: &str, at: usize) -> (usize, usize) {
 }
 
 #[test]
-fn every_bad_recipe_is_told_at_its_place() {
+fn bad_recipe_reports_position() {
     assert_told(BAD_RECIPE_VALUES, BAD_RECIPES, recipe);
 }
 
 #[test]
-fn every_bad_cell_is_told_at_its_place() {
+fn bad_cell_reports_position() {
     assert_told(BAD_CELL_VALUES, BAD_CELLS, cell);
 }
 
 #[test]
-fn a_head_with_two_axes_and_a_ball_on_its_pole_are_refused() {
+fn tilt_refuses_two_axes_and_ball_pole() {
     let two = TILTING.replace("[grinder.rotary]", "[[grinder.rotary]]");
     let told = cell(&two).unwrap_err().to_string();
     assert!(told.contains("grinder.rotary") && told.contains("table"), "{told}");
@@ -656,7 +656,7 @@ fn a_head_with_two_axes_and_a_ball_on_its_pole_are_refused() {
 }
 
 #[test]
-fn all_problems_are_told_at_once_and_in_order() {
+fn recipe_reports_all_problems_in_order() {
     let text = RECIPE
         .replace("probe_radius_mm = 1.5", "probe_radius_mm = 1500")
         .replace("edge_margin_mm", "edge_margin")
@@ -683,7 +683,7 @@ fn all_problems_are_told_at_once_and_in_order() {
 }
 
 #[test]
-fn several_places_of_broken_syntax_are_told() {
+fn recipe_reports_all_syntax_errors() {
     let text = changed(RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um 20.0");
     let text = changed(&text, "track_mm = 0.24", "track_mm = = 0.24");
     let problems = recipe(&text).unwrap_err();
@@ -695,7 +695,7 @@ fn several_places_of_broken_syntax_are_told() {
 }
 
 #[test]
-fn old_names_of_keys_are_read_with_a_note() {
+fn old_key_names_read_with_note() {
     let new = changed(
         RECIPE,
         "probe_radius_mm = 1.5\n",
@@ -712,7 +712,7 @@ fn old_names_of_keys_are_read_with_a_note() {
 }
 
 #[test]
-fn both_names_of_a_key_are_refused() {
+fn old_and_new_key_name_refused() {
     let text = changed(RECIPE, "max_cycles = 5", "max_cycles = 5\nmost_cycles = 4");
     let problems = Recipe::parse(Path::new("recipes/freeform-mirror.toml"), &text).unwrap_err();
     assert_eq!(problems.problems.len(), 1, "{problems}");
@@ -721,7 +721,7 @@ fn both_names_of_a_key_are_refused() {
 }
 
 #[test]
-fn what_is_no_text_is_told() {
+fn recipe_refuses_non_text_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("recipe.toml");
     let read = |bytes: &[u8]| {
@@ -742,7 +742,7 @@ fn what_is_no_text_is_told() {
 }
 
 #[test]
-fn depth_and_number_have_an_end() {
+fn recipe_limits_nesting_and_problems() {
     for text in [
         format!("a = {}{}", "[".repeat(20_000), "]".repeat(20_000)),
         format!("a = {}1{}", "{ a = ".repeat(5_000), "}".repeat(5_000)),
@@ -759,7 +759,7 @@ fn depth_and_number_have_an_end() {
 }
 
 #[test]
-fn somebody_else_can_point_into_a_file() {
+fn recipe_problem_locates_key() {
     let recipe = recipe(RECIPE).unwrap();
     let problems = recipe.problem("simulation.part.stock_um", "is 200", "it must be 0 to 100", "lower it");
     let (line, column) = problems.place(&problems.problems[0]);
@@ -768,7 +768,7 @@ fn somebody_else_can_point_into_a_file() {
 }
 
 #[test]
-fn the_command_tells_problems_in_words_and_as_json() {
+fn check_reports_text_and_json() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bad.toml");
     fs::write(&path, changed(BICONIC, "biconic.csv", "none.csv")).unwrap();
@@ -791,7 +791,7 @@ fn the_command_tells_problems_in_words_and_as_json() {
 }
 
 #[test]
-fn the_truth_of_a_simulated_cell_is_checked_too() {
+fn check_validates_simulation_table() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("recipe.toml");
     for (to, key, words) in [
@@ -807,7 +807,7 @@ fn the_truth_of_a_simulated_cell_is_checked_too() {
 }
 
 #[test]
-fn the_committed_schemas_are_the_ones_in_force() {
+fn committed_schemas_are_current() {
     let schemas = [
         ("recipe", regrind::recipe::json_schema()),
         ("cell", regrind::config::json_schema()),
@@ -868,7 +868,7 @@ fn accepts(schema: &Value, value: &Value) -> bool {
 }
 
 #[test]
-fn the_schemas_accept_what_ships_and_refuse_what_is_wrong() {
+fn schemas_accept_shipped_files_only() {
     for (folder, schema) in [
         ("recipes", regrind::recipe::json_schema()),
         ("config", regrind::config::json_schema()),

@@ -111,7 +111,7 @@ fn points(told: &[PreliminaryPoints]) -> Vec<MeasuredPoint> {
 }
 
 #[tokio::test]
-async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_of_an_old_machine() {
+async fn read_ahead_result_equals_full_read() {
     let plan = plan(POINTS);
     let mut both = Vec::new();
     for (gives_ahead, came) in [(true, 14), (false, 0)] {
@@ -134,7 +134,7 @@ async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_
 }
 
 #[tokio::test]
-async fn records_that_lie_across_pages_and_low_words_first_come_whole() {
+async fn read_ahead_records_across_pages() {
     let plan = plan(POINTS);
     let options = MachineOptions { speed: 0.0, word_order: words::WordOrder::Little, ..MachineOptions::default() };
     let machine = registers::SimulatedMachine::new(Box::new(toy().in_counts()), 0xb007, options);
@@ -188,7 +188,7 @@ fn lies() -> Vec<(u16, Fault)> {
 }
 
 #[tokio::test]
-async fn whatever_is_said_ahead_the_points_are_right_in_the_end() {
+async fn read_ahead_faults_never_alter_result() {
     let plan = plan(POINTS);
     for (at, fault) in lies() {
         for always in [false, true] {
@@ -211,7 +211,7 @@ async fn whatever_is_said_ahead_the_points_are_right_in_the_end() {
 }
 
 #[tokio::test]
-async fn a_machine_that_refuses_is_asked_once_and_one_that_does_not_answer_three_times() {
+async fn read_ahead_gives_up_after_refusal() {
     let plan = plan(POINTS);
     for (fault, times) in [(Fault::Exception(2), 1), (Fault::Disconnect(0), 3)] {
         let serving = serve(toy(), true).await;
@@ -233,7 +233,7 @@ async fn a_machine_that_refuses_is_asked_once_and_one_that_does_not_answer_three
 }
 
 #[tokio::test]
-async fn nothing_that_was_kept_outlives_its_line_or_its_job() {
+async fn read_ahead_cache_ends_with_link_or_job() {
     let plan = plan(POINTS);
     for reconnects in [false, true] {
         let serving = serve(toy(), true).await;
@@ -256,7 +256,7 @@ async fn nothing_that_was_kept_outlives_its_line_or_its_job() {
 }
 
 #[tokio::test]
-async fn a_page_that_changes_after_all_has_everything_read_anew() {
+async fn read_ahead_refetches_changed_page() {
     let plan = plan(POINTS);
     let serving = serve(toy(), true).await;
     let mut cmm = half_done(&serving, settings(&serving), &plan).await;
@@ -272,7 +272,7 @@ async fn a_page_that_changes_after_all_has_everything_read_anew() {
 }
 
 #[tokio::test]
-async fn one_step_follows_a_look_and_none_an_order() {
+async fn read_ahead_one_step_per_poll() {
     let plan = plan(POINTS);
     let serving = serve(toy(), true).await;
     let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
@@ -315,7 +315,7 @@ async fn one_step_follows_a_look_and_none_an_order() {
 }
 
 #[tokio::test]
-async fn on_a_line_on_which_an_order_would_wait_nothing_is_read_ahead() {
+async fn read_ahead_off_on_slow_line() {
     let plan = plan(40);
     for (baud, told) in [(19_200, 0), (38_400, 2)] {
         let (serving, settings) =
@@ -329,7 +329,7 @@ async fn on_a_line_on_which_an_order_would_wait_nothing_is_read_ahead() {
 /// Measures the figure of docs/figures.md: run with `--ignored --nocapture`.
 #[tokio::test]
 #[ignore = "takes as long as a line of 115,200 baud takes and as 1,800 points at 50 a second, two minutes"]
-async fn eighteen_hundred_points_over_a_serial_line() {
+async fn read_ahead_1800_points_over_rtu() {
     let plan = plan(1800);
     for gives_ahead in [false, true] {
         let options = MachineOptions { gives_ahead, ..MachineOptions::default() };

@@ -266,7 +266,7 @@ const UNTURNED: [&str; 10] = [
 ];
 
 #[tokio::test]
-async fn the_frames_of_the_page_are_those_on_the_wire() {
+async fn modbus_page_frames_match_wire() {
     let page = vectors();
     let mut looked_at = BTreeSet::new();
     for (name, order, sim_order) in
@@ -332,7 +332,7 @@ fn point_in_counts(order: words::WordOrder) -> Vec<u8> {
 }
 
 #[test]
-fn the_check_numbers_in_the_text_are_those_of_the_frames() {
+fn modbus_page_checksums_match_frames() {
     let page = vectors();
     let mut told = vec![
         format!("digest 0x{:08X}", digest(&[plan().identity()])),
@@ -358,7 +358,7 @@ fn the_check_numbers_in_the_text_are_those_of_the_frames() {
 }
 
 #[test]
-fn the_ranges_of_the_page_are_those_of_the_program() {
+fn modbus_page_ranges_match_driver() {
     let rows: Vec<_> = PAGE.lines().map(cells).filter(|cells| cells.len() == 4).collect();
     for ValueRange { name: figure, min: least, max: most, unit } in RANGES {
         let is_it = |cells: &&Vec<&str>| {
@@ -371,7 +371,7 @@ fn the_ranges_of_the_page_are_those_of_the_program() {
 }
 
 #[test]
-fn the_blocks_of_the_page_are_those_of_the_driver() {
+fn modbus_page_blocks_match_driver() {
     let told: Vec<_> = PAGE.lines().map(cells).filter(|cells| cells.len() == 5).collect();
     for (name, first, registers) in RegisterMap::default().blocks() {
         let row = [name.replace('_', " "), first.to_string(), (40_001 + first).to_string(), registers.to_string()];
@@ -380,7 +380,7 @@ fn the_blocks_of_the_page_are_those_of_the_driver() {
 }
 
 #[test]
-fn the_second_number_of_every_register_is_40001_more_than_its_address() {
+fn modbus_page_numbers_offset_40001() {
     let blocks = RegisterMap::default().blocks();
     let (mut first, mut rows) = (None, 0);
     for cells in PAGE.lines().map(cells) {

@@ -145,7 +145,7 @@ fn three() -> String {
 }
 
 #[test]
-fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
+fn exchange_plan_files_are_exact() {
     let shop = Shop::new();
     let bench = Bench::new(shop.cmm());
     assert_eq!(shop.handed(), ["SN_7_j3_c2"]);
@@ -169,7 +169,7 @@ fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
 }
 
 #[test]
-fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
+fn result_accepted_after_settling() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
     assert_says(&bench.poll(), &["waiting for SN_7_c2.* in"]);
@@ -225,7 +225,7 @@ fn dmis_result(program: &str) -> String {
 }
 
 #[test]
-fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
+fn dmis_hand_over_and_result() {
     use regrind::formats::result::{Content, Coordinates as Said};
     let shop = Shop::new();
     let content = Content { coordinates: Some(Said::Centres), ..Content::default() };
@@ -257,7 +257,7 @@ fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
 }
 
 #[test]
-fn a_qif_result_is_taken_by_what_it_says_of_itself() {
+fn qif_result_identified_by_content() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
     let identity: String = plan(3).identity().iter().map(|b| format!("{b:02x}")).collect();
@@ -284,7 +284,7 @@ fn a_qif_result_is_taken_by_what_it_says_of_itself() {
 }
 
 #[test]
-fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
+fn result_of_other_part_or_cycle_ignored() {
     let shop = Shop::new();
     shop.put("SN_7_c2.csv", &three());
     let mut bench = Bench::new(shop.cmm());
@@ -307,7 +307,7 @@ fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
 }
 
 #[test]
-fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
+fn result_errors_include_remedy() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
     let with = |rows: &str| format!("{CENTRES}{rows}");
@@ -342,7 +342,7 @@ fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
 }
 
 #[test]
-fn two_files_at_once_are_neither_taken() {
+fn two_matching_files_refused() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
     shop.put("SN_7_c2.csv", &three());
@@ -353,7 +353,7 @@ fn two_files_at_once_are_neither_taken() {
 }
 
 #[test]
-fn the_cell_may_say_what_the_file_does_not() {
+fn cell_file_completes_result_content() {
     use regrind::formats::result::{Content, Coordinates as Said, DecimalMark};
     let shop = Shop::new();
     let content = Content {
@@ -373,7 +373,7 @@ fn the_cell_may_say_what_the_file_does_not() {
 }
 
 #[test]
-fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
+fn hand_over_once_per_job_and_cycle() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
     let (order, digest) = order(3);
@@ -399,7 +399,7 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
 }
 
 #[test]
-fn a_restart_finds_what_is_open() {
+fn restart_finds_open_hand_over() {
     let shop = Shop::new();
     let bench = Bench::new(shop.cmm());
     let job = bench.job;
@@ -447,7 +447,7 @@ fn points(station: usize) -> String {
 }
 
 #[test]
-fn stations_are_merged_by_their_reference_points() {
+fn stations_merge_by_reference_points() {
     let shop = Shop::new();
     let mut bench = Bench::new(station_shop(&shop));
     bench.refused("waiting for the first station");
@@ -482,7 +482,7 @@ fn map() -> CorrectionMap {
 }
 
 #[test]
-fn a_pass_is_confirmed_by_files_that_name_its_map() {
+fn pass_confirmed_by_map_identity() {
     let shop = Shop::new();
     let mut grinder = shop.grinder(Duration::from_secs(2));
     let map_identity = map().identity();
@@ -551,7 +551,7 @@ fn answer_of<T: std::fmt::Debug>(told: Result<T, DeviceError>) -> Answer {
 }
 
 #[tokio::test]
-async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
+async fn exchange_cmm_state_sequence() {
     let shop = Shop::new();
     let mut cmm = connected(&shop).await;
     let plan = plan(3);
@@ -588,7 +588,7 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
 }
 
 #[tokio::test]
-async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is_told() {
+async fn hold_and_resume_while_reading_file() {
     let shop = Shop::new();
     let folders = CmmFolders::new(CmmExchange { read_timeout: Duration::ZERO, ..at_once(shop.cmm()) });
     let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ANSWERS_WITHIN);
@@ -625,7 +625,7 @@ async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is
 }
 
 #[tokio::test]
-async fn a_restarted_client_learns_what_became_of_its_start() {
+async fn restarted_client_reconciles_start() {
     let shop = Shop::new();
     let mut cmm = connected(&shop).await;
     let plan = plan(3);
@@ -657,7 +657,7 @@ async fn a_restarted_client_learns_what_became_of_its_start() {
 }
 
 #[tokio::test]
-async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
+async fn exchange_grinder_by_confirmation() {
     let shop = Shop::new();
     let folders = shop.grinder(Duration::ZERO);
     let mut grinder = ExchangeMachine::new("grinder", MachineKind::Grinder, folders, ANSWERS_WITHIN);
@@ -687,7 +687,7 @@ async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
 }
 
 #[tokio::test]
-async fn a_folder_that_is_not_there_is_named() {
+async fn connect_names_missing_folder() {
     let settings = CmmExchange::new("p", "/nowhere/out", Path::new("/nowhere/in"));
     let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, CmmFolders::new(settings), ANSWERS_WITHIN);
     let error = cmm.connect().await.unwrap_err();
@@ -763,7 +763,7 @@ async fn late_start(shop: &Shop, after: bool) -> (ExchangeMachine<Hanging>, Devi
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_start_that_timed_out_is_never_handed_over_later() {
+async fn timed_out_start_never_handed_over() {
     let shop = Shop::new();
     let (mut cmm, told, found) = late_start(&shop, false).await;
     assert!(matches!(told, DeviceError::TimedOut { .. }), "{told}");
@@ -777,7 +777,7 @@ async fn a_start_that_timed_out_is_never_handed_over_later() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_start_that_timed_out_while_it_appeared_is_taken_back_and_told() {
+async fn timed_out_start_withdrawn_if_visible() {
     let shop = Shop::new();
     let (_cmm, told, found) = late_start(&shop, true).await;
     assert!(matches!(told, DeviceError::StartUnknown { .. }), "{told}");
@@ -808,7 +808,7 @@ fn cell_of(wires: [bool; 2], shops: &[Shop; 2]) -> regrind::config::CellConfig {
 }
 
 #[tokio::test]
-async fn every_combination_of_wires_makes_two_machines() {
+async fn wire_combinations_make_machines() {
     use regrind::setup;
     let recipe = Path::new(env!("CARGO_MANIFEST_DIR")).join("recipes/shallow-wave.toml");
     let recipe = regrind::recipe::Recipe::read(&recipe).unwrap();

@@ -137,7 +137,7 @@ const GOLDEN: [(LineFormat, &[u8]); 8] = [
 ];
 
 #[tokio::test]
-async fn the_eight_formats_come_over_a_serial_line_byte_for_byte() {
+async fn hit_formats_over_serial_line() {
     for (format, line) in GOLDEN {
         let style = Style {
             letters: format.is_lettered(),
@@ -168,7 +168,7 @@ fn with_fault(fault: &Fault) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_again() {
+async fn damaged_hit_line_is_touched_again() {
     // Fault, number of the four targets that are touched anyway, and the words of the message.
     for (fault, touched, why) in [
         (Fault::Lost(4), 3, "not a number with 3 digits"),
@@ -204,7 +204,7 @@ async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_a
 }
 
 #[tokio::test]
-async fn a_line_sent_twice_is_one_touch_and_a_header_is_passed_over() {
+async fn duplicate_hit_line_used_once() {
     let mut bench = Bench::on_serial(4, |_| {}).await;
     bench.serving.send(b"PROBE 1\r\n").await;
     bench.serving.send(&with_fault(&Fault::Twice)).await;
@@ -214,7 +214,7 @@ async fn a_line_sent_twice_is_one_touch_and_a_header_is_passed_over() {
 }
 
 #[tokio::test]
-async fn a_line_that_was_lost_leaves_its_target_open_and_a_person_may_end_without_it() {
+async fn lost_hit_line_leaves_target_open() {
     let mut bench = Bench::on_serial(4, |_| {}).await;
     bench.serving.send(&with_fault(&Fault::Dropped)).await;
     bench.until(3, State::Execute).await;
@@ -226,7 +226,7 @@ async fn a_line_that_was_lost_leaves_its_target_open_and_a_person_may_end_withou
 }
 
 #[tokio::test]
-async fn another_touch_of_a_target_takes_the_place_of_the_first_only_where_the_cell_file_says_so() {
+async fn repeated_touch_replaces_if_configured() {
     for (repeated, first) in [(Repeated::Refuse, true), (Repeated::Replace, false)] {
         let mut bench = Bench::on_serial(2, |settings| settings.repeated = repeated).await;
         bench.serving.send(b"100.000,200.000,300.000\r\n100.010,200.000,300.000\r\n150.000,200.000,300.000\r\n").await;
@@ -237,7 +237,7 @@ async fn another_touch_of_a_target_takes_the_place_of_the_first_only_where_the_c
 }
 
 #[tokio::test]
-async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_is() {
+async fn hit_lines_tcp_loss_preserves_points() {
     let serving = ServingHits::tcp("127.0.0.1:0").await.unwrap();
     let port = serving.local_addr().unwrap().port();
     let mut bench = Bench::new(3, serving, HitSource::Tcp { host: "127.0.0.1".into(), port }, |_| {}).await;
@@ -267,7 +267,7 @@ async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_i
 }
 
 #[tokio::test]
-async fn a_port_that_is_pulled_out_is_lost_and_what_gathered_before_it_is_opened_is_read_away() {
+async fn unplugged_port_and_stale_input() {
     let serving = ServingHits::serial().unwrap();
     // Possibly of another part.
     serving.send(b"100.000,200.000,300.000\r\n").await;
@@ -284,7 +284,7 @@ async fn a_port_that_is_pulled_out_is_lost_and_what_gathered_before_it_is_opened
 }
 
 #[tokio::test]
-async fn hold_stop_and_abort_are_asked_of_the_person() {
+async fn hold_stop_abort_need_operator() {
     let mut bench = Bench::on_serial(2, |_| {}).await;
     assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;

@@ -131,7 +131,7 @@ fn plan() -> Plan {
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-async fn our_driver_has_a_pymodbus_cmm_measure() {
+async fn driver_measures_on_pymodbus_cmm() {
     let python = python();
     let process = Process::start(python, "cmm.py", &[]);
     let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
@@ -162,7 +162,7 @@ async fn our_driver_has_a_pymodbus_cmm_measure() {
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
+async fn pymodbus_cmm_read_ahead() {
     let process = Process::start(python(), "cmm.py", &["--ahead", "--seconds", "3"]);
     let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
     cmm.connect().await.unwrap();
@@ -184,7 +184,7 @@ async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-async fn our_driver_has_a_pymodbus_grinder_grind() {
+async fn driver_grinds_on_pymodbus_grinder() {
     let python = python();
     // Long enough for a hold to arrive before its end on any computer.
     let process = Process::start(python, "grinder.py", &["--seconds", "3"]);
@@ -217,7 +217,7 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
 /// Runs the whole program against both: grind, measure, register, judge, compensate, until the part is accepted.
 #[test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
+fn whole_run_on_pymodbus_machines() {
     let python = python();
     let home = tempfile::tempdir().unwrap();
     let part = home.path().join("part.bin");
@@ -285,7 +285,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
+async fn pymodbus_client_measures_on_sim_cmm() {
     let python = python();
     let machine = registers::SimulatedMachine::new(
         Box::new(crate::toy::Toy::new(Kind::Cmm, 100.0)),
@@ -309,7 +309,7 @@ async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
 
 #[test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
-fn our_x3p_opens_in_another_reader_with_equal_values() {
+fn x3p_opens_in_other_reader() {
     let python = python();
     let grid = Grid { columns: 31, rows: 17, first_mm: [-51.0, -31.0], spacing_mm: [3.4, 3.875] };
     let values_mm: Vec<f64> = (0..grid.len()).map(|k| 1e-3 * (0.37 * k as f64).sin() + 1e-9 * k as f64).collect();

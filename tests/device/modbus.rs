@@ -150,7 +150,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
 // ---- in order -----------------------------------------------------------------------------------------------------------------------
 
 #[tokio::test]
-async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
+async fn modbus_measurement_is_bit_exact() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     let identity = cmm.connect().await.unwrap();
@@ -169,7 +169,7 @@ async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
 }
 
 #[tokio::test]
-async fn a_pass_is_ground_and_recorded() {
+async fn modbus_pass_ground_and_recorded() {
     let serving = serve(Kind::Grinder, AT_ONCE, SharedFaultPlan::none()).await;
     let mut grinder = ModbusGrinder::new(settings(&serving)).unwrap();
     grinder.connect().await.unwrap();
@@ -192,7 +192,7 @@ async fn a_pass_is_ground_and_recorded() {
 }
 
 #[tokio::test]
-async fn low_words_first_and_other_addresses_are_as_good() {
+async fn word_orders_and_moved_registers() {
     for word_order in [WordOrder::Little, WordOrder::Badc, WordOrder::Dcba] {
         let layout = RegisterLayout { status: 1064, command: 1040, outbox_page: 2462, ..RegisterLayout::default() };
         let of_sim = if word_order.is_low_first() { words::WordOrder::Little } else { words::WordOrder::Big };
@@ -220,7 +220,7 @@ async fn low_words_first_and_other_addresses_are_as_good() {
 }
 
 #[tokio::test]
-async fn hold_resume_stop_abort_and_clear_are_obeyed() {
+async fn hold_resume_stop_abort_clear() {
     let serving = serve(Kind::Cmm, 20.0, SharedFaultPlan::none()).await;
     let mut cmm = claimed(settings(&serving)).await;
     let (plan, calm) = (plan(200), Interrupt::new());
@@ -249,7 +249,7 @@ async fn hold_resume_stop_abort_and_clear_are_obeyed() {
 }
 
 #[tokio::test]
-async fn another_client_is_refused_and_an_abort_is_not() {
+async fn second_client_refused_except_abort() {
     let serving = serve(Kind::Cmm, 20.0, SharedFaultPlan::none()).await;
     let mut first = ModbusCmm::new(settings(&serving)).unwrap();
     let mut second = ModbusCmm::new(ModbusSettings { owner: 2, ..settings(&serving) }).unwrap();
@@ -276,7 +276,7 @@ fn of_first(command: SimCommand) -> SimFrame {
 }
 
 #[tokio::test]
-async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second_master() {
+async fn abort_despite_second_master() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed).await.unwrap();
@@ -295,7 +295,7 @@ async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second
 }
 
 #[tokio::test]
-async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
+async fn lost_ownership_names_other_owner() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut first = claimed(settings(&serving)).await;
     first.status().await.unwrap();
@@ -307,7 +307,7 @@ async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
 }
 
 #[tokio::test]
-async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
+async fn busy_exception_retried_until_timeout() {
     let few =
         |serving: &Serving| ModbusSettings { retries: 3, lost_after: Duration::from_secs(2), ..settings(serving) };
     // A controller that is still starting reports busy for more requests than a silent one has retries.
@@ -332,7 +332,7 @@ async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
 }
 
 #[tokio::test]
-async fn a_clock_that_was_set_back_makes_nobody_a_stranger_to_his_own_machine() {
+async fn claim_raises_epoch_after_clock_reset() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     assert_eq!(write_command(&serving, SimFrame { sequence: 5, epoch: 50, ..of_first(SimCommand::Claim) }), 1);
     let mut after = connected(ModbusSettings { epoch: 7, ..settings(&serving) }).await;
@@ -363,7 +363,7 @@ fn interrupt_at_page(serving: &Serving, number: u32) -> (Interrupt, Arc<AtomicU3
 }
 
 #[tokio::test]
-async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
+async fn interrupted_transfer_not_in_force() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     cmm.connect().await.unwrap();
@@ -379,7 +379,7 @@ async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
 }
 
 #[tokio::test]
-async fn further_signals_are_read_scaled_and_held_against_their_range() {
+async fn signals_scaled_and_range_checked() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let temperature = Signal {
         name: "part_temperature".into(),
@@ -465,7 +465,7 @@ async fn refusal(change: impl FnOnce(&mut Vec<u16>)) -> DeviceError {
 }
 
 #[tokio::test]
-async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
+async fn connect_refuses_wrong_device() {
     let e = refusal(|image| image.fill(0)).await;
     assert!(matches!(e, DeviceError::WrongDevice { address: 0, required: 0x5247, found: 0, .. }), "{e}");
     let e = refusal(|image| image[1] = 0x4432).await;
@@ -527,7 +527,7 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
 }
 
 #[tokio::test]
-async fn a_machine_with_the_right_identity_that_does_not_answer_freshly_is_not_believed() {
+async fn connect_refuses_missing_sync_answer() {
     let (settings, writes) = impostor(true_identity()).await;
     let settings = ModbusSettings { retries: 1, quarantine: Duration::ZERO, ..settings };
     let refused = ModbusCmm::new(settings).unwrap().connect().await.unwrap_err();
@@ -536,7 +536,7 @@ async fn a_machine_with_the_right_identity_that_does_not_answer_freshly_is_not_b
 }
 
 #[tokio::test]
-async fn nobody_there_is_said_so() {
+async fn connect_unreachable() {
     // A port that is bound but has no listener.
     let taken = TcpSocket::new_v4().unwrap();
     taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
@@ -574,7 +574,7 @@ fn wire_faults() -> Vec<Fault> {
 }
 
 #[tokio::test]
-async fn every_fault_of_the_wire_ends_in_the_right_points_or_in_an_error() {
+async fn tcp_wire_faults_give_exact_points() {
     let plan = plan(60);
     for fault in wire_faults() {
         let rules = FaultPlan::new(5).always(When::Every(17), fault.clone());
@@ -591,7 +591,7 @@ async fn every_fault_of_the_wire_ends_in_the_right_points_or_in_an_error() {
 }
 
 #[tokio::test]
-async fn seeded_mixtures_of_faults_give_no_wrong_value_and_no_second_start() {
+async fn seeded_faults_never_start_twice() {
     let plan = plan(40);
     let mut finished = 0;
     for seed in 0..12 {
@@ -616,7 +616,7 @@ async fn seeded_mixtures_of_faults_give_no_wrong_value_and_no_second_start() {
 }
 
 #[tokio::test]
-async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
+async fn flipped_bit_found_by_result_crc() {
     // In the pages, which the CRC-32 over the whole protects; once, so that the second fetch succeeds.
     let rules = FaultPlan::new(1).once(When::Reading(462), Fault::FlipData);
     let serving = serve(Kind::Cmm, AT_ONCE, rules.into()).await;
@@ -639,7 +639,7 @@ async fn armed(serving: &Serving, plan: &Plan) -> (ModbusCmm, Armed) {
 }
 
 #[tokio::test]
-async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again() {
+async fn start_retry_is_idempotent() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).times(1, 2, When::Commanding(3), Fault::DropReply));
@@ -660,7 +660,7 @@ fn silent_from_start(lost: bool) -> FaultPlan {
 }
 
 #[tokio::test]
-async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
+async fn unknown_start_reconciles_running() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     // The START is carried out, and from then on nothing answers.
@@ -675,7 +675,7 @@ async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
 }
 
 #[tokio::test]
-async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
+async fn dropped_start_reconciles_not_started() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.faults().set(silent_from_start(true));
@@ -698,7 +698,7 @@ fn delayed(armed: &Armed) -> SimFrame {
 }
 
 #[tokio::test]
-async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
+async fn late_start_after_reconcile_is_fenced() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, lost) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
@@ -721,7 +721,7 @@ async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
 }
 
 #[tokio::test]
-async fn a_start_that_arrives_while_it_is_asked_about_is_found_to_run() {
+async fn late_start_before_reconcile_is_found() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, late) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
@@ -733,7 +733,7 @@ async fn a_start_that_arrives_while_it_is_asked_about_is_found_to_run() {
 }
 
 #[tokio::test]
-async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
+async fn restarted_machine_reconciles_unknown() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed.clone()).await.unwrap();
@@ -752,7 +752,7 @@ async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
 }
 
 #[tokio::test]
-async fn a_frozen_application_behind_a_living_wire_is_found() {
+async fn frozen_application_detected() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = connected(settings(&serving)).await;
     serving.machine(1).unwrap().with(|machine| machine.freeze(true));
@@ -813,7 +813,7 @@ async fn two_machines_share_a_serial_line() {
 }
 
 #[tokio::test]
-async fn faults_on_a_serial_line_end_in_the_right_points() {
+async fn rtu_wire_faults_give_exact_points() {
     let plan = plan(20);
     let mut faults = wire_faults();
     faults.retain(|fault| !matches!(fault, Fault::WrongTransaction));
@@ -832,7 +832,7 @@ async fn faults_on_a_serial_line_end_in_the_right_points() {
 }
 
 #[tokio::test]
-async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one() {
+async fn late_reply_not_matched_to_next_request() {
     let plan = plan(20);
     let rules = FaultPlan::new(5).times(2, 2, When::Reading(64), Fault::DelayReply(Duration::from_millis(900))).times(
         3,
@@ -849,7 +849,7 @@ async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one
 }
 
 #[tokio::test]
-async fn a_prepared_job_that_has_died_is_not_started() {
+async fn start_refused_after_interlock() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
@@ -859,7 +859,7 @@ async fn a_prepared_job_that_has_died_is_not_started() {
 }
 
 #[tokio::test]
-async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
+async fn hold_interrupts_page_transfer() {
     let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = claimed(settings(&serving)).await;
     let (interrupt, pages) = interrupt_at_page(&serving, 30);

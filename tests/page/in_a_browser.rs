@@ -27,7 +27,7 @@ fn is_old(browser: &mut Browser, tab: &Tab) -> bool {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
+fn orders_show_in_every_tab() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
@@ -55,7 +55,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
+fn run_page_draws_map_and_relief() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 200.0);
     // Hold the run, so that it waits for the browser, however long that takes to start.
@@ -84,7 +84,7 @@ fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn where_touches_are_chosen_the_map_is_shown_as_it_grows_and_how_well_it_is_known() {
+fn adaptive_map_shows_uncertainty() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 200.0);
     let text = std::fs::read_to_string(&recipe).unwrap();
@@ -118,7 +118,7 @@ fn where_touches_are_chosen_the_map_is_shown_as_it_grows_and_how_well_it_is_know
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
+fn page_of_killed_cell_disables_orders() {
     let home = tempfile::tempdir().unwrap();
     let shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
@@ -146,7 +146,7 @@ fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn the_keyboard_alone_aborts_a_run() {
+fn keyboard_aborts_run() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
@@ -171,7 +171,7 @@ fn the_keyboard_alone_aborts_a_run() {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
-fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
+fn tls_sign_in_enables_role_orders() {
     let home = tempfile::tempdir().unwrap();
     for (name, role) in [("V. Guest", "viewer"), ("A. Smith", "operator")] {
         users::add(home.path(), name, role, users::PASSWORD);
@@ -214,7 +214,7 @@ fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
 
 #[test]
 #[ignore = "needs a browser and axe-core: REGRIND_AXE names its axe.min.js"]
-fn axe_finds_nothing_serious_in_any_appearance() {
+fn axe_finds_nothing_serious() {
     let axe = std::fs::read_to_string(std::env::var("REGRIND_AXE").expect("REGRIND_AXE names axe.min.js")).unwrap();
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 200.0);

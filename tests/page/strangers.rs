@@ -23,7 +23,7 @@ fn status(folder: &Path) -> Value {
 }
 
 #[test]
-fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_goes_on() {
+fn foreign_orders_refused_and_recorded() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 20.0);
     shown.run.line("grinding", |line| line.contains("grinding"));
@@ -82,7 +82,7 @@ fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_
 }
 
 #[test]
-fn who_has_no_key_sees_nothing_and_a_thousand_wrong_ones_keep_nobody_out() {
+fn wrong_keys_refused_and_throttled() {
     let home = tempfile::tempdir().unwrap();
     let (page, url) = serve(home.path());
     let stranger = Visitor::stranger(&url);
@@ -108,7 +108,7 @@ fn who_has_no_key_sees_nothing_and_a_thousand_wrong_ones_keep_nobody_out() {
 }
 
 #[test]
-fn the_pages_of_two_cells_on_one_computer_leave_each_other_their_keys() {
+fn cookies_of_two_cells_do_not_clash() {
     let [one, other] = [(), ()].map(|()| tempfile::tempdir().unwrap());
     let ((_one, one), (_other, other)) = (serve(one.path()), serve(other.path()));
     // A browser stores cookies by the host name, independent of the port.
@@ -122,7 +122,7 @@ fn the_pages_of_two_cells_on_one_computer_leave_each_other_their_keys() {
 }
 
 #[test]
-fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_there() {
+fn foreign_host_and_outside_path_refused() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();
     std::fs::write(home.path().join("secret.html"), "secret").unwrap();
@@ -167,7 +167,7 @@ fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_
 }
 
 #[test]
-fn clients_that_never_finish_a_request_do_not_keep_others_waiting() {
+fn unfinished_requests_block_nobody() {
     let home = tempfile::tempdir().unwrap();
     let (_page, url) = serve(home.path());
     let visitor = Visitor::with_key(&url);
@@ -181,7 +181,7 @@ fn clients_that_never_finish_a_request_do_not_keep_others_waiting() {
 
 /// Opens as many connections as the page once had room for, each with a complete header and an unfinished body.
 #[test]
-fn orders_that_are_never_finished_keep_nobody_out() {
+fn unfinished_bodies_block_nobody() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();
     assert_eq!(add(home.path(), "operator", "operator", PASSWORD).0, 0);
@@ -207,7 +207,7 @@ fn orders_that_are_never_finished_keep_nobody_out() {
 }
 
 #[test]
-fn one_screen_has_control_every_screen_makes_safe_and_taking_over_is_on_record() {
+fn one_screen_has_control_any_can_hold() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 20.0);
     shown.run.line("grinding", |line| line.contains("grinding"));

@@ -40,7 +40,7 @@ fn shown_to_users(home: &Path) -> CellPage {
 }
 
 #[test]
-fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
+fn users_file_commands_and_errors() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("users.toml");
     assert_eq!(add(home.path(), "王 芳", "operator", PASSWORD).0, 0);
@@ -80,7 +80,7 @@ fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
 #[cfg(unix)]
 #[test]
 #[cfg_attr(not(feature = "https"), ignore = "needs TLS: --features https")]
-fn a_list_and_a_key_that_others_may_read_are_refused() {
+fn users_file_and_key_need_mode_600() {
     use std::os::unix::fs::PermissionsExt;
     let home = tempfile::tempdir().unwrap();
     assert_eq!(add(home.path(), "a", "viewer", PASSWORD).0, 0);
@@ -99,7 +99,7 @@ fn a_list_and_a_key_that_others_may_read_are_refused() {
 }
 
 #[test]
-fn each_role_orders_what_is_its_own_and_the_record_has_who_it_was() {
+fn roles_limit_orders_and_are_recorded() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = shown_to_users(home.path());
     shown.run.line("grinding", |line| line.contains("grinding"));
@@ -143,7 +143,7 @@ fn each_role_orders_what_is_its_own_and_the_record_has_who_it_was() {
 }
 
 #[test]
-fn a_thousand_wrong_passwords_let_nobody_in_are_on_record_and_leave_the_cell_alone() {
+fn wrong_passwords_are_throttled() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = shown_to_users(home.path());
     shown.run.line("grinding", |line| line.contains("grinding"));
@@ -180,7 +180,7 @@ fn a_thousand_wrong_passwords_let_nobody_in_are_on_record_and_leave_the_cell_alo
 }
 
 #[test]
-fn who_is_taken_off_the_list_or_signs_out_is_out_at_once() {
+fn removed_user_is_signed_out() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();
     for name in ["stays", "goes", "changes"] {
@@ -225,7 +225,7 @@ pub fn certificate(home: &Path) -> (String, String, Arc<ClientConfig>) {
 
 #[test]
 #[cfg_attr(not(feature = "https"), ignore = "needs TLS: --features https")]
-fn another_computer_comes_in_by_tls_under_the_names_of_the_certificate_alone() {
+fn tls_accepts_certificate_names_only() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();
     assert_eq!(add(home.path(), "A. Smith", "operator", PASSWORD).0, 0);

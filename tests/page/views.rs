@@ -5,7 +5,7 @@ use crate::program::{replaced, run, run_folders, small_recipe};
 use crate::{CellPage, serve};
 
 #[test]
-fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
+fn finished_run_pages() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e5).display().to_string();
     for part in ["SN-<1>", "SN-0002"] {
@@ -69,7 +69,7 @@ fn escaped(id: &str) -> String {
 }
 
 #[test]
-fn a_run_with_signs_of_addresses_in_its_name_is_shown_and_takes_orders() {
+fn run_name_is_url_escaped() {
     let home = tempfile::tempdir().unwrap();
     let recipe = home.path().join("lens #3 100%41? & <half>.toml");
     std::fs::rename(small_recipe(home.path(), 20.0), &recipe).unwrap();
@@ -93,7 +93,7 @@ fn a_run_with_signs_of_addresses_in_its_name_is_shown_and_takes_orders() {
 }
 
 #[test]
-fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
+fn serve_refuses_public_or_used_address() {
     let home = tempfile::tempdir().unwrap();
     let (code, _, errors) = run(&["serve", "--listen", "0.0.0.0:0"], home.path());
     assert!(
@@ -107,7 +107,7 @@ fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
 
 /// The configured radius of the probe differs from that on the sphere: the cell is held, and a person ends the run.
 #[test]
-fn a_run_that_was_stopped_shows_the_alarms_that_it_ended_with() {
+fn stopped_run_shows_last_alarms() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e5);
     let text = std::fs::read_to_string(&recipe).unwrap();

@@ -84,7 +84,7 @@ fn worst_mm(points: &[[f64; 3]], z: f64, error: impl Fn(f64, f64) -> f64) -> f64
 }
 
 #[test]
-fn a_long_line_is_divided_where_the_correction_changes_along_it() {
+fn compensate_splits_long_lines() {
     // Flat on the left, a wave on the right.
     let error = |x: f64, _: f64| if x > 0.0 { 5e-3 * (1.0 - (0.4 * x).cos()) } else { 0.0 };
     let bench = Shop::new(error, "G21 G90 G17\nG0 Z5\nG0 X-28 Y3\nG1 Z1 F500\nG1 X28 Y3\nG0 Z5\nM2\n");
@@ -107,7 +107,7 @@ fn a_long_line_is_divided_where_the_correction_changes_along_it() {
 }
 
 #[test]
-fn rapid_moves_and_machine_coordinates_stay_as_they_are() {
+fn compensate_leaves_rapids_and_g53() {
     let program = "%\n(head)\nN10 G21 G90 G54\nN20 G53 G0 Z0\nN30 G0 X0 Y0\nN40 G0 Z2.5 M8\nN50 G1 X10 Y5 F200 S3000\nN60 G53 G0 Z0\nN70 X1 Y1\nN80 M30\n%\n";
     let bench = Shop::new(error_mm, program);
     let text = bench.compensate(&[]).unwrap();
@@ -125,7 +125,7 @@ fn rapid_moves_and_machine_coordinates_stay_as_they_are() {
 }
 
 #[test]
-fn arcs_stay_arcs_only_where_the_correction_is_the_same_all_along() {
+fn arcs_remain_under_constant_correction() {
     let program = "G21 G90 G17\nG0 X10 Y0 Z1\nG1 Z0 F300\nG3 X0 Y10 I-10 J0\nG2 X10 Y0 R10\nG3 X10 Y0 I-10\nM2\n";
     let constant = Shop::new(|_, _| 0.004, program).compensate(&[]).unwrap();
     assert!(constant.contains("G3 X0.000000 Y10.000000 Z-0.004000 I-10.000000 J0.000000\n"), "{constant}");
@@ -147,7 +147,7 @@ fn arcs_stay_arcs_only_where_the_correction_is_the_same_all_along() {
 }
 
 #[test]
-fn arcs_in_the_other_planes_helices_inches_and_distances() {
+fn compensate_planes_inches_and_relative() {
     let side = "G21 G90 G18\nG0 X0 Y2 Z10\nG1 X0.001 F100\nG2 X10 Z0 I-0.001 K-10\nM2\n";
     let text = Shop::new(|_, _| 0.003, side).compensate(&[]).unwrap();
     assert!(text.contains("G2 X10.000000 Y2.000000 Z-0.003000"), "{text}");
@@ -161,7 +161,7 @@ fn arcs_in_the_other_planes_helices_inches_and_distances() {
 }
 
 #[test]
-fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
+fn compensate_refuses_unknown_motion() {
     for (line, words) in [
         ("G81 X1 Y1 Z-1 R2", "canned cycle"),
         ("O100 call", "O-word"),
@@ -216,7 +216,7 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
 }
 
 #[test]
-fn what_is_in_force_is_written_and_nothing_is_lost() {
+fn compensate_preserves_modal_state() {
     let kept = |program: &str, lines: &[&str]| {
         let text = Shop::new(|_, _| 0.004, program).compensate(&[]).unwrap_or_else(|said| panic!("{program}: {said}"));
         lines.iter().for_each(|line| assert!(text.lines().any(|of| of == *line), "{line}\n{text}"));
@@ -259,7 +259,7 @@ fn what_is_in_force_is_written_and_nothing_is_lost() {
 }
 
 #[test]
-fn arcs_of_three_decimals_stay_arcs() {
+fn rounded_arcs_remain_arcs() {
     // Ends that rounding moves half a micrometre off the circle.
     let mut program = String::from("G21 G90 G17\nG0 X14.142 Y0 Z1\nG1 Z0 F300\n");
     for k in 1..=8 {
@@ -273,7 +273,7 @@ fn arcs_of_three_decimals_stay_arcs() {
 }
 
 #[test]
-fn a_program_without_a_unit_gets_the_one_that_it_is_taken_for() {
+fn missing_unit_is_assumed_and_written() {
     let program = "G90 G54\nG0 X0.5 Y0\nG0 Z0.2\nG1 Z0 F20\nG1 X-0.5\nM30\n";
     let bench = Shop::new(|_, _| 0.005, program);
     let (code, told, _) =
@@ -287,7 +287,7 @@ fn a_program_without_a_unit_gets_the_one_that_it_is_taken_for() {
 }
 
 #[test]
-fn a_program_beside_the_map_is_refused_or_told() {
+fn program_outside_map_refused() {
     let at = |x: i32| format!("G21 G90\nG0 X{x} Y0 Z1\nG1 Z0 F100\nG1 X{}\nM2\n", x + 20);
     let told = |program: &str| {
         let bench = Shop::new(|_, _| 0.005, program);
@@ -308,7 +308,7 @@ fn a_program_beside_the_map_is_refused_or_told() {
 }
 
 #[test]
-fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
+fn map_validity_and_max_correction() {
     let bench = Shop::new(|_, _| 0.0, "G21 G90\nG0 X-4 Y0 Z1\nG1 Z0 F100\nG1 X4\nM2\n");
     let map = |value: &dyn Fn(i32) -> String| {
         let rows: String = (-3..=3)
@@ -341,7 +341,7 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
 }
 
 #[test]
-fn the_corrected_program_takes_the_place_of_nothing_else() {
+fn compensate_overwrites_no_input() {
     let program = "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n";
     let bench = Shop::new(error_mm, program);
     for out in ["base.ngc", "./base.ngc", "map.csv"] {
@@ -359,7 +359,7 @@ fn the_corrected_program_takes_the_place_of_nothing_else() {
 }
 
 #[test]
-fn programs_of_other_controls_are_called_so() {
+fn compensate_names_other_control() {
     for (program, name) in [
         ("%\nO7001(PART)\nG21 G90\nG0 X0. Y0. Z1.\nG1 X5. F100\nM30\n%\n", "Fanuc"),
         ("0 BEGIN PGM PART MM\n1 L X+0 Y+0 R0 FMAX\n", "Klartext"),
@@ -371,7 +371,7 @@ fn programs_of_other_controls_are_called_so() {
 }
 
 #[test]
-fn a_map_is_applied_once_and_only_to_its_part() {
+fn map_applied_once_to_its_part() {
     let program = "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n";
     let bench = Shop::new(error_mm, program);
     bench.compensate(&[]).unwrap();
@@ -387,7 +387,7 @@ fn a_map_is_applied_once_and_only_to_its_part() {
 }
 
 #[test]
-fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
+fn map_requires_its_base_program() {
     let program = |comments: &str| format!("{comments}G21 G90\nG0 X-20 Y0 Z5\nG1 Z0 F100\nG1 X20\nM2\n");
     let (one, other) = ("01".repeat(32), "02".repeat(32));
     let has = |map: &str| format!("(part: sha256 {})\n(map: sha256 {map})\n", "ab".repeat(32));
@@ -414,7 +414,7 @@ fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
 }
 
 #[test]
-fn maps_that_are_none_are_refused() {
+fn compensate_refuses_malformed_maps() {
     let bench = Shop::new(error_mm, "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n");
     let whole = fs::read_to_string(bench.path("map.csv")).unwrap();
     let without = |n: usize| {
@@ -434,7 +434,7 @@ fn maps_that_are_none_are_refused() {
 }
 
 #[test]
-fn along_the_normals_the_ball_leaves_the_corrected_surface() {
+fn compensate_ball_along_normals() {
     // A dome z = -x^2 / 80 - y^2 / 120 and a ball of 5 mm whose tip the program moves.
     let height = |x: f64, y: f64| -x * x / 80.0 - y * y / 120.0;
     let normal = |x: f64, y: f64| {
@@ -490,7 +490,7 @@ fn along_the_normals_the_ball_leaves_the_corrected_surface() {
 }
 
 #[test]
-fn a_program_that_was_written_in_arcs_keeps_them_where_the_correction_is_the_same() {
+fn generated_arcs_remain_arcs() {
     let mut part = part("biconic");
     part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
     (part.programs.arcs_within_mm, part.programs.part_identity) = (Some(1e-4), PART);

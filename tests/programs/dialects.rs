@@ -40,7 +40,7 @@ fn half_a_step_mm(name: &str) -> f64 {
 }
 
 #[test]
-fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
+fn controls_read_back_planned_path() {
     for name in DIALECTS {
         let mut part = part("freeform-mirror");
         part.programs.options = with(&part.programs.options, Wheel::Sphere { radius_mm: 12.5 }, 4.0);
@@ -92,7 +92,7 @@ fn off_the_way(stop: &Waypoint, from: [f64; 3], place: [f64; 3]) -> f64 {
 }
 
 #[test]
-fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_tolerance() {
+fn arcs_pass_plan_points_in_tolerance() {
     for (name, recipe, fewer) in [
         ("linuxcnc", "shallow-wave", 5),
         ("fanuc", "freeform-mirror", 2),
@@ -138,7 +138,7 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
 }
 
 #[test]
-fn the_wheel_that_goes_along_arcs_leaves_the_corrected_surface() {
+fn wheel_on_arcs_leaves_surface() {
     for (name, recipe) in [
         ("linuxcnc", "freeform-mirror"),
         ("fanuc", "biconic"),
@@ -170,7 +170,7 @@ fn the_wheel_that_goes_along_arcs_leaves_the_corrected_surface() {
 }
 
 #[test]
-fn the_wheel_that_follows_what_a_control_has_read_leaves_the_corrected_surface() {
+fn wheel_on_read_path_leaves_surface() {
     for name in DIALECTS {
         let mut part = part("freeform-mirror");
         let wheel = Wheel::Sphere { radius_mm: 12.5 };
@@ -188,7 +188,7 @@ fn the_wheel_that_follows_what_a_control_has_read_leaves_the_corrected_surface()
 }
 
 #[test]
-fn every_path_mode_of_every_dialect_is_one_that_its_control_keeps_to_the_path_in() {
+fn path_modes_readable_by_control() {
     for name in DIALECTS {
         let mut part = part("shallow-wave");
         part.programs.options = with(&part.programs.options, part.programs.options.wheel, 20.0);
@@ -206,7 +206,7 @@ fn every_path_mode_of_every_dialect_is_one_that_its_control_keeps_to_the_path_in
 }
 
 #[test]
-fn a_control_does_not_read_what_is_written_for_another() {
+fn control_refuses_other_dialects() {
     let mut part = part("shallow-wave");
     part.programs.options = with(&part.programs.options, part.programs.options.wheel, 20.0);
     for name in DIALECTS {

@@ -4,7 +4,7 @@ use crate::path::{correction, part, part_from_below, read};
 use std::fs;
 
 #[test]
-fn a_program_from_below_says_so() {
+fn header_marks_program_from_below() {
     let part = part_from_below("shallow-wave");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
@@ -14,7 +14,7 @@ fn a_program_from_below_says_so() {
 }
 
 #[test]
-fn a_header_says_what_a_person_needs_and_counts_right() {
+fn header_content_and_counts() {
     let part = part("freeform-mirror");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");

@@ -467,7 +467,7 @@ fn assert_is_corrected(drawn: &Drawn, text: &str, error: fn(f64, f64) -> f64, se
 }
 
 #[test]
-fn a_drawn_program_is_corrected_point_by_point_or_refused() {
+fn drawn_program_corrected_or_refused() {
     let (mut corrected, mut refused, mut kept) = (0, 0, 0);
     let count = seeds(60);
     for seed in 0..count {

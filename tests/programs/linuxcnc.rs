@@ -46,7 +46,7 @@ fn interpreted(file: &Path) -> Result<Vec<End>, String> {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn every_program_of_every_recipe_is_read_point_by_point() {
+fn rs274_reads_every_program() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"] {
         let mut part = part(name);
@@ -95,7 +95,7 @@ fn arcs(said: &str) -> Vec<([usize; 3], Vec<f64>)> {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn the_interpreter_turns_where_the_simulated_control_does() {
+fn rs274_arcs_match_simulated_control() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     for (name, pattern) in [
@@ -131,7 +131,7 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
+fn rs274_reads_tilted_programs() {
     let folder = tempfile::tempdir().unwrap();
     let mut part = part("freeform-mirror");
     let plain = part.programs.options;
@@ -176,7 +176,7 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn every_path_mode_is_read() {
+fn rs274_reads_every_path_mode() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     let mut part = part("shallow-wave");
@@ -192,7 +192,7 @@ fn every_path_mode_is_read() {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn the_interpreter_is_one_that_refuses() {
+fn rs274_refuses_bad_program() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bad.ngc");
     fs::write(&file, "G21 G90\nG1 X1 F100\nG1 X1.5e3\nM2\n").unwrap();
@@ -203,7 +203,7 @@ fn the_interpreter_is_one_that_refuses() {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn corrected_programs_are_read_by_the_interpreter_of_linuxcnc() {
+fn rs274_reads_corrected_programs() {
     let program = "%\nG21 G90 G17 G64 P0.001\nG0 Z5\nG0 X-10 Y0\nG1 Z0 F300\nG1 X10\nG2 X-10 Y0 I-10 J0\nG18 G3 X10 Z0 R10.0\nG17 G91 G1 X1 Y1\nG90 G0 Z5\nM2\n%\n";
     for error in [|_: f64, _: f64| 0.004, error_mm] {
         let bench = Shop::new(error, program);
@@ -244,7 +244,7 @@ fn ends_of_feeds(said: &str) -> Vec<[f64; 3]> {
 
 #[test]
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
-fn drawn_programs_are_corrected_as_the_interpreter_of_linuxcnc_reads_them() {
+fn rs274_reads_drawn_programs() {
     let (mut read, mut moves) = (0, 0);
     for seed in 0..crate::sample::seeds(25) {
         let drawn = crate::generated::drawn(seed);

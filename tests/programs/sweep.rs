@@ -123,7 +123,7 @@ fn parts_and_wheels() -> impl Iterator<Item = (&'static str, (&'static str, Whee
 }
 
 #[test]
-fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
+fn every_wheel_leaves_surface_on_tracks() {
     for name in PARTS {
         let mut part = part(name);
         let plain = part.programs.options;
@@ -139,7 +139,7 @@ fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
 }
 
 #[test]
-fn from_below_every_wheel_leaves_the_corrected_lower_side() {
+fn wheel_from_below_leaves_surface() {
     for name in PARTS {
         let mut part = part_from_below(name);
         let plain = part.programs.options;
@@ -165,7 +165,7 @@ fn from_below_every_wheel_leaves_the_corrected_lower_side() {
 }
 
 #[test]
-fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
+fn ridge_height_between_tracks() {
     let height_mm = 1e-2;
     for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
@@ -191,7 +191,7 @@ fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
 }
 
 #[test]
-fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
+fn scallop_figures_match_swept_wheel() {
     for (name, (wheel_name, wheel), pattern) in [
         ("freeform-mirror", wheels(0.8)[0], TrackPattern::Raster),
         ("freeform-mirror", wheels(0.8)[1], TrackPattern::Raster),
@@ -233,7 +233,7 @@ fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
 }
 
 #[test]
-fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
+fn spiral_ridges_within_spacing() {
     let mut part = part("off-axis-asphere");
     let wheel = Wheel::Sphere { radius_mm: 12.5 };
     part.programs.options = with(&part.programs.options, wheel, 0.4);
@@ -249,7 +249,7 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
 }
 
 #[test]
-fn no_spiral_cuts_deeper_anywhere() {
+fn spiral_never_cuts_too_deep() {
     for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
         part.programs.options =
@@ -266,7 +266,7 @@ fn no_spiral_cuts_deeper_anywhere() {
 }
 
 #[test]
-fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
+fn sweep_detects_correction_along_z() {
     // The check must be able to fail: it detects a ball whose correction was added along z alone.
     let part = part("freeform-mirror");
     let correction = correction(part.half_mm);

@@ -95,7 +95,7 @@ fn leaning(part: &Part, wheel: Wheel, rotary: RotaryAxis, lean: TiltMode, track_
 }
 
 #[test]
-fn in_every_dialect_every_tilted_wheel_leaves_the_corrected_surface() {
+fn tilted_wheel_leaves_surface() {
     let ways = [
         ("linuxcnc", None, 6),
         ("linuxcnc", Some(PIVOT_MM), 6),
@@ -150,7 +150,7 @@ fn steep(part: &mut Part) {
 }
 
 #[test]
-fn a_flank_too_steep_for_an_upright_wheel_is_ground_by_one_that_follows() {
+fn steep_flank_ground_by_following_tilt() {
     let mut part = part("freeform-mirror");
     steep(&mut part);
     let plain = part.programs.options;
@@ -195,7 +195,7 @@ fn steep_truth(x: f64, y: f64) -> [f64; 3] {
 }
 
 #[test]
-fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
+fn zero_tilt_equals_upright_program() {
     for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
         let mut part = part("shallow-wave");
         let plain = with(&part.programs.options, part.programs.options.wheel, 8.0);
@@ -230,7 +230,7 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
 }
 
 #[test]
-fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
+fn tilted_program_needs_rotary_axis() {
     let mut part = part("shallow-wave");
     let lean = TiltMode::Constant { angle_rad: 0.3 };
     let wheel = part.programs.options.wheel;
@@ -261,7 +261,7 @@ fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
 }
 
 #[test]
-fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
+fn inverse_time_feed_matches_duration() {
     let mut part = part("freeform-mirror");
     let (wheel, lean) = (Wheel::Sphere { radius_mm: 12.5 }, TiltMode::Following { lead_rad: 0.35 });
     part.programs.options = leaning(&part, wheel, head(RotationAxis::Y, Some(PIVOT_MM), 6), lean, 8.0);

@@ -38,7 +38,7 @@ fn rows(path: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_false_trigger_is_touched_again_and_the_part_accepted_without_anybody() {
+fn false_trigger_is_touched_again() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1, 20_000.0);
     let mut running = Running::new(regrind(&["run", &recipe], home.path()));
@@ -72,7 +72,7 @@ fn a_false_trigger_is_touched_again_and_the_part_accepted_without_anybody() {
 }
 
 #[test]
-fn a_run_that_is_killed_while_it_touches_again_goes_on_with_what_it_had() {
+fn killed_during_retouch_resumes() {
     let home = tempfile::tempdir().unwrap();
     let few = [
         ("columns = 60", "columns = 20"),

@@ -32,7 +32,7 @@ fn run_against(home: &Path, recipe: &str, cell: &str, serving: &mut Running) -> 
 }
 
 #[test]
-fn over_modbus_tcp() {
+fn run_over_modbus_tcp() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 2000.0);
     let recipe = recipe.to_str().unwrap();
@@ -49,7 +49,7 @@ fn over_modbus_tcp() {
 }
 
 #[test]
-fn over_modbus_rtu_on_pseudo_terminals() {
+fn run_over_modbus_rtu() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 2000.0);
     let recipe = recipe.to_str().unwrap();

@@ -127,7 +127,7 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn a_sound_record_is_proven_in_words_and_json() {
+fn audit_verifies_sound_record() {
     let (home, folder) = recorded(true);
     let words = printed(home.path(), &["audit", "verify"], 0);
     assert!(words.starts_with("SIMULATION  runs/mirror-1\n"), "{words}");
@@ -147,7 +147,7 @@ fn a_sound_record_is_proven_in_words_and_json() {
 }
 
 #[test]
-fn a_broken_record_is_named_and_ends_with_1() {
+fn audit_names_broken_record() {
     let (home, folder) = recorded(true);
     fs::write(folder.join("cycle-2/measured.csv"), "1,2,4\n").unwrap();
     let error = refused(home.path(), &["audit", "verify"], 1);
@@ -167,7 +167,7 @@ fn a_broken_record_is_named_and_ends_with_1() {
 }
 
 #[test]
-fn a_record_without_its_anchor_or_its_end_is_not_whole_and_ends_with_1() {
+fn audit_detects_missing_anchor_or_end() {
     let (home, folder) = recorded(true);
     fs::remove_file(folder.join("journal.anchor")).unwrap();
     assert!(refused(home.path(), &["audit", "verify"], 1).contains("journal.anchor is missing"));
@@ -183,7 +183,7 @@ fn a_record_without_its_anchor_or_its_end_is_not_whole_and_ends_with_1() {
 }
 
 #[test]
-fn what_lies_beside_the_record_is_told() {
+fn audit_lists_unrecorded_files() {
     let (home, folder) = recorded(true);
     printed(home.path(), &["report"], 0);
     let words = printed(home.path(), &["audit", "verify"], 0);
@@ -197,7 +197,7 @@ fn what_lies_beside_the_record_is_told() {
 }
 
 #[test]
-fn folders_without_a_record_end_with_2() {
+fn audit_refuses_folder_without_record() {
     let home = tempfile::tempdir().unwrap();
     for what in ["verify", "show", "export"] {
         for arguments in [vec!["audit", what], vec!["audit", what, "nowhere"], vec!["audit", what, "."]] {
@@ -214,7 +214,7 @@ fn folders_without_a_record_end_with_2() {
 }
 
 #[test]
-fn the_table_says_what_happened_and_is_marked() {
+fn audit_show_prints_marked_table() {
     let (home, _) = recorded(true);
     let shown = printed(home.path(), &["audit", "show"], 0);
     assert!(shown.starts_with("SIMULATION  runs/mirror-1; Mirror <A> & B\n"), "{shown}");
@@ -247,7 +247,7 @@ fn the_table_says_what_happened_and_is_marked() {
 }
 
 #[test]
-fn what_is_exported_proves_itself() {
+fn audit_export_chain_is_verifiable() {
     let (home, _) = recorded(false);
     let mut previous = "0".repeat(64);
     let lines = printed(home.path(), &["audit", "export"], 0);
@@ -293,7 +293,7 @@ fn rows_of_csv(text: &str) -> Vec<Vec<String>> {
 }
 
 #[test]
-fn a_record_in_csv_is_exact() {
+fn audit_export_csv_is_exact() {
     let (home, folder) = recorded(false);
     let rows = rows_of_csv(&printed(home.path(), &["audit", "export", "--format", "csv"], 0));
     let head = "seq utc boot_id mono_ns actor station kind part cycle command_id reason payload prev_hash hash";
@@ -320,7 +320,7 @@ fn with_key(home: &Path, key: &Path, arguments: &[&str]) -> (i32, String, String
 }
 
 #[test]
-fn the_key_of_a_computer_is_made_once_and_its_public_half_is_told_again() {
+fn audit_key_is_created_once() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("settings/audit.key");
     let (code, said, errors) = with_key(home.path(), &path, &["audit", "key"]);
@@ -355,7 +355,7 @@ fn the_key_of_a_computer_is_made_once_and_its_public_half_is_told_again() {
 }
 
 #[test]
-fn a_run_signs_its_record_and_quality_proves_it_with_the_key_that_it_kept() {
+fn signed_run_verifies_with_public_key() {
     let home = tempfile::tempdir().unwrap();
     let key = home.path().join("audit.key");
     let kept = with_key(home.path(), &key, &["audit", "key"]).1;
@@ -398,7 +398,7 @@ fn report_in(home: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_run_does_not_begin_with_a_key_that_cannot_be_used() {
+fn run_refuses_unusable_audit_key() {
     use std::os::unix::fs::PermissionsExt;
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e4);
@@ -418,7 +418,7 @@ fn a_run_does_not_begin_with_a_key_that_cannot_be_used() {
 }
 
 #[test]
-fn an_end_that_is_not_signed_ends_with_1_where_the_run_names_a_key() {
+fn audit_detects_unsigned_end() {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("runs/r");
     let header = Header {
@@ -444,7 +444,7 @@ fn an_end_that_is_not_signed_ends_with_1_where_the_run_names_a_key() {
 }
 
 #[test]
-fn the_report_of_a_run_is_one_file_that_needs_nothing_else() {
+fn report_is_self_contained() {
     let (home, folder) = recorded(true);
     assert_eq!(printed(home.path(), &["report"], 0), "runs/mirror-1/report.html\n");
     let html = fs::read_to_string(folder.join("report.html")).unwrap();
@@ -482,7 +482,7 @@ fn the_report_of_a_run_is_one_file_that_needs_nothing_else() {
 }
 
 #[test]
-fn a_run_under_way_is_shown_and_its_open_end_is_said() {
+fn audit_reports_open_run() {
     let home = tempfile::tempdir().unwrap();
     let header = Header {
         run: "r".into(),
@@ -501,7 +501,7 @@ fn a_run_under_way_is_shown_and_its_open_end_is_said() {
 }
 
 #[test]
-fn who_holds_the_lock_of_a_run_does_not_make_it_sound() {
+fn audit_lock_does_not_make_run_sound() {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("runs/r");
     let header = || Header {
@@ -539,7 +539,7 @@ fn who_holds_the_lock_of_a_run_does_not_make_it_sound() {
 }
 
 #[test]
-fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
+fn state_table_and_picture_are_current() {
     let home = tempfile::tempdir().unwrap();
     let idle = printed(home.path(), &["states", "--state", "idle"], 0);
     assert!(idle.starts_with("Idle\n"), "{idle}");
@@ -556,7 +556,7 @@ fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
 }
 
 #[test]
-fn the_picture_names_every_state_once_and_is_well_formed() {
+fn state_picture_names_each_state_once() {
     let rows = transition_table();
     let picture = state_picture(&rows);
     let document = roxmltree::Document::parse(&picture).unwrap();
@@ -592,7 +592,7 @@ fn runs_of(home: &Path, key: &Path, parts: &[&str]) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_run_that_is_removed_renamed_or_exchanged_is_missed_in_its_folder() {
+fn audit_detects_removed_or_renamed_run() {
     let [home, elsewhere] = [(), ()].map(|()| tempfile::tempdir().unwrap());
     let (home, elsewhere) = (home.path(), elsewhere.path());
     let key = home.join("audit.key");

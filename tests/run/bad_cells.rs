@@ -31,7 +31,7 @@ fn sim_cell() -> String {
 }
 
 #[test]
-fn a_file_stands_where_the_runs_should_be() {
+fn file_at_runs_folder_refused() {
     let home = tempfile::tempdir().unwrap();
     fs::write(home.path().join("runs"), "not a folder").unwrap();
     let (code, _, errors) = in_time(&["run", &recipe(home.path(), 1e4), "--cell", &sim_cell()], home.path());
@@ -41,7 +41,7 @@ fn a_file_stands_where_the_runs_should_be() {
 }
 
 #[test]
-fn a_recipe_that_needs_the_temperature_is_refused_over_a_wire_that_tells_none() {
+fn temperature_keys_need_reporting_cmm() {
     let home = tempfile::tempdir().unwrap();
     let cell = root().join("config/ippdme.toml").display().to_string();
     let part = ("[part]", "[part]\nexpansion_um_m_k = 7.1");
@@ -58,7 +58,7 @@ fn a_recipe_that_needs_the_temperature_is_refused_over_a_wire_that_tells_none() 
 }
 
 #[test]
-fn runs_that_begin_in_one_second_have_folders_of_their_own() {
+fn simultaneous_runs_get_own_folders() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
     let mut both: Vec<Running> = (0..2)
@@ -76,7 +76,7 @@ fn runs_that_begin_in_one_second_have_folders_of_their_own() {
 
 #[test]
 #[ignore = "needs a user who may not write everywhere: not root"]
-fn a_folder_that_may_not_be_written() {
+fn read_only_runs_folder_refused() {
     use std::os::unix::fs::PermissionsExt;
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
@@ -112,7 +112,7 @@ fn fills_up(command: Command, home: &Path, named: &str, fill: impl FnOnce()) {
 
 /// The shell's limit on the size of a file: a write beyond it fails.
 #[test]
-fn a_journal_that_cannot_grow_holds_the_cell_and_loses_nothing() {
+fn journal_at_size_limit_holds_cell() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 2000.0);
     let mut command = Command::new("bash");
@@ -151,7 +151,7 @@ impl Drop for SmallDisk {
 
 #[test]
 #[ignore = "needs a user who may mount a small disk: root"]
-fn a_disk_that_fills_up_holds_the_cell_and_loses_nothing() {
+fn disk_full_holds_cell() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 2000.0);
     let disk = SmallDisk::at(home.path().join("small"), 40_000);
@@ -161,7 +161,7 @@ fn a_disk_that_fills_up_holds_the_cell_and_loses_nothing() {
 
 #[test]
 #[ignore = "needs a user who may mount a small disk: root"]
-fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
+fn disk_full_starts_no_cycle() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 200.0);
     let disk = SmallDisk::at(home.path().join("small"), 400);
@@ -219,7 +219,7 @@ impl Drop for BrokenDisk {
 
 #[test]
 #[ignore = "needs a user who may mount a disk that breaks: root"]
-fn a_disk_that_turns_read_only_holds_the_cell_and_loses_nothing() {
+fn disk_read_only_holds_cell() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 2000.0);
     let disk = BrokenDisk::at(home.path().join("broken"));
@@ -228,7 +228,7 @@ fn a_disk_that_turns_read_only_holds_the_cell_and_loses_nothing() {
 }
 
 #[test]
-fn a_port_that_is_taken_cannot_be_simulated() {
+fn simulate_refuses_used_port() {
     let home = tempfile::tempdir().unwrap();
     let taken = std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let port = taken.local_addr().unwrap().port().to_string();
@@ -240,7 +240,7 @@ fn a_port_that_is_taken_cannot_be_simulated() {
 }
 
 #[test]
-fn a_file_stands_where_a_serial_device_should_be_linked() {
+fn simulate_refuses_file_at_device_link() {
     let home = tempfile::tempdir().unwrap();
     let devices = format!("device = \"{}/", home.path().display());
     let text = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
@@ -254,7 +254,7 @@ fn a_file_stands_where_a_serial_device_should_be_linked() {
 }
 
 #[test]
-fn machines_that_are_not_there() {
+fn unreachable_machines_end_run() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
     // A port that is bound but does not listen.
@@ -281,7 +281,7 @@ fn machines_that_are_not_there() {
 
 /// A missing serial port is reported at once, with the list of existing ports. Nothing has started.
 #[test]
-fn a_serial_port_that_is_not_there() {
+fn missing_serial_port_lists_ports() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
     let devices = format!("device = \"{}/absent-", home.path().display());
@@ -294,7 +294,7 @@ fn a_serial_port_that_is_not_there() {
 }
 
 #[test]
-fn a_recipe_for_another_cell() {
+fn recipe_beyond_cell_limits_refused() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
     let cells = [
@@ -329,7 +329,7 @@ fn a_recipe_for_another_cell() {
 }
 
 #[test]
-fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_not_begun() {
+fn pass_beyond_travel_is_not_started() {
     let home = tempfile::tempdir().unwrap();
     let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
     assert!(text.contains("[cycle]\n"));
@@ -349,7 +349,7 @@ fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_n
 }
 
 #[test]
-fn every_kind_of_broken_file_through_every_command() {
+fn commands_refuse_broken_files() {
     let home = tempfile::tempdir().unwrap();
     let good = recipe(home.path(), 1e4);
     let text = fs::read_to_string(&good).unwrap();
@@ -385,7 +385,7 @@ fn every_kind_of_broken_file_through_every_command() {
 }
 
 #[test]
-fn a_recipe_without_a_truth_cannot_be_simulated() {
+fn recipe_without_simulation_refused() {
     let home = tempfile::tempdir().unwrap();
     let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
     let cut = text.split("# The truth of a simulated cell").next().unwrap();
@@ -398,7 +398,7 @@ fn a_recipe_without_a_truth_cannot_be_simulated() {
 }
 
 #[test]
-fn ctrl_c_holds_once_and_aborts_twice() {
+fn ctrl_c_holds_then_aborts() {
     let home = tempfile::tempdir().unwrap();
     // Slow enough that the machine still grinds.
     let recipe = recipe(home.path(), 100.0);

@@ -54,7 +54,7 @@ fn least_apart_mm(plan: &Plan, of: usize) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn after_a_measurement_that_was_refused_the_first_touches_are_few_and_slow() {
+async fn careful_start_after_refused_measurement() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     rig.recipe.measure.temperature_c = Some([19.0, 21.0]);
     let ready = rig.next(true);
@@ -87,7 +87,7 @@ async fn after_a_measurement_that_was_refused_the_first_touches_are_few_and_slow
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_result_of_another_probe_than_the_recipes_is_not_used() {
+async fn result_of_other_probe_radius_refused() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let ready = rig.next(true);
     let (folder, mut notices) = (ready.folder, ready.notices);

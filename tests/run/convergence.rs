@@ -29,7 +29,7 @@ fn rms(values: impl Iterator<Item = f64> + Clone) -> f64 {
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn cycles_come_down_to_what_the_grinder_cannot_repeat() {
+fn cycles_converge_to_repeatability() {
     let runs = runs(Way::Regrind(GainRule::Wavelength), 2);
     for (name, parts) in &runs {
         println!("{name}: {:.3?}", parts[0]);

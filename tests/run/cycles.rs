@@ -164,7 +164,7 @@ fn summary(reports: &[Report], number: usize) {
 }
 
 #[test]
-fn the_default_recipe_does_as_the_paper_says() {
+fn default_recipe_matches_paper() {
     for r in drawn() {
         let [first, second] = [&r.cycles[0], &r.cycles[1]];
         assert!((20.0..=35.0).contains(&first.found_pv_um), "seed {}\n{}", r.seed, r.told);
@@ -173,7 +173,7 @@ fn the_default_recipe_does_as_the_paper_says() {
 }
 
 #[test]
-fn every_seed_ends_as_the_truth_says() {
+fn verdict_matches_truth() {
     for r in drawn() {
         let last = r.cycles.last().unwrap_or_else(|| panic!("seed {}: nothing was measured\n{}", r.seed, r.told));
         let [pv, rms] = r.tolerance_um;
@@ -193,7 +193,7 @@ fn every_seed_ends_as_the_truth_says() {
 }
 
 #[test]
-fn intervals_of_the_figures_hold_the_truth() {
+fn intervals_of_figures_cover_truth() {
     let cycles: Vec<&Cycle> = drawn().iter().flat_map(|report| &report.cycles).collect();
     for k in [0, 1] {
         let held = cycles.iter().filter(|cycle| cycle.held[k]).count();
@@ -204,14 +204,14 @@ fn intervals_of_the_figures_hold_the_truth() {
 }
 
 #[test]
-fn every_pass_is_begun_once() {
+fn every_pass_starts_once() {
     for r in drawn() {
         assert!(!r.grinds.is_empty() && r.grinds.iter().all(|begun| *begun == 1), "seed {}: {:?}", r.seed, r.grinds);
     }
 }
 
 #[test]
-fn the_map_agrees_with_the_truth_within_its_uncertainty() {
+fn map_uncertainty_covers_truth() {
     for r in drawn() {
         for c in &r.cycles {
             let [within, points] = c.within;
@@ -221,7 +221,7 @@ fn the_map_agrees_with_the_truth_within_its_uncertainty() {
 }
 
 #[test]
-fn the_pose_agrees_with_the_truth_within_its_uncertainty() {
+fn pose_covariance_covers_truth() {
     let cycles: Vec<&Cycle> = drawn().iter().flat_map(|r| &r.cycles).collect();
     for k in 0..6 {
         let within = cycles.iter().filter(|c| c.pose_z[k].abs() <= 2.0).count();

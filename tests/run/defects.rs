@@ -195,7 +195,7 @@ fn run_case(case: Case) -> CaseResult {
 }
 
 #[test]
-fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
+fn defect_beyond_limits_not_accepted() {
     let count = 8 * seeds(1);
     let one: Option<u64> = std::env::var("REGRIND_CASE").ok().map(|of| of.parse().expect("the number of a case"));
     // If few cases are drawn, each recipe has one part, and whole pattern and chosen touches alternate.

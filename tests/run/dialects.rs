@@ -25,7 +25,7 @@ fn made(dialect: &str, more: &str) -> (tempfile::TempDir, i32, String, String) {
 }
 
 #[test]
-fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
+fn part_accepted_in_every_dialect() {
     let all = [("fanuc", "nc", "controller_tolerance_um = 0.1"), ("sinumerik", "mpf", ""), ("heidenhain", "h", "")];
     for (dialect, extension, more) in cases(all, 3) {
         let (home, code, said, errors) = made(dialect, more);
@@ -59,7 +59,7 @@ const FOLLOWING: &str = "[grinding.tilt]\nlean = \"following\"\nangle_deg = 25.0
 const HEAD: &str = "[grinder.rotary]\naxis = \"B\"\nreversed = true\nleast_deg = -80.0\nmost_deg = 80.0\nlargest_rate_deg_min = 36000.0";
 
 #[test]
-fn a_part_is_ground_by_a_ball_that_leans_until_it_is_accepted() {
+fn part_accepted_with_tilted_ball() {
     let all = [
         ("[grinder.program]\ndialect = \"sinumerik\"\nfolder = \"programs\"", HEAD.to_owned()),
         ("[grinder.program]\nfolder = \"programs\"", format!("{HEAD}\npivot_mm = [3.0, 0.0, 180.0]")),
@@ -78,7 +78,7 @@ fn a_part_is_ground_by_a_ball_that_leans_until_it_is_accepted() {
 }
 
 #[test]
-fn a_wheel_is_not_tilted_by_a_machine_that_cannot_or_does_not_know() {
+fn tilt_needs_capable_machine() {
     let folder = "[grinder.program]\nfolder = \"programs\"";
     let narrow = HEAD.replace("-80.0", "-20.0");
     for (dialect, head, why) in [
@@ -94,7 +94,7 @@ fn a_wheel_is_not_tilted_by_a_machine_that_cannot_or_does_not_know() {
 }
 
 #[test]
-fn a_part_is_ground_along_arcs_until_it_is_accepted() {
+fn part_accepted_along_arcs() {
     for (dialect, extension, word) in
         cases([("heidenhain", "h", " DR+"), ("fanuc", "nc", "G03 "), ("sinumerik", "mpf", "G3 ")], 3)
     {
@@ -112,7 +112,7 @@ fn a_part_is_ground_along_arcs_until_it_is_accepted() {
 }
 
 #[test]
-fn arcs_that_cannot_be_written_so_exactly_are_refused_before_anything_moves() {
+fn arcs_beyond_tolerance_refused() {
     // Four decimals move points by 0.087 µm. The lines of the recipe are within 0.1 µm.
     for (dialect, um, told) in
         [("heidenhain", "0.05", "grinder.program.arcs_within_um"), ("sinumerik", "0.2", "grinding.chord_error_um")]
@@ -125,7 +125,7 @@ fn arcs_that_cannot_be_written_so_exactly_are_refused_before_anything_moves() {
 }
 
 #[test]
-fn what_a_dialect_cannot_say_is_refused_before_anything_moves() {
+fn fanuc_needs_controller_tolerance() {
     let (home, code, said, errors) = made("fanuc", "");
     assert_eq!(code, 2, "{said}{errors}");
     assert!(errors.contains("grinder.program.controller_tolerance_um"), "{errors}");

@@ -53,7 +53,7 @@ fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
 }
 
 #[test]
-fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
+fn wrong_devices_detected_before_write() {
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
     let order_words = &["word order", "othing was written", "word_order in the cell file"];
     let older = &["version 1 of the register map", "lacks a beat that names its owner", "update it to version 2"];
@@ -76,13 +76,13 @@ fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
 }
 
 #[test]
-fn a_map_of_another_part_is_not_ground() {
+fn map_of_other_part_refused() {
     let faults = WorldFaults { wrong_part: true, ..WorldFaults::default() };
     each_is_caught([("a map of another part", faults, AlarmId::MachineRefused, &["grinder", "another part"])], 0);
 }
 
 #[test]
-fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
+fn misapplied_map_detected_at_first_pass() {
     let none = WorldFaults::default;
     let mirrored = |map_mirrored| WorldFaults { map_mirrored, ..none() };
     let turned = &["rotated map", "how the part is turned"];
@@ -112,7 +112,7 @@ fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
 }
 
 #[test]
-fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
+fn pass_record_checked_against_command() {
     let says = |misreported| WorldFaults { misreported, ..WorldFaults::default() };
     let alarm = AlarmId::PassRecord;
     each_is_caught(
@@ -129,7 +129,7 @@ fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
 }
 
 #[test]
-fn what_is_wrong_with_a_measurement_is_told_from_it() {
+fn measurement_faults_are_identified() {
     let none = WorldFaults::default;
     let contacts = WorldFaults { returns_contact_points: true, ..none() };
     let declared = WorldFaults { contact_points_declared: true, ..contacts.clone() };
@@ -153,7 +153,7 @@ fn what_is_wrong_with_a_measurement_is_told_from_it() {
 }
 
 #[test]
-fn a_measurement_outside_its_window_of_temperature_is_not_used() {
+fn temperature_outside_window_refused() {
     let window = |least: f64, most: f64| Setup { temperature_c: Some([least, most]), ..usual() };
     let warm = window(19.5, 20.5).with(|world| world.cmm.part_temperature_c = 23.25);
     let words = &["it was 23.25 °C, limits 19.50 to 20.50 °C", "temperature of part and room"];
@@ -163,7 +163,7 @@ fn a_measurement_outside_its_window_of_temperature_is_not_used() {
 }
 
 #[test]
-fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
+fn thermal_expansion_is_compensated() {
     // Ten kelvins at 8e-6 a kelvin: a curved part grows out of its nominal shape.
     let at = |temperature_c: f64, expansion_um_m_k: Option<f64>| {
         let setup = Setup { expansion_um_m_k, ..usual() };
@@ -192,7 +192,7 @@ fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
 }
 
 #[test]
-fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
+fn reference_sphere_detects_probe_error() {
     for error_um in [10.0, -10.0] {
         let setup = usual().with(move |world| world.cmm.probe_radius_error_um = error_um);
         let words = ["radius of the probe", "the difference is", "Qualify the probe"];
@@ -201,7 +201,7 @@ fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
 }
 
 #[test]
-fn a_part_that_lies_turned_round_is_told() {
+fn rotated_part_is_detected() {
     let faults = WorldFaults { part_turned_180: true, ..WorldFaults::default() };
     // The probe meets the steep part during a free move, and the machine stops by itself. The alarm must still send a
     // person to the part.

@@ -44,7 +44,7 @@ fn until_handed_over(running: &mut Running, home: &Path) {
 }
 
 #[test]
-fn the_commands_of_the_page_begin_a_run_that_hands_over_its_first_plan() {
+fn file_exchange_guide_starts_run() {
     let (home, arguments) = shop();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let mut running = Running::new(regrind(&arguments, home.path()));
@@ -60,7 +60,7 @@ fn the_commands_of_the_page_begin_a_run_that_hands_over_its_first_plan() {
 }
 
 #[test]
-fn enter_at_the_terminal_that_asks_confirms_the_part() {
+fn enter_key_confirms_loading() {
     let (home, arguments) = shop();
     let program = regrind(&[], home.path());
     // `script` gives the program its own terminal.
@@ -81,7 +81,7 @@ fn enter_at_the_terminal_that_asks_confirms_the_part() {
 
 /// Each wrong result is ignored, and the plan stays open for the right one.
 #[test]
-fn a_wrong_or_short_result_uses_up_no_cycle() {
+fn wrong_result_file_uses_no_cycle() {
     let home = tempfile::tempdir().unwrap();
     let home = home.path();
     let recipe = small_recipe(home, 3000.0);

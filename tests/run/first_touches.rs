@@ -64,7 +64,7 @@ fn begun_run(home: &Path, running: &mut Running) -> PathBuf {
 }
 
 #[test]
-fn over_a_serial_line() {
+fn faults_found_over_serial_line() {
     for (what, world, alarm) in WRONG {
         let home = tempfile::tempdir().unwrap();
         let _machines = on_serial_lines(home.path(), recipe(world));
@@ -77,7 +77,7 @@ fn over_a_serial_line() {
 }
 
 #[test]
-fn by_files() {
+fn faults_found_by_file_exchange() {
     for (what, world, alarm) in WRONG {
         let home = tempfile::tempdir().unwrap();
         let text = recipe(world);

@@ -17,7 +17,7 @@ fn grinding(home: &Path) -> (Running, std::path::PathBuf) {
 }
 
 #[test]
-fn a_record_that_is_moved_away_holds_what_moves_and_is_gone_on_with_when_it_is_back() {
+fn moved_journal_holds_cell_until_back() {
     for name in ["journal.sqlite", "journal.sqlite-wal"] {
         let home = tempfile::tempdir().unwrap();
         let (mut running, folder) = grinding(home.path());
@@ -49,7 +49,7 @@ fn a_record_that_is_moved_away_holds_what_moves_and_is_gone_on_with_when_it_is_b
 }
 
 #[test]
-fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
+fn deleted_journal_starts_no_pass() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     for name in ["journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"] {
@@ -69,7 +69,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
 
 #[cfg(unix)]
 #[test]
-fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_meanwhile() {
+fn deleted_control_socket_is_recreated() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     let (socket, path) = (folder.join("control.sock"), folder.display().to_string());
@@ -97,7 +97,7 @@ fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_me
 
 #[cfg(unix)]
 #[test]
-fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
+fn moved_runs_folder_accepts_abort() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     fs::rename(home.path().join("runs"), home.path().join("moved")).unwrap();
@@ -113,7 +113,7 @@ fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
 
 #[cfg(unix)]
 #[test]
-fn orders_to_a_process_that_stands_still_are_not_carried_out_later() {
+fn orders_to_suspended_process_expire() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     let path = folder.display().to_string();

@@ -74,7 +74,7 @@ fn beats(rig: &Rig) -> [usize; 2] {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
+async fn heartbeats_continue_during_computation() {
     let mut rig = Rig::new(recipe()).await;
     let ready = rig.next(true);
     let (folder, mut notices) = (ready.folder, ready.notices);

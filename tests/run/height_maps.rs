@@ -284,7 +284,7 @@ fn true_rms_um(world: &World) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_interferometers_maps_close_the_loop() {
+async fn interferometer_maps_close_the_loop() {
     let seed = 9;
     let ran = run(seed).await;
     for row in &ran.cycles {
@@ -364,7 +364,7 @@ fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
 }
 
 #[test]
-fn every_kind_of_map_is_a_measurement_of_contact_points() {
+fn height_map_formats_give_contact_points() {
     let home = tempfile::tempdir().unwrap();
     for (path, map) in small_maps(home.path()) {
         let points = read_measured(&path).unwrap();
@@ -413,7 +413,7 @@ fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>)
 }
 
 #[test]
-fn a_map_without_lateral_scale_is_refused_with_the_remedy() {
+fn height_map_without_scale_refused() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("map.dat");
     fs::write(&path, metropro([5, 4], 0.0, &[Some(1e-4); 20])).unwrap();
@@ -426,7 +426,7 @@ fn a_map_without_lateral_scale_is_refused_with_the_remedy() {
 // ---- the command line ---------------------------------------------------------------------------------------------------------------
 
 #[test]
-fn a_map_is_registered_from_the_command_line_as_contact_points() {
+fn register_accepts_height_map() {
     let home = tempfile::tempdir().unwrap();
     let shape = FreeForm::default();
     let nominal: Vec<String> =

@@ -6,7 +6,7 @@ use std::fs;
 use crate::program::{Running, changed, regrind, root, run};
 
 #[test]
-fn a_part_is_made_by_the_lines_of_a_machine_that_hears_nothing() {
+fn part_made_from_hit_lines() {
     let home = tempfile::tempdir().unwrap();
     let recipe = home.path().join("wave.toml");
     fs::write(

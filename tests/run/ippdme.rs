@@ -5,7 +5,7 @@ use serde_json::Value;
 use crate::program::{Running, changed, regrind, root, run, small_recipe};
 
 #[test]
-fn a_part_is_made_with_a_probe_that_is_led_touch_by_touch() {
+fn part_made_over_ippdme() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 2000.0);
     let cell = root().join("config/ippdme.toml");
@@ -18,7 +18,7 @@ fn a_part_is_made_with_a_probe_that_is_led_touch_by_touch() {
 }
 
 #[test]
-fn a_doctor_sees_the_server_and_leaves_it_to_others() {
+fn doctor_inspects_ippdme_server() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 2000.0);
     let open = home.path().join("open.toml");

@@ -122,12 +122,12 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
+async fn killed_program_resumes_each_pass_once() {
     killed(1..=seeds(3)).await;
 }
 
 #[test]
-fn over_a_serial_line_too() {
+fn killed_program_resumes_on_serial_line() {
     let home = tempfile::tempdir().unwrap();
     let _serving = on_serial_lines(home.path(), small(12, 8, 2000.0).text());
     let (folder, kills) = run_with_kills(home.path(), 21);
@@ -147,7 +147,7 @@ fn killed_at_work(home: &Path) -> PathBuf {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_file_that_is_on_no_record_decides_nothing() {
+async fn unrecorded_file_decides_nothing() {
     let (_rig, home) = cell_that_stays().await;
     tokio::task::spawn_blocking(move || {
         let folder = killed_at_work(&home);
@@ -165,7 +165,7 @@ async fn a_file_that_is_on_no_record_decides_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_record_whose_last_lines_are_lost_is_not_gone_on_with_unasked() {
+async fn resume_refuses_lost_records() {
     let (_rig, home) = cell_that_stays().await;
     tokio::task::spawn_blocking(move || {
         let folder = killed_at_work(&home);
@@ -226,7 +226,7 @@ fn recover(home: &Path, typed: &str) -> (i32, String) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn machines_that_hold_what_no_run_knows_are_brought_home_step_by_step() {
+async fn recover_clears_machines_stepwise() {
     let (_rig, home) = cell_that_stays().await;
     tokio::task::spawn_blocking(move || {
         let run = killed_while(&home, "\"event\":\"started\"");
@@ -256,7 +256,7 @@ async fn machines_that_hold_what_no_run_knows_are_brought_home_step_by_step() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded() {
+async fn resume_refuses_changed_run() {
     let (rig, home) = cell_that_stays().await;
     let commands =
         |rig: &Rig| [CMM, GRINDER].map(|k| rig.came[k].lock().unwrap().iter().filter(|c| c.command.is_some()).count());

@@ -53,7 +53,7 @@ fn first_rms_mm(run: &Path) -> f64 {
 }
 
 #[test]
-fn a_part_begins_with_what_the_one_before_it_told() {
+fn next_part_starts_from_learned_error() {
     let shop = Shop::new();
     let (first, said) = shop.ran(&shop.recipe);
     assert!(said.contains("begins without knowledge"), "{said}");
@@ -87,7 +87,7 @@ fn a_part_begins_with_what_the_one_before_it_told() {
 }
 
 #[test]
-fn what_cannot_be_begun_with_is_refused() {
+fn unusable_learned_error_refused() {
     let shop = Shop::new();
     let (first, _) = shop.ran(&shop.recipe);
     let refused = |recipe: &str, words: &[&str]| {

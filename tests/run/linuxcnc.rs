@@ -136,8 +136,8 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted() {
-    let name = "linuxcnc::a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted";
+fn part_ground_along_executed_path() {
+    let name = "linuxcnc::part_ground_along_executed_path";
     beside_linuxcnc(name, |home| {
         // 360 points leave larger gaps in the aperture than the shipped recipe does, and the PV is judged there too.
         let (recipe, cell) = (recipe(home, [10.0, 1.2]), cell(home));
@@ -153,8 +153,8 @@ fn a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted()
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
-    let name = "linuxcnc::a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass";
+fn run_killed_while_linuxcnc_grinds() {
+    let name = "linuxcnc::run_killed_while_linuxcnc_grinds";
     beside_linuxcnc(name, |home| {
         // One pass is enough, and the world outlives the run.
         let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
@@ -214,8 +214,8 @@ fn begun(record: &str) -> usize {
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn a_controller_that_is_killed_while_linuxcnc_grinds_is_told_and_never_started_again() {
-    let name = "linuxcnc::a_controller_that_is_killed_while_linuxcnc_grinds_is_told_and_never_started_again";
+fn controller_killed_while_linuxcnc_grinds() {
+    let name = "linuxcnc::controller_killed_while_linuxcnc_grinds";
     beside_linuxcnc(name, |home| {
         let (state, alarms) = stands_after(home, || {
             for name in ["linuxcncrsh", "milltask", "io", "linuxcncsvr", "rtapi_app"] {
@@ -230,8 +230,8 @@ fn a_controller_that_is_killed_while_linuxcnc_grinds_is_told_and_never_started_a
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine() {
-    let name = "linuxcnc::a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine";
+fn stop_circuit_while_linuxcnc_grinds() {
+    let name = "linuxcnc::stop_circuit_while_linuxcnc_grinds";
     beside_linuxcnc(name, |home| {
         let (state, alarms) = stands_after(home, || {
             for words in [&["unlinkp", "iocontrol.0.emc-enable-in"][..], &["setp", "iocontrol.0.emc-enable-in", "0"]] {
@@ -247,8 +247,8 @@ fn a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine() {
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn another_client_that_takes_control_while_linuxcnc_grinds_is_told() {
-    let name = "linuxcnc::another_client_that_takes_control_while_linuxcnc_grinds_is_told";
+fn other_client_while_linuxcnc_grinds() {
+    let name = "linuxcnc::other_client_while_linuxcnc_grinds";
     beside_linuxcnc(name, |home| {
         let mut other = None;
         let (state, alarms) = stands_after(home, || {
@@ -263,8 +263,8 @@ fn another_client_that_takes_control_while_linuxcnc_grinds_is_told() {
 
 #[test]
 #[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
-fn a_program_that_the_controller_cannot_open_is_never_begun() {
-    let name = "linuxcnc::a_program_that_the_controller_cannot_open_is_never_begun";
+fn unreadable_program_never_starts() {
+    let name = "linuxcnc::unreadable_program_never_starts";
     beside_linuxcnc(name, |home| {
         let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
         let text = fs::read_to_string(&cell).unwrap();

@@ -75,8 +75,8 @@ fn locks() -> Vec<PathBuf> {
 
 #[test]
 #[ignore = "needs root and namespaces"]
-fn what_another_user_laid_in_the_way_is_not_followed() {
-    in_namespaces("local_users::what_another_user_laid_in_the_way_is_not_followed", |home| {
+fn links_by_other_user_not_followed() {
+    in_namespaces("local_users::links_by_other_user_not_followed", |home| {
         let cell = Cell::at(home, 2e4);
         // A folder that belongs to the other user, who could exchange every lock in it.
         assert!(another_user(&format!("mkdir -m 777 {LOCKS}")));
@@ -118,8 +118,8 @@ fn records_in(home: &Path) -> Vec<serde_json::Value> {
 
 #[test]
 #[ignore = "needs root and namespaces"]
-fn another_user_neither_sees_nor_orders_nor_holds_up_a_run() {
-    in_namespaces("local_users::another_user_neither_sees_nor_orders_nor_holds_up_a_run", |home| {
+fn other_user_cannot_interfere() {
+    in_namespaces("local_users::other_user_cannot_interfere", |home| {
         let cell = Cell::at(home, 200.0);
         let mut running = Running::new(regrind(&cell.arguments(), home));
         let folder = running.folder(home);

@@ -116,7 +116,7 @@ async fn resume(folder: &std::path::Path) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
+async fn lost_prepare_answer_is_retried() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
     let (drive, _orders) =
@@ -132,7 +132,7 @@ async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_ground_twice() {
+async fn vanished_job_is_not_ground_twice() {
     let mut rig = Rig::new(small(20, 10, 400.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let seen = Arc::new(Mutex::new(0));
@@ -163,7 +163,7 @@ async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_gr
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_result_that_was_discarded_at_the_panel_is_measured_once_more_by_a_persons_word() {
+async fn discarded_result_is_measured_again() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let cmm = Odd { cmm, discarded: 1, fates: VecDeque::new() };
@@ -181,7 +181,7 @@ async fn a_result_that_was_discarded_at_the_panel_is_measured_once_more_by_a_per
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_machine_that_says_held_and_gets_further_is_aborted() {
+async fn progress_while_held_aborts() {
     let mut rig = Rig::new(small(20, 10, 20.0)).await;
     let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
     let says = |status: &mut Status| {
@@ -200,7 +200,7 @@ async fn a_machine_that_says_held_and_gets_further_is_aborted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
+async fn stop_not_executed_aborts() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let says = |status: &mut Status| {
@@ -220,7 +220,7 @@ async fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_pass_that_is_called_complete_at_40_percent_of_its_path_is_not_believed() {
+async fn complete_at_40_percent_refused() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let says = |status: &mut Status| {
@@ -239,7 +239,7 @@ async fn a_pass_that_is_called_complete_at_40_percent_of_its_path_is_not_believe
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn figures_of_a_measurement_that_cannot_be_make_nothing_of_it() {
+async fn impossible_measurement_refused() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let kept: Arc<Mutex<Option<Measurement>>> = Arc::default();

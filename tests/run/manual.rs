@@ -148,7 +148,7 @@ fn hold_and_go_on(person: &Person, program: &mut Running) {
 /// With manual machines, a rehearsal returns the plan as the measurement. All of its files are marked, and no other
 /// kind of cell is rehearsed.
 #[test]
-fn a_rehearsal_is_marked_and_takes_the_plan_for_the_measurement() {
+fn rehearsal_is_marked_simulation() {
     let home = tempfile::tempdir().unwrap();
     let (recipe, _) = recipe(home.path());
     let text = fs::read_to_string(&recipe).unwrap();
@@ -177,7 +177,7 @@ fn a_rehearsal_is_marked_and_takes_the_plan_for_the_measurement() {
 }
 
 #[test]
-fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
+fn manual_part_with_recorded_steps() {
     let home = tempfile::tempdir().unwrap();
     let (recipe, spec) = recipe(home.path());
     let cell = root().join("config/manual.toml");

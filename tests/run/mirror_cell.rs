@@ -104,7 +104,7 @@ fn registered(nominal: &Nominal, cloud: &[Point], locked: [bool; 6]) -> Registra
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
+fn tracker_files_give_no_map_unlocked() {
     let data = data("lat-freeform-mirror");
     let nominal = nominal();
     for (session, points, rms_um, pv_um, in_plane_mm) in
@@ -154,7 +154,7 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn another_reflector_than_the_recipes_is_refused() {
+fn other_reflector_radius_refused() {
     let data = data("lat-freeform-mirror");
     let home = tempfile::tempdir().unwrap();
     let (found, said) = measured(cell(&data, "20250825_M1", home.path()), 6.35);
@@ -201,7 +201,7 @@ fn compare_prediction(by: &Registration, of: &Registration) -> (f64, f64) {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
+fn session_predicts_other_session() {
     let data = data("lat-freeform-mirror");
     let nominal = nominal();
     let sessions = ["20250824_M1_1", "20250825_M1"].map(|name| session(&data, &nominal, name));
@@ -245,7 +245,7 @@ fn um(Interval { median_mm, low_mm, high_mm, .. }: Interval) -> String {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by() {
+fn prediction_covers_new_session() {
     let data = data("lat-freeform-mirror");
     let nominal = nominal();
     let names = ["20250824_M1_1", "20250825_M1"];
@@ -284,7 +284,7 @@ fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
+fn fifth_of_points_gives_same_figures() {
     let data = data("lat-freeform-mirror");
     let nominal = nominal();
     for name in ["20250824_M1_1", "20250825_M1"] {

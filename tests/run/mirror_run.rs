@@ -117,7 +117,7 @@ fn is_about(found: f64, expected: f64) -> bool {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
+fn weak_mirror_judged_not_corrected() {
     let data = data("lat-freeform-mirror");
     let shop = Shop::new(&data, "");
     let mut program = shop.run();
@@ -155,7 +155,7 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confirmed() {
+fn locked_mirror_map_handed_over_once() {
     let data = data("lat-freeform-mirror");
     let shop = Shop::new(&data, "lock = [\"x\", \"y\", \"rz\"]");
     let mut program = shop.run();
@@ -212,7 +212,7 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn a_folder_that_is_not_there_is_told_before_anything_begins() {
+fn missing_exchange_folder_refused() {
     let data = data("lat-freeform-mirror");
     let shop = Shop::new(&data, "");
     fs::remove_dir(shop.folder("grinder/in")).unwrap();

@@ -143,7 +143,7 @@ async fn at_every_phase(hold: bool) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn hold_and_resume_at_every_phase_and_then_abort() {
+async fn hold_and_resume_at_every_phase() {
     at_every_phase(true).await;
 }
 
@@ -153,7 +153,7 @@ async fn abort_at_every_phase() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_when_it_is_on_record() {
+async fn abort_while_journal_is_locked() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
@@ -189,7 +189,7 @@ async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_wh
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_run() {
+async fn abort_ends_run_with_broken_journal() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let actor = run.actor.clone();
@@ -254,7 +254,7 @@ async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_again() {
+async fn unsaved_result_is_recomputed() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     // A folder is in the place of the deviations file of the first cycle.
@@ -278,7 +278,7 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
+async fn amended_verdict_leaves_first_file() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let mut ready = rig.next(true);
     // Another pass is needed, and then the remaining material is not enough.
@@ -292,7 +292,7 @@ async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_file_of_a_run_is_on_record() {
+async fn every_run_file_is_on_record() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let ready = rig.next(true);
     let (ending, folder) = run_to_its_end(ready).await;

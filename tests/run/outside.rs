@@ -43,7 +43,7 @@ fn heeding_hangup(arguments: &[&str], home: &Path) -> Command {
 }
 
 #[test]
-fn the_simulated_cell_comes_with_the_program() {
+fn simulated_cell_is_built_in() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e4).display().to_string();
     let (code, with_none, errors) = run(&["plan", &recipe], home.path());
@@ -56,7 +56,7 @@ fn the_simulated_cell_comes_with_the_program() {
 }
 
 #[test]
-fn a_running_cell_is_watched_line_by_line_in_a_pipe_and_listed_with_what_became_of_it() {
+fn watch_and_runs_show_active_run() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
     let name = folder.file_name().unwrap().to_string_lossy().into_owned();
@@ -81,7 +81,7 @@ fn a_running_cell_is_watched_line_by_line_in_a_pipe_and_listed_with_what_became_
 }
 
 #[test]
-fn the_door_takes_no_text_that_misleads_and_no_more_watchers_than_it_has_places_for() {
+fn control_socket_limits_text_and_watchers() {
     use std::io::{BufRead, BufReader, Write};
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
@@ -113,7 +113,7 @@ fn the_door_takes_no_text_that_misleads_and_no_more_watchers_than_it_has_places_
 }
 
 #[test]
-fn each_order_shows_how_it_is_given() {
+fn order_help_has_example() {
     for order in ["hold", "stop", "abort", "status"] {
         let (code, said, _) = run(&[order, "--help"], Path::new("."));
         let example = said.split("Example:").nth(1).unwrap_or_else(|| panic!("{order} has no example: {said}"));
@@ -122,7 +122,7 @@ fn each_order_shows_how_it_is_given() {
 }
 
 #[test]
-fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
+fn sigterm_and_hangup_stop_in_order() {
     for (signal, reason) in [("TERM", "SIGTERM"), ("HUP", "SIGHUP, the terminal was closed")] {
         let home = tempfile::tempdir().unwrap();
         let (mut running, folder) = grinding(home.path(), |arguments| heeding_hangup(arguments, home.path()));
@@ -137,7 +137,7 @@ fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
 }
 
 #[test]
-fn a_service_that_is_told_twice_aborts() {
+fn second_sigterm_aborts() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
     // The operating system keeps the order of the two signals only if the first has been received.
@@ -156,7 +156,7 @@ fn a_service_that_is_told_twice_aborts() {
 }
 
 #[test]
-fn orders_get_through_after_all_descriptors_were_taken() {
+fn orders_after_descriptor_exhaustion() {
     let home = tempfile::tempdir().unwrap();
     let few = |arguments: &[&str]| {
         let mut shell = Command::new("sh");
@@ -182,7 +182,7 @@ fn orders_get_through_after_all_descriptors_were_taken() {
 }
 
 #[test]
-fn an_order_goes_to_the_run_that_goes_on_and_not_to_the_newest_folder() {
+fn order_goes_to_active_run() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
     fs::create_dir(home.path().join("runs/newer")).unwrap();
@@ -195,7 +195,7 @@ fn an_order_goes_to_the_run_that_goes_on_and_not_to_the_newest_folder() {
 }
 
 #[test]
-fn two_runs_that_go_on_are_named_and_none_is_taken() {
+fn order_refused_with_two_active_runs() {
     let home = tempfile::tempdir().unwrap();
     let (mut first, _) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
     let (mut second, _) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
@@ -209,7 +209,7 @@ fn two_runs_that_go_on_are_named_and_none_is_taken() {
 }
 
 #[test]
-fn a_second_run_does_not_take_the_machines_of_the_first() {
+fn second_run_refused_for_same_machines() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 100.0).display().to_string();
     let open = changed("config/modbus-tcp.toml", &[("15021", "0"), ("15022", "0")]);
@@ -236,7 +236,7 @@ fn a_second_run_does_not_take_the_machines_of_the_first() {
 }
 
 #[test]
-fn what_a_new_folder_says_to_type_makes_a_part() {
+fn init_readme_makes_a_part() {
     let home = tempfile::tempdir().unwrap();
     let (code, said, errors) = run(&["init", "shop", "--part", "plano \"X\" \\ 1"], home.path());
     assert_eq!(code, 0, "{said}{errors}");
@@ -261,7 +261,7 @@ fn what_a_new_folder_says_to_type_makes_a_part() {
 }
 
 #[test]
-fn every_kind_of_new_folder_has_a_good_recipe_and_a_good_cell() {
+fn init_files_valid_for_every_machine() {
     let home = tempfile::tempdir().unwrap();
     for machines in ["simulated", "modbus-tcp", "modbus-rtu", "files", "manual"] {
         let (code, said, errors) = run(&["init", machines, "--machines", machines], home.path());
@@ -277,7 +277,7 @@ fn every_kind_of_new_folder_has_a_good_recipe_and_a_good_cell() {
 }
 
 #[test]
-fn without_a_folder_and_without_a_person_to_ask_nothing_is_made() {
+fn init_without_folder_refused() {
     let home = tempfile::tempdir().unwrap();
     let (code, _, errors) = run(&["init"], home.path());
     assert!(code == 2 && errors.contains("the folder to create is missing"), "{errors}");
@@ -285,7 +285,7 @@ fn without_a_folder_and_without_a_person_to_ask_nothing_is_made() {
 }
 
 #[test]
-fn at_a_terminal_a_new_folder_is_asked_for_until_the_answers_will_do() {
+fn init_prompts_at_terminal() {
     let home = tempfile::tempdir().unwrap();
     // `script` gives the program its own terminal.
     let typed = format!("{} init", env!("CARGO_BIN_EXE_regrind"));
@@ -303,7 +303,7 @@ fn at_a_terminal_a_new_folder_is_asked_for_until_the_answers_will_do() {
 }
 
 #[test]
-fn the_doctor_misses_the_folders_in_which_machines_give_and_take() {
+fn doctor_finds_missing_exchange_folders() {
     let home = tempfile::tempdir().unwrap();
     let (code, _, errors) = run(&["init", "shop", "--machines", "files"], home.path());
     assert_eq!(code, 0, "{errors}");
@@ -323,7 +323,7 @@ fn the_doctor_misses_the_folders_in_which_machines_give_and_take() {
 }
 
 #[test]
-fn a_run_shows_its_page_beside_it_and_ends_as_ever() {
+fn run_serves_its_page() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e5).display().to_string();
     let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--serve", "127.0.0.1:0"], home.path());
@@ -331,7 +331,7 @@ fn a_run_shows_its_page_beside_it_and_ends_as_ever() {
 }
 
 #[test]
-fn the_doctor_says_what_stands_in_the_way_of_a_run_and_moves_nothing() {
+fn doctor_lists_obstacles() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e4).display().to_string();
     let (code, said, errors) = run(&["doctor", "--recipe", &recipe], home.path());

@@ -38,7 +38,7 @@ impl Grinder for Brittle {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_driver_that_panics_is_told_as_a_fault_of_the_program_and_its_machine_holds_itself() {
+async fn panicking_driver_raises_alarm() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let ready = rig.next(true);
     let (folder, mut notices) = (ready.folder, ready.notices);

@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::program::{Running, changed, only_run, regrind, root, run, run_folders};
 use crate::sample::seeds;
-use crate::study::told_apart::Compared;
+use crate::study::identifiability::Compared;
 use crate::study::{After, Bench};
 
 /// A good machine with a wheel whose radius is 0.4 mm too large. The part has at most 1.6 touches per square
@@ -51,7 +51,7 @@ fn rms_um(folder: &Path, cycle: usize) -> Option<f64> {
 }
 
 #[test]
-fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
+fn wheel_radius_compensated_in_run() {
     let told = ["", TAKEN].map(|parameters| {
         let home = tempfile::tempdir().unwrap();
         let (folder, said) = ran(home.path(), &recipe(parameters, 0.7));
@@ -75,7 +75,7 @@ fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
 }
 
 #[test]
-fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
+fn parameter_beyond_tolerance_holds_cell() {
     let home = tempfile::tempdir().unwrap();
     let parameters = TAKEN.replace("600.0", "300.0");
     fs::write(home.path().join("mirror.toml"), recipe(&parameters, 0.7)).unwrap();
@@ -97,7 +97,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
 /// Draws a few worlds; `cargo run --release --example parameters` draws two hundred.
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn what_is_told_of_a_few_worlds_holds_and_saves() {
+fn parameters_compensated_in_drawn_worlds() {
     let bench = Bench::new("freeform-mirror").held([false; 6]);
     let made: Vec<Compared> = (1..=seeds(4)).into_par_iter().map(|seed| bench.told_apart(seed, 2)).collect();
     let within = made.iter().flat_map(|world| &world.parameters).filter(|told| told.off.abs() <= 1.0).count();

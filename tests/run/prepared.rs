@@ -12,7 +12,7 @@ fn cell(file: &str, changes: &[(&str, &str)]) -> CellConfig {
 }
 
 #[test]
-fn a_transfer_has_the_time_that_its_size_takes_on_its_line() {
+fn transfer_timeout_from_line_speed() {
     let recipe = recipe(&[]);
     let transfer = |cell: &CellConfig| {
         let (task, plan) = setup::prepare(&recipe, cell).unwrap();
@@ -29,7 +29,7 @@ fn a_transfer_has_the_time_that_its_size_takes_on_its_line() {
 }
 
 #[test]
-fn a_reference_sphere_in_the_part_is_refused_with_place_and_gap() {
+fn reference_sphere_in_part_refused() {
     let recipe = recipe(&[]);
     let mut cell = cell("config/modbus-tcp.toml", &[]);
     setup::prepare(&recipe, &cell).unwrap();

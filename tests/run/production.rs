@@ -31,7 +31,7 @@ const MINUTES: f64 = 30.0;
 /// id of the machines' process.
 const HOME: &str = "REGRIND_PRODUCTION_HOME";
 const MACHINES: &str = "REGRIND_PRODUCTION_MACHINES";
-const NAME: &str = "production::thirty_minutes_of_production_at_a_hundred_times_the_speed";
+const NAME: &str = "production::thirty_minutes_of_production";
 /// Line that follows the last part.
 const OVER: &str = "production is over";
 
@@ -53,7 +53,7 @@ const DRIFT_PERCENT: f64 = 5.0;
 
 #[test]
 #[ignore = "takes half an hour: for .ci/long; six minutes with REGRIND_PRODUCTION_MINUTES=0"]
-fn thirty_minutes_of_production_at_a_hundred_times_the_speed() {
+fn thirty_minutes_of_production() {
     match std::env::var_os(HOME) {
         Some(home) => Production::new(Path::new(&home)).go_on(),
         None => in_processes_of_their_own(),

@@ -77,7 +77,7 @@ fn copy_files(from: &Path, to: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_record_is_done_again_without_a_difference_wherever_it_broke_off() {
+async fn replay_agrees_at_every_break() {
     let (rig, folder) = finished().await;
     let last = verify(&folder).unwrap().records;
     let whole = again(&rig, &folder, |_, _| ()).unwrap_or_else(|error| panic!("{error}"));
@@ -94,7 +94,7 @@ async fn a_record_is_done_again_without_a_difference_wherever_it_broke_off() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gone_on_with() {
+async fn replay_names_first_difference() {
     let (rig, folder) = finished().await;
     let said = |change: fn(&mut Task, &mut CellPlan)| {
         let error = again(&rig, &folder, change).err().expect("it differs");
@@ -114,7 +114,7 @@ async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gon
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_event_that_was_changed_on_record_is_found_although_its_chain_is_whole() {
+async fn replay_detects_changed_event() {
     let (rig, folder) = finished().await;
     let reader = Reader::open(&folder).unwrap();
     let records: Vec<_> = reader.records(0).map(Result::unwrap).collect();

@@ -102,7 +102,7 @@ fn shown(folder: &Path) -> Vec<(String, String)> {
 }
 
 #[test]
-fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
+fn report_of_accepted_run_matches_result() {
     let home = tempfile::tempdir().unwrap();
     let arguments = arguments(&small_recipe(home.path(), 1e4));
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
@@ -191,7 +191,7 @@ fn maps_are_drawn(page: &Page, cycles: usize) {
 }
 
 #[test]
-fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
+fn report_shows_figures_with_limits() {
     let home = tempfile::tempdir().unwrap();
     let arguments = arguments(&small_recipe(home.path(), 1e4));
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
@@ -250,7 +250,7 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
 }
 
 #[test]
-fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured() {
+fn report_of_stopped_run() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     running.signal("TERM");
@@ -272,7 +272,7 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
 }
 
 #[test]
-fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
+fn report_of_aborted_run() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     let path = folder.to_str().unwrap();
@@ -364,7 +364,7 @@ pub fn aborted() -> Ending {
 }
 
 #[test]
-fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
+fn report_lists_alarms_with_times() {
     let mut written = Written::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     written.command(raised("link_lost", "The link to a machine is lost: grinder."));
@@ -393,7 +393,7 @@ fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
 }
 
 #[test]
-fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
+fn report_of_failed_and_amended_cycles() {
     let mut written = Written::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     let failed = |words: &str| GateResult::Failed(GateFailure::Coverage(words.into()));
@@ -425,7 +425,7 @@ pub fn figures() -> Figures {
 }
 
 #[test]
-fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
+fn report_shows_no_raw_record() {
     let mut written = Written::new(Value::Null);
     sample_events(1).into_iter().for_each(|event| written.event(event));
     let refused = Event::Resume { actor: ada(), reason: "go".into() };
@@ -469,7 +469,7 @@ fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
 }
 
 #[test]
-fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
+fn report_without_limits_invents_none() {
     let tolerance = Tolerance { pv_mm: f64::INFINITY, ..tolerance() };
     let of = |content: Value| {
         let mut written = Written::new(content);

@@ -61,7 +61,7 @@ fn hostile() -> (TempDir, std::path::PathBuf) {
 }
 
 #[test]
-fn both_formats_tell_what_result_json_tells_and_the_same_twice() {
+fn qif_and_dfq_match_result_json() {
     let home = tempfile::tempdir().unwrap();
     let arguments = arguments(&small_recipe(home.path(), 1e4));
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
@@ -99,7 +99,7 @@ fn both_formats_tell_what_result_json_tells_and_the_same_twice() {
 }
 
 #[test]
-fn a_run_in_which_nothing_was_measured_has_no_results_and_says_so() {
+fn results_refused_without_measurement() {
     let mut written = Written::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     let (home, folder) = written.ended(&aborted());
@@ -111,7 +111,7 @@ fn a_run_in_which_nothing_was_measured_has_no_results_and_says_so() {
 
 #[test]
 #[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
-fn other_readers_qif_follows_the_schema_and_says_what_stands_where() {
+fn other_readers_read_qif() {
     let (_home, folder) = hostile();
     let path = folder.join("results.qif");
     fs::write(&path, run_results(&folder, ResultsFormat::Qif).unwrap()).unwrap();
@@ -135,7 +135,7 @@ fn other_readers_qif_follows_the_schema_and_says_what_stands_where() {
 
 #[test]
 #[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
-fn other_readers_dfq_reads_by_the_list_of_fields() {
+fn other_readers_read_dfq() {
     let (_home, folder) = hostile();
     let path = folder.join("results.dfq");
     fs::write(&path, run_results(&folder, ResultsFormat::Dfq).unwrap()).unwrap();
@@ -159,7 +159,7 @@ fn other_readers_dfq_reads_by_the_list_of_fields() {
 
 #[test]
 #[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
-fn other_readers_read_a_whole_run() {
+fn other_readers_read_whole_run() {
     let home = tempfile::tempdir().unwrap();
     let arguments = arguments(&small_recipe(home.path(), 1e4));
     let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());

@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::study::others::{Differ, Pair, TAUGHT_BY, TransferResult};
+use crate::study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
 use crate::study::{After, Bench, RECIPES};
 
 /// Computes one world of each recipe.
@@ -21,7 +21,7 @@ fn together(worlds: &[TransferResult], after: impl Fn(&TransferResult) -> After)
 }
 
 #[test]
-fn the_first_pass_of_another_machine_of_its_kind_is_near_the_floor() {
+fn shared_learning_reaches_floor() {
     let worlds = worlds(Differ::By { share: 0.02, waviness_um: 0.1 });
     let [with, without] = [together(&worlds, |of| of.with[0]), together(&worlds, |of| of.without[0])];
     assert!(with < 1.4 && without > 5.0, "{with} times the floor with what was taught, {without} without");
@@ -32,7 +32,7 @@ fn the_first_pass_of_another_machine_of_its_kind_is_near_the_floor() {
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn machines_that_have_nothing_in_common_are_not_the_worse_for_it() {
+fn unrelated_machine_does_no_harm() {
     let worlds = worlds(Differ::Unrelated);
     for of in &worlds {
         assert!(of.with[0].rms_um < 1.02 * of.without[0].rms_um, "{of:?}");

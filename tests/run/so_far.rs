@@ -26,7 +26,7 @@ async fn seen<T>(folder: &Path, what: impl Fn(&Snapshot) -> Option<T>) -> T {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
+async fn status_shows_preliminary_touches() {
     let mut rig = Rig::new(small(12, 8, 5000.0)).await;
     // The test decides when the CMM measures.
     cmm(&rig, |machine| machine.set_speed(0.0));

@@ -2,12 +2,12 @@
 //! with the truth.
 #![allow(dead_code, reason = "not every program that includes this uses all of it")]
 
-#[path = "made.rs"]
-pub mod made;
-#[path = "others.rs"]
-pub mod others;
-#[path = "told_apart.rs"]
-pub mod told_apart;
+#[path = "made_part.rs"]
+pub mod made_part;
+#[path = "transfer.rs"]
+pub mod transfer;
+#[path = "identifiability.rs"]
+pub mod identifiability;
 
 use std::path::Path;
 
@@ -63,7 +63,7 @@ pub struct Bench {
     task: Task,
     plan: CellPlan,
     spec: WorldSpec,
-    machine: told_apart::Machine,
+    machine: identifiability::Machine,
     plan_of: Vec<(Point, Vector)>,
 }
 
@@ -77,7 +77,7 @@ impl Bench {
         // No correction can remove the ridges between tracks. The study is about the effect of corrections.
         spec.grinder.scallops = false;
         let plan_of = task.targets.iter().map(|t| (t.point, t.normal)).collect();
-        Self { name: name.to_owned(), task, plan, spec, machine: told_apart::Machine::default(), plan_of }
+        Self { name: name.to_owned(), task, plan, spec, machine: identifiability::Machine::default(), plan_of }
     }
 
     /// Makes one part after another in its own world. Returns the truth after every pass, for each part.

@@ -32,7 +32,7 @@ fn batches(folder: &Path) -> Vec<u64> {
 }
 
 #[test]
-fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
+fn adaptive_part_with_sixth_of_touches() {
     for (recipe, seed) in cases([("freeform-mirror", 1), ("biconic", 2)], 2) {
         let ran = run(chosen(recipe, seed));
         assert!(ran.accepted(), "{recipe}: {}", ran.failure_text());
@@ -89,7 +89,7 @@ fn is_true(ran: &Ran, recipe: &str) {
 }
 
 #[test]
-fn what_is_wrong_is_seen_at_the_first_ten_touches() {
+fn adaptive_faults_found_in_ten_touches() {
     let faults = |faults: WorldFaults| chosen("freeform-mirror", 1).with(move |world| world.faults = faults.clone());
     let mirrored = faults(WorldFaults { cmm_mirrored: true, ..WorldFaults::default() });
     let inches = faults(WorldFaults { inches: true, ..WorldFaults::default() });
@@ -118,7 +118,7 @@ fn what_is_wrong_is_seen_at_the_first_ten_touches() {
 }
 
 #[test]
-fn a_part_that_lies_elsewhere_is_seen_at_the_first_ten_touches() {
+fn adaptive_missing_part_in_ten_touches() {
     let setup = chosen("freeform-mirror", 1).with(|world| world.faults.no_part = true);
     let ran = run(setup);
     assert_eq!(ran.alarms().first().map(|alarm| alarm.id), Some(AlarmId::NoPart), "{}", ran.failure_text());
@@ -126,7 +126,7 @@ fn a_part_that_lies_elsewhere_is_seen_at_the_first_ten_touches() {
 }
 
 #[test]
-fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
+fn adaptive_batches_publish_figures() {
     let ran = run(chosen("off-axis-asphere", 3));
     let figures = ran.notices.iter().filter_map(|notice| match notice {
         Notice::Figures { figures, .. } => Some(figures),
@@ -153,7 +153,7 @@ fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
 }
 
 #[test]
-fn a_killed_program_goes_on_with_the_touches_that_are_on_record_and_repeats_none() {
+fn adaptive_resume_repeats_no_touch() {
     let home = tempfile::tempdir().unwrap();
     let recipe = changed(
         "recipes/freeform-mirror.toml",

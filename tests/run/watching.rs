@@ -70,7 +70,7 @@ fn turn(rig: &Rig, machine: usize, mode: Mode) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_key_of_the_idle_machine_holds_the_one_that_moves() {
+async fn idle_machine_key_holds_moving_one() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let (mut run, running) = grinding(&mut rig).await;
     let turned = Instant::now();
@@ -90,7 +90,7 @@ async fn the_key_of_the_idle_machine_holds_the_one_that_moves() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_key_of_the_machine_that_moves_holds_it_and_aborts_nothing() {
+async fn moving_machine_key_holds_not_aborts() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let (mut run, running) = grinding(&mut rig).await;
     let turned = Instant::now();
@@ -106,7 +106,7 @@ async fn the_key_of_the_machine_that_moves_holds_it_and_aborts_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_machine_that_leaves_its_place_holds_the_one_that_moves() {
+async fn machine_not_clear_holds_moving_one() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let (mut run, running) = grinding(&mut rig).await;
     let moved = Instant::now();
@@ -121,7 +121,7 @@ async fn a_machine_that_leaves_its_place_holds_the_one_that_moves() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_machine_in_manual_mode_is_not_prepared() {
+async fn manual_mode_prevents_prepare() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     turn(&rig, CMM, Mode::Manual);
     let Ready { run, cmm, grinder, notices, folder } = rig.next(true);

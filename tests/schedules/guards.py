@@ -17,35 +17,35 @@ GUARDS = {
     "START waits for its record": (
         "src/drive/mod.rs", "        Command::HoldMachine { .. }\n", "        Command::StartMachine { .. } | Command::HoldMachine { .. }\n"),
     "what has waited is asked of the cell once more": (
-        "src/drive/mod.rs", "Then::Execute(command) if self.cell.wants(&command) =>", "Then::Execute(command) if true || self.cell.wants(&command) =>"),
+        "src/drive/mod.rs", "RecordAction::Execute(command) if self.cell.still_requires(&command) =>", "RecordAction::Execute(command) if true || self.cell.still_requires(&command) =>"),
     "an order is answered when it is on record": (
-        "src/drive/mod.rs", "self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });",
-        "drop((ticket, answer.send(Reply { accepted, message, status: self.snapshot() })));"),
+        "src/drive/mod.rs", "self.backlog.push_back(PendingRecord {\n                receipt: ticket,\n                action: RecordAction::Answer { answer, accepted, message },\n            });",
+        "drop((ticket, answer.send(Reply { taken: accepted, message, status: self.snapshot() })));"),
     "an abort gives up what the machine is asked": (
-        "src/drive/station.rs", "() = aborts.ordered() => {}", "() = std::future::pending() => {}"),
+        "src/drive/station.rs", "() = aborts.wait_for_abort() => {}", "() = std::future::pending() => {}"),
     "an abort waits for no record": (
         "src/drive/mod.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
     "a START without an answer is unknown": (
-        "src/drive/station.rs", "self.tell(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;",
-        "self.seen.running = false; self.failed(Asked::Start, error).await;"),
+        "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;",
+        "self.observed.running = false; self.report_failure(MachineRequest::Start, error).await;"),
     "a START that was not seen is fenced off": (
         "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second",
-        "device", "a_start_that_arrives_after_it_was_found_not_started"),
+        "device", "late_start_after_reconcile_is_fenced"),
     "a machine that was lost is sent no START": (
-        "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Start).await;\n        }\n", ""),
+        "src/drive/station.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Start).await;\n        }\n", ""),
     "a machine that was lost is sent no RESUME": (
-        "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Resume).await;\n        }\n", ""),
+        "src/drive/station.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Resume).await;\n        }\n", ""),
     "a station looks again after the loop has hung": (
-        "src/drive/station.rs", "if self.seen.connected => if pulse.is_felt() {", "if self.seen.connected && pulse.is_felt() => if true {"),
+        "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {"),
     "holding goes on when the link is lost": (
-        "src/cell/act.rs", "        if is_holding && phase.moving() == Some(device) {\n", "        if is_holding && phase.moving() == Some(device) {\n            self.go(Held(out_of_sight(phase)));\n        } else if false {\n"),
+        "src/cell/transitions.rs", "        if is_holding && phase.moving_device() == Some(device) {\n", "        if is_holding && phase.moving_device() == Some(device) {\n            self.enter_state(Held(phase_after_link_loss(phase)));\n        } else if false {\n"),
     "a job found running while holding is told to hold": (
-        "src/cell/act.rs", "                self.go(self.same(run));\n                self.push(Command::HoldMachine { device });\n", "                self.go(self.same(run));\n"),
+        "src/cell/transitions.rs", "                self.enter_state(self.state_with_phase(run));\n                self.push(Command::HoldMachine { device });\n", "                self.enter_state(self.state_with_phase(run));\n"),
     "a machine that moves while the cell stands is told to hold": (
-        "src/cell/act.rs", "        let astray = self.knows(device).astray;\n", "        return;\n        #[allow(unreachable_code)]\n        let astray = false;\n",
-        "cell", "a_machine_that_moves_while_the_cell_is_held_is_told_to_hold"),
+        "src/cell/transitions.rs", "        let astray = self.machine(device).moves_unordered;\n", "        return;\n        #[allow(unreachable_code)]\n        let astray = false;\n",
+        "cell", "motion_while_held_commands_hold"),
     "a program that was started again asks what became of the job": (
-        "src/cell/act.rs", "        self.go(Held(out_of_sight(phase)));\n        for device in Device::BOTH {", "        self.go(Held(restart_of(phase)));\n        for device in Device::BOTH {"),
+        "src/cell/transitions.rs", "        self.enter_state(Held(phase_after_link_loss(phase)));\n        for device in Device::BOTH {", "        self.enter_state(Held(restart_phase(phase)));\n        for device in Device::BOTH {"),
     "an answer of an older connection is turned away": (
         "src/device/modbus/link.rs", "        if stale {\n", "        if stale && false {\n"),
     "nothing may wait when a request begins": (
@@ -57,47 +57,47 @@ GUARDS = {
     "payloads in force are compared before a job": (
         "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
     "what was seen to begin has begun, whatever the machine says": (
-        "src/cell/act.rs", "(Reconciliation::NotStarted, _) if self.begun[device as usize] => {", "(Reconciliation::NotStarted, _) if self.begun[device as usize] && false => {"),
+        "src/cell/transitions.rs", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] && false => {"),
     "what has not come on record is withdrawn while the disk is full": (
-        "src/drive/mod.rs", "        if self.failing.is_none() || self.ending.is_some() {\n", "        if true {\n"),
+        "src/drive/mod.rs", "        if self.record_failure_reason.is_none() || self.ending.is_some() {\n", "        if true {\n"),
     "an abort of a lost I++ connection is given anew": (
         "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == State::Aborting))", "saturating_sub(u64::from(state == State::Aborting && false))",
-        "device", "an_abort_behind_a_lost_connection"),
+        "device", "abort_is_first_after_reconnect"),
     "what an interrupted I++ job has left moving is aborted": (
         "src/device/ippdme/machine.rs", "moved.then_some(self.settings.silence_limit)", "moved.then_some(self.settings.silence_limit).filter(|_| false)"),
     "a line of another I++ command is none of this one": (
         "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
-        "device", "data_of_a_command_that_was_never_given"),
+        "device", "unrequested_data_disconnects"),
     "an I++ job is held between two targets": (
         "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break 'job;", "if false && self.current_request() != JobRequest::Continue {\n                    break 'job;",
-        "device", "a_hold_retracts_and_a_resume"),
+        "device", "hold_retracts_resume_touches_rest"),
     "an I++ job is held between two rows": (
         "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break;", "if false && self.current_request() != JobRequest::Continue {\n                    break;",
-        "device", "a_hold_in_a_scan"),
+        "device", "hold_in_scan_defers_next_row"),
     "the probe travels at the clearance": (
         "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
     "a program that has begun is not prepared again": (
         "src/device/linuxcnc/machine/beginning.rs", "if before.begun > 0 {", "if false && before.begun > 0 {",
-        "linuxcnc", "a_program_that_has_begun_is_not_prepared_again"),
+        "linuxcnc", "prepare_refuses_begun_program"),
     "the controller has the program that it was told to open": (
         "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)",
-        "linuxcnc", "an_open_that_is_acknowledged_and_not_done"),
+        "linuxcnc", "ignored_open_fails_load"),
     "a lost linuxcncrsh is told as lost": (
         "src/device/linuxcnc/controller.rs", "self.link_error.clone().unwrap_or_else(never)", "self.link_error.clone().filter(|_| false).unwrap_or_else(never)"),
     "a program writes its end behind its motion": (
         "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
         "src/device/linuxcnc/machine/reconciling.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
-        "linuxcnc", "a_start_that_is_acknowledged_and_does_not_show"),
+        "linuxcnc", "ignored_start_unknown_until_reconcile"),
     "what is prepared is looked at before a START": (
         "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode",
-        "linuxcnc", "a_program_that_is_changed_behind_our_back"),
+        "linuxcnc", "start_refuses_replaced_program"),
 }  # fmt: skip
 
 # Guards that schedules of a kind of their own are about.
 KINDS = {
-    "what was seen to begin has begun, whatever the machine says": "nor_one_in_which_a_machine_forgets_its_job",
-    "what has not come on record is withdrawn while the disk is full": "nor_one_in_which_the_disk_is_full_for_a_while",
+    "what was seen to begin has begun, whatever the machine says": "schedules_with_forgotten_job",
+    "what has not come on record is withdrawn while the disk is full": "schedules_with_full_disk",
 }
 
 
@@ -146,7 +146,7 @@ def tried(root, tree, target, change, kind, most):
     while True:
         environment = {"REGRIND_SCHEDULES": str(seeds), "PATH": "/usr/bin:/bin"}
         other = "ippdme" in file or "linuxcnc" in file
-        run = ["--exact", kind or ("nor_one_by_other_wires" if other else "no_schedule_breaks_a_promise")]
+        run = ["--exact", kind or ("schedules_on_other_wires" if other else "schedules_keep_promises")]
         done = subprocess.run([tree / program, *run], cwd=tree, env=environment, capture_output=True, text=True)
         broken = re.findall(r"^seed (\d+): (.*)$", done.stdout + done.stderr, re.M)
         if broken:

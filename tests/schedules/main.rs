@@ -103,13 +103,13 @@ fn hold_their_promises(seeds: impl Iterator<Item = u64>) {
 }
 
 #[test]
-fn no_schedule_breaks_a_promise() {
+fn schedules_keep_promises() {
     let seeds = KEPT.iter().copied().chain(0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE));
     hold_their_promises(seeds);
 }
 
 #[test]
-fn nor_one_by_other_wires() {
+fn schedules_on_other_wires() {
     let seeds = KEPT_BY_OTHER_WIRES.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_BY_OTHER_WIRES)).map(|k| OTHER_WIRES + k));
     hold_their_promises(seeds);
@@ -117,7 +117,7 @@ fn nor_one_by_other_wires() {
 
 /// Checks machines that restart with their old boot id and report that their job never began.
 #[test]
-fn nor_one_in_which_a_machine_forgets_its_job() {
+fn schedules_with_forgotten_job() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FORGETFUL)).map(|k| FORGETFUL + k);
     hold_their_promises(seeds);
 }
@@ -125,7 +125,7 @@ fn nor_one_in_which_a_machine_forgets_its_job() {
 /// Checks a disk that is temporarily full: the cell is held in the meantime, does not wait for an answer to a request
 /// that it has not sent, and continues afterwards.
 #[test]
-fn nor_one_in_which_the_disk_is_full_for_a_while() {
+fn schedules_with_full_disk() {
     // A stop that overtook the preparation of a cycle was not recognized as done.
     let seeds = KEPT_OF_FULL_DISKS.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k));
@@ -135,14 +135,14 @@ fn nor_one_in_which_the_disk_is_full_for_a_while() {
 /// Checks machines that report false values, in turn in each register of the status and of the header of a result. No
 /// START is intended again for a job that was seen to begin, no job begins without a record, and the run finishes.
 #[test]
-fn nor_one_in_which_a_machine_says_what_is_not_so() {
+fn schedules_with_false_status() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_LIARS)).map(|k| LIARS + k);
     hold_their_promises(seeds);
 }
 
 /// Kills the program once before each of its effects on the world, and before some pairs of them.
 #[test]
-fn a_death_before_any_effect_breaks_no_promise() {
+fn death_before_effect_keeps_promises() {
     let stride = if number("REGRIND_SCHEDULES").is_some() { 1 } else { STRIDE };
     let began = std::time::Instant::now();
     let effects = Schedule::with_deaths(1, Vec::new()).effects();
@@ -168,7 +168,7 @@ fn one_schedule() {
 }
 
 #[test]
-fn a_seed_is_one_schedule() {
+fn seed_repeats_schedule() {
     for seed in (0..4).chain(OTHER_WIRES..OTHER_WIRES + 4) {
         let [first, second] = [(); 2].map(|()| Schedule::drawn(seed).traced());
         assert!(first.len() > 50, "seed {seed}: {} lines", first.len());

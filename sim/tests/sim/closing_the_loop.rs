@@ -61,7 +61,7 @@ fn cycles(spec: WorldSpec, count: u16) -> Vec<(f64, f64)> {
 }
 
 #[test]
-fn one_compensation_does_what_the_trials_did() {
+fn one_compensation_reproduces_trials() {
     for seed in 1..=6 {
         let figures = cycles(WorldSpec { seed, ..WorldSpec::default() }, 3);
         println!("seed {seed}: {figures:.2?}");
@@ -72,7 +72,7 @@ fn one_compensation_does_what_the_trials_did() {
 }
 
 #[test]
-fn every_recipe_that_can_be_simulated_gets_better_too() {
+fn simulated_recipes_reach_tolerance() {
     let mut simulated = 0;
     for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../recipes")).unwrap() {
         let path = entry.unwrap().path();

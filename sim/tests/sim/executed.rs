@@ -35,7 +35,7 @@ fn over(world: &World, half_mm: [f64; 2]) -> Vec<f64> {
 }
 
 #[test]
-fn the_surface_stands_where_the_path_has_it() {
+fn executed_path_determines_surface() {
     // 20 mm in a whole number of tracks.
     for spacing_mm in [0.25, 0.8, 2.0] {
         let world = World::new(small_perfect()).unwrap();
@@ -49,7 +49,7 @@ fn the_surface_stands_where_the_path_has_it() {
 }
 
 #[test]
-fn a_wheel_along_a_path_leaves_what_one_does_that_makes_its_own() {
+fn executed_path_matches_simulated_pass() {
     // What depends on the feed, on the path's own time and on how the wheel is touched off is left out.
     let of = GrinderSpec {
         wheel_radius_error_um: 0.0,
@@ -79,7 +79,7 @@ fn a_wheel_along_a_path_leaves_what_one_does_that_makes_its_own() {
 }
 
 #[test]
-fn what_the_wheel_has_not_come_to_stands_as_before() {
+fn unreached_surface_unchanged() {
     let world = World::new(small_perfect()).unwrap();
     sweep(&world, 0.5, 0.0, 0..10, 3.0);
     assert!(world.deviation_mm(8.0, -9.0) > 0.199, "beyond where it lifted off");
@@ -88,7 +88,7 @@ fn what_the_wheel_has_not_come_to_stands_as_before() {
 }
 
 #[test]
-fn a_wheel_that_nobody_knows_the_place_of_grinds_nothing() {
+fn unknown_wheel_position_grinds_nothing() {
     let world = World::new(small_perfect()).unwrap();
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
     for k in 0..100 {
@@ -99,7 +99,7 @@ fn a_wheel_that_nobody_knows_the_place_of_grinds_nothing() {
 }
 
 #[test]
-fn a_part_of_which_nobody_knows_how_it_is_is_not_measured() {
+fn touch_unexpected_after_lost_path() {
     let touched = |world: &World| {
         let (point, normal) = world.nominal(0.0, 0.0);
         world.touch_probe().touch(point, normal, [1.5, 2.0, 2.0])

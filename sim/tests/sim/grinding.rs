@@ -30,7 +30,7 @@ fn assert_level(world: &World, level_mm: f64, within_mm: f64) {
 }
 
 #[test]
-fn without_errors_the_surface_stands_at_the_level() {
+fn perfect_pass_reaches_level() {
     let world = world(small_perfect());
     assert_level(&world, 0.2, 1e-15);
     let record = grind(&mut world.grinder(), 1, 0, &zero_map(HALF_MM), &pass(HALF_MM, 0.013));
@@ -41,7 +41,7 @@ fn without_errors_the_surface_stands_at_the_level() {
 }
 
 #[test]
-fn the_record_agrees_with_area_path_and_time() {
+fn pass_record_matches_path_and_volume() {
     let mut spec = small_perfect();
     spec.part.shape = ShapeSpec::Wave { height_mm: 1e-9 };
     let world = world(spec);
@@ -62,7 +62,7 @@ fn the_record_agrees_with_area_path_and_time() {
 }
 
 #[test]
-fn grinding_above_the_surface_removes_nothing() {
+fn pass_above_surface_removes_nothing() {
     let world = world(small_perfect());
     let record = grind(&mut world.grinder(), 1, 0, &zero_map(HALF_MM), &pass(HALF_MM, 0.25));
     assert_level(&world, 0.2, 1e-15);
@@ -70,7 +70,7 @@ fn grinding_above_the_surface_removes_nothing() {
 }
 
 #[test]
-fn a_share_of_what_stood_proud_stays_and_spark_out_takes_it_again() {
+fn spark_out_reduces_error_copying() {
     let mut spec = small_perfect();
     spec.grinder.error_copying = 0.2;
     for (spark_out, left) in [(0, 0.2), (1, 0.04), (2, 0.008)] {
@@ -82,7 +82,7 @@ fn a_share_of_what_stood_proud_stays_and_spark_out_takes_it_again() {
 }
 
 #[test]
-fn a_map_displaces_the_surface_by_what_it_says() {
+fn correction_map_displaces_surface() {
     let slope = |x: f64, y: f64| 1e-4 * x + 2e-4 * y;
     let mirrored = |map_mirrored| WorldFaults { map_mirrored, ..WorldFaults::default() };
     type Case = (WorldFaults, f64, fn([f64; 2]) -> [f64; 2]);
@@ -109,7 +109,7 @@ fn a_map_displaces_the_surface_by_what_it_says() {
 }
 
 #[test]
-fn a_flipped_sign_doubles_the_error() {
+fn map_sign_flip_doubles_error() {
     let rms = |flipped: bool| {
         let mut spec = small_perfect();
         spec.grinder.straightness_x_um = [6.0, 0.0];
@@ -130,7 +130,7 @@ fn a_flipped_sign_doubles_the_error() {
 }
 
 #[test]
-fn a_wheel_larger_than_stated_cuts_deeper_on_slopes_until_its_radius_is_stated_right() {
+fn wheel_radius_error_cuts_slopes_deeper() {
     let mut spec = small_perfect();
     spec.grinder.wheel_radius_error_um = 50.0;
     let world = world(spec);
@@ -148,7 +148,7 @@ fn a_wheel_larger_than_stated_cuts_deeper_on_slopes_until_its_radius_is_stated_r
 }
 
 #[test]
-fn wear_and_heat_run_along_the_path_and_heat_stays_for_the_next_pass() {
+fn wear_and_thermal_growth_along_path() {
     let mut spec = small_perfect();
     spec.grinder.wear_um = 5.0;
     let worn = world(spec.clone());
@@ -167,7 +167,7 @@ fn wear_and_heat_run_along_the_path_and_heat_stays_for_the_next_pass() {
 }
 
 #[test]
-fn between_the_tracks_ridges_stand_where_the_wheel_has_cut() {
+fn scallop_ridges_between_tracks() {
     let mut spec = small_perfect();
     spec.grinder.scallops = true;
     spec.part.shape = ShapeSpec::Wave { height_mm: 1e-9 };
@@ -198,7 +198,7 @@ fn between_the_tracks_ridges_stand_where_the_wheel_has_cut() {
 }
 
 #[test]
-fn an_abort_leaves_a_half_ground_part() {
+fn abort_leaves_part_half_ground() {
     let world = world(small_perfect());
     let mut grinder = world.grinder();
     let first = grinder.prepare(1, 0, &grinder_payloads(&zero_map(HALF_MM), &deep(0.1))).unwrap();
@@ -219,7 +219,7 @@ fn an_abort_leaves_a_half_ground_part() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_run_in_whatever_steps() {
+fn seed_reproduces_world_at_any_time_step() {
     let history = |seed: u64, step_s: f64| {
         let part = PartSpec { form_error_um: 20.0, ..small_perfect().part };
         let world = world(WorldSpec { seed, part, ..WorldSpec::default() });
@@ -250,7 +250,7 @@ fn the_same_seed_gives_the_same_run_in_whatever_steps() {
 }
 
 #[test]
-fn one_more_source_changes_no_other() {
+fn error_sources_are_independent() {
     let left = |waviness_um: f64, repeatability_um: f64| {
         let mut spec = small_perfect();
         (spec.grinder.waviness_um, spec.grinder.repeatability_um) = (waviness_um, repeatability_um);
@@ -265,7 +265,7 @@ fn one_more_source_changes_no_other() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_and_nothing_moves() {
+fn grinder_prepare_refuses_bad_payload() {
     let world = world(small_perfect());
     let mut grinder = world.grinder();
     let (map, good) = (zero_map(HALF_MM), deep(0.1));
@@ -290,7 +290,7 @@ fn what_does_not_fit_is_refused_and_nothing_moves() {
 }
 
 #[test]
-fn a_part_keeps_its_identity_within_a_job_and_a_new_job_brings_a_new_blank() {
+fn new_job_loads_new_blank() {
     let world = world(small_perfect());
     let mut grinder = world.grinder();
     grind(&mut grinder, 1, 0, &zero_map(HALF_MM), &deep(0.1));
@@ -308,7 +308,7 @@ fn a_part_keeps_its_identity_within_a_job_and_a_new_job_brings_a_new_blank() {
 }
 
 #[test]
-fn the_two_machines_exclude_each_other() {
+fn cmm_and_grinder_interlock_each_other() {
     let world = world(small_perfect());
     let (mut grinder, mut cmm) = (world.grinder(), world.cmm());
     let pass = grinder_payloads(&zero_map(HALF_MM), &deep(0.1));
@@ -332,7 +332,7 @@ fn the_two_machines_exclude_each_other() {
 }
 
 #[test]
-fn without_a_part_the_wheel_cuts_air() {
+fn pass_without_part_cuts_air() {
     let mut spec = small_perfect();
     spec.faults.no_part = true;
     let world = world(spec);

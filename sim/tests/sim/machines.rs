@@ -113,7 +113,7 @@ impl Desk {
 }
 
 #[test]
-fn a_part_is_ground_and_measured_through_registers() {
+fn grind_and_measure_over_registers() {
     for order in [WordOrder::Big, WordOrder::Little] {
         let world = World::new(small_perfect()).unwrap();
         let level_mm = world.level_mm() - 0.01;
@@ -146,7 +146,7 @@ fn a_part_is_ground_and_measured_through_registers() {
 }
 
 #[test]
-fn a_part_that_is_held_and_stopped_is_given_free() {
+fn stop_after_hold_releases_part() {
     let world = World::new(small_perfect()).unwrap();
     let level_mm = world.level_mm() - 0.01;
     let map = (2, zero_map(HALF_MM).encode());
@@ -191,7 +191,7 @@ fn measuring(gives_ahead: bool, order: WordOrder) -> Desk {
 }
 
 #[test]
-fn full_pages_are_given_while_it_measures_and_stay_as_they_are() {
+fn full_pages_readable_during_measurement() {
     for order in [WordOrder::Big, WordOrder::Little] {
         let mut cmm = measuring(true, order);
         assert_eq!(cmm.machine.read(12, 1), Ok(vec![3]), "the flag");
@@ -215,7 +215,7 @@ fn full_pages_are_given_while_it_measures_and_stay_as_they_are() {
 }
 
 #[test]
-fn a_machine_that_gives_all_at_the_end_or_was_aborted_shows_nothing() {
+fn early_pages_absent_if_off_or_aborted() {
     let mut old = measuring(false, WordOrder::Big);
     assert_eq!(old.machine.read(12, 1), Ok(vec![1]));
     assert_eq!((old.machine.read(400, 56).unwrap(), old.outbox_page(0)[2]), (vec![0; 56], 0));
@@ -234,7 +234,7 @@ fn grinder(options: MachineOptions) -> Desk {
 }
 
 #[test]
-fn a_machine_moves_without_an_order_until_it_is_held_or_brought_back() {
+fn stray_motion_without_command() {
     let mut grinder = grinder(MachineOptions::default());
     for held in [true, false] {
         grinder.machine.stray(true);
@@ -257,7 +257,7 @@ fn a_machine_moves_without_an_order_until_it_is_held_or_brought_back() {
 }
 
 #[test]
-fn a_held_machine_goes_on_at_its_panel() {
+fn panel_start_resumes_held_machine() {
     let mut grinder = grinder(MachineOptions::default());
     grinder.machine.press_start();
     assert_eq!(grinder.machine.state(), State::Idle, "nothing is held");
@@ -271,7 +271,7 @@ fn a_held_machine_goes_on_at_its_panel() {
 }
 
 #[test]
-fn only_a_trusting_machine_begins_a_job_again_or_with_what_was_not_sent() {
+fn trusting_machine_skips_job_checks() {
     for trusting in [false, true] {
         let mut grinder = grinder(MachineOptions { trusting, ..MachineOptions::default() });
         grinder.command(Command::Prepare, Answer::Accepted);

@@ -21,7 +21,7 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
 const CENTRE: Vec3 = [0.0, 0.0, 60.0];
 
 #[test]
-fn centres_on_a_sphere_are_concentric_wherever_the_part_lies() {
+fn sphere_centres_concentric_in_any_pose() {
     let mut spec = small_perfect();
     spec.cmm.translation_mm = [0.7, -0.4, 0.2];
     spec.cmm.rotation_deg = [0.6, -0.4, 2.0];
@@ -38,7 +38,7 @@ fn centres_on_a_sphere_are_concentric_wherever_the_part_lies() {
 }
 
 #[test]
-fn the_ball_is_as_large_as_it_is_and_the_part_as_warm() {
+fn probe_radius_error_and_part_expansion() {
     let mut spec = small_perfect();
     spec.cmm.probe_radius_error_um = 10.0;
     spec.cmm.part_temperature_c = 25.0;
@@ -53,7 +53,7 @@ fn the_ball_is_as_large_as_it_is_and_the_part_as_warm() {
 }
 
 #[test]
-fn the_reference_sphere_is_touched_where_it_stands() {
+fn cmm_touches_reference_sphere() {
     let world = world(small_perfect());
     let [cx, cy, cz] = CmmSpec::default().sphere_centre_mm;
     let mut plan = plan(&world, &[[0.0, 0.0]]);
@@ -70,7 +70,7 @@ fn the_reference_sphere_is_touched_where_it_stands() {
 }
 
 #[test]
-fn nothing_is_found_beyond_the_edge_or_without_a_part() {
+fn target_not_found_off_edge_or_no_part() {
     let beyond = world(small_perfect());
     let mut plan = plan(&beyond, &[[0.0, 0.0], [15.5, 0.0]]);
     let statuses = |world: &World, plan: &Plan| {
@@ -88,7 +88,7 @@ fn nothing_is_found_beyond_the_edge_or_without_a_part() {
 }
 
 #[test]
-fn a_part_turned_round_stops_the_machine_or_reads_quite_wrong() {
+fn part_turned_180_faults_cmm() {
     let faults = WorldFaults { part_turned_180: true, ..WorldFaults::default() };
     let world = world(WorldSpec { faults, ..WorldSpec::default() });
     let mut cmm = world.cmm();
@@ -105,7 +105,7 @@ fn a_part_turned_round_stops_the_machine_or_reads_quite_wrong() {
 }
 
 #[test]
-fn noise_outliers_and_misses_come_in_the_stated_measure() {
+fn noise_outlier_and_miss_rates() {
     let mut spec = small_perfect();
     spec.cmm.noise_um = 0.5;
     let noisy = world(spec.clone());
@@ -126,7 +126,7 @@ fn noise_outliers_and_misses_come_in_the_stated_measure() {
 }
 
 #[test]
-fn a_loading_shifts_the_part_and_lying_still_does_not() {
+fn part_pose_shifts_only_on_loading() {
     let world = world(WorldSpec { part: small_perfect().part, ..WorldSpec::default() });
     let (mut cmm, mut grinder) = (world.cmm(), world.grinder());
     let plan = plan(&world, &[[0.0, 0.0]]);
@@ -147,7 +147,7 @@ fn a_loading_shifts_the_part_and_lying_still_does_not() {
 }
 
 #[test]
-fn faults_show_in_the_points_as_they_should() {
+fn world_faults_alter_points() {
     let spec = small_perfect();
     let read = |faults: WorldFaults, scaled: bool| {
         let mut spec = WorldSpec { faults, ..spec.clone() };
@@ -189,7 +189,7 @@ fn faults_show_in_the_points_as_they_should() {
 }
 
 #[test]
-fn a_plan_beyond_the_travel_or_for_another_machine_is_refused() {
+fn cmm_refuses_plan_beyond_travel() {
     let world = world(small_perfect());
     let mut cmm = world.cmm();
     let good = plan(&world, &[[0.0, 0.0]]);
@@ -207,7 +207,7 @@ fn a_plan_beyond_the_travel_or_for_another_machine_is_refused() {
 }
 
 #[test]
-fn a_stopped_measurement_says_so_of_every_target() {
+fn stop_marks_unreached_targets() {
     let world = world(small_perfect());
     let mut cmm = world.cmm();
     cmm.prepare(1, 0, &cmm_payloads(&plan(&world, &net([10.0, 5.0], 5.0)))).unwrap();
@@ -226,7 +226,7 @@ fn a_stopped_measurement_says_so_of_every_target() {
 }
 
 #[test]
-fn in_the_default_fixture_all_points_half_a_millimetre_within_the_edge_are_found() {
+fn default_fixture_points_all_found() {
     for seed in 1..=5 {
         let world = world(WorldSpec { seed, ..WorldSpec::default() });
         let (_, records) = measure(&mut world.cmm(), &plan(&world, &net([50.5, 30.5], 50.5 / 30.0)));
@@ -236,7 +236,7 @@ fn in_the_default_fixture_all_points_half_a_millimetre_within_the_edge_are_found
 }
 
 #[test]
-fn eighteen_hundred_points_are_all_touched() {
+fn cmm_touches_1800_points() {
     let world = world(WorldSpec::default());
     let plan = plan(&world, &net([49.0, 29.0], 1.77));
     let (_, records) = measure(&mut world.cmm(), &plan);
@@ -245,7 +245,7 @@ fn eighteen_hundred_points_are_all_touched() {
 }
 
 #[test]
-fn every_shape_is_a_world_and_a_table_is_read_and_written() {
+fn world_spec_round_trip_all_shapes() {
     let table = r#"
         seed = 4
         [part]
@@ -280,7 +280,7 @@ fn every_shape_is_a_world_and_a_table_is_read_and_written() {
 }
 
 #[test]
-fn a_table_that_cannot_be_is_refused_with_its_key() {
+fn world_spec_error_names_key() {
     let bad = |change: &dyn Fn(&mut WorldSpec)| {
         let mut spec = WorldSpec::default();
         change(&mut spec);
@@ -299,7 +299,7 @@ fn a_table_that_cannot_be_is_refused_with_its_key() {
 }
 
 #[test]
-fn the_careful_beginning_of_a_plan_is_slow_and_the_rest_is_not() {
+fn careful_start_slows_first_targets() {
     let mut spec = small_perfect();
     spec.cmm.travel_mm_s = 1e6;
     let world = World::new(spec).unwrap();
@@ -311,7 +311,7 @@ fn the_careful_beginning_of_a_plan_is_slow_and_the_rest_is_not() {
 }
 
 #[test]
-fn between_two_targets_lies_the_travel() {
+fn travel_time_between_targets() {
     let world = World::new(small_perfect()).unwrap();
     let took = |places: &[[f64; 2]]| measure(&mut world.cmm(), &plan(&world, places)).0.duration_s;
     let [near, far] = [took(&[[0.0, 0.0], [1.0, 0.0]]), took(&[[0.0, 0.0], [10.0, 0.0]])];

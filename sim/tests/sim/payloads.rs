@@ -75,7 +75,7 @@ fn with(bytes: &[u8], at: usize, by: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn every_payload_in_stands_byte_by_byte_where_the_document_says() {
+fn inbound_payload_byte_layout() {
     let (value, bytes) = plan();
     assert_eq!((bytes.len(), value.encode()), (64 + 56, bytes.clone()));
     assert_eq!(Plan::decode(&bytes), Ok(value));
@@ -88,7 +88,7 @@ fn every_payload_in_stands_byte_by_byte_where_the_document_says() {
 }
 
 #[test]
-fn points_stand_byte_by_byte_where_the_document_says() {
+fn point_record_byte_layout() {
     let records = [
         PointRecord { index: 0x0102_0304, status: Status::Touched, quality: 7, position_mm: [1.0, -2.0, 1.5] },
         PointRecord { index: 5, status: Status::NotFound, quality: 100, position_mm: [0.0; 3] },
@@ -109,7 +109,7 @@ fn points_stand_byte_by_byte_where_the_document_says() {
 }
 
 #[test]
-fn the_pass_record_stands_byte_by_byte_where_the_document_says() {
+fn pass_record_byte_layout() {
     let record = PassRecord {
         job: 0x0102_0304,
         cycle: 0x0506,
@@ -128,7 +128,7 @@ fn the_pass_record_stands_byte_by_byte_where_the_document_says() {
 }
 
 #[test]
-fn a_payload_cut_anywhere_is_refused() {
+fn payload_refuses_truncation() {
     let (plan, map, pass) = (plan().1, map().1, pass().1);
     for end in 0..plan.len() {
         assert_eq!(Plan::decode(&plan[..end]).unwrap_err().answer, 8, "plan of {end} bytes");
@@ -146,7 +146,7 @@ fn a_payload_cut_anywhere_is_refused() {
 }
 
 #[test]
-fn a_wrong_plan_is_refused_for_its_reason() {
+fn plan_decode_names_reason() {
     let bytes = plan().1;
     let nan = f64::NAN.to_be_bytes();
     let cases: [(usize, &[u8], u16, &str); 16] = [
@@ -178,7 +178,7 @@ fn a_wrong_plan_is_refused_for_its_reason() {
 }
 
 #[test]
-fn a_wrong_map_is_refused_for_its_reason() {
+fn map_decode_names_reason() {
     let bytes = map().1;
     let nan = f64::NAN.to_be_bytes();
     let cases: [(usize, &[u8], u16, &str); 12] = [
@@ -202,7 +202,7 @@ fn a_wrong_map_is_refused_for_its_reason() {
 }
 
 #[test]
-fn a_wrong_pass_is_refused_for_its_reason() {
+fn pass_decode_names_reason() {
     let bytes = pass().1;
     let cases: [(usize, &[u8], u16, &str); 10] = [
         (0, &[1, 0], 8, "format is 256"),
@@ -223,7 +223,7 @@ fn a_wrong_pass_is_refused_for_its_reason() {
 }
 
 #[test]
-fn bytes_at_random_never_panic() {
+fn payload_decode_never_panics() {
     use rand::RngExt;
     const SEED: u64 = 20;
     let mut rng = regrind_sim::rng(SEED);
@@ -246,7 +246,7 @@ fn bytes_at_random_never_panic() {
 }
 
 #[test]
-fn a_map_is_bilinear_within_and_flat_beyond() {
+fn map_bilinear_inside_flat_outside() {
     let map = map().0;
     let cases = [
         ([-2.0, 0.0], 1.0),

@@ -258,7 +258,7 @@ impl Desk {
 }
 
 #[test]
-fn the_identity_says_what_it_is_in_both_orders() {
+fn identity_block_in_both_word_orders() {
     for (order, kind) in [(WordOrder::Big, Kind::Cmm), (WordOrder::Little, Kind::Grinder)] {
         let options = MachineOptions { word_order: order, lost_after_ms: 1200, ..MachineOptions::default() };
         let mut desk = Desk::at(Counter::new(kind, 1.0), options);
@@ -276,14 +276,14 @@ fn the_identity_says_what_it_is_in_both_orders() {
 }
 
 #[test]
-fn the_machine_answers_the_sync_words_with_their_complements() {
+fn sync_words_answered_by_complements() {
     let mut desk = Desk::new(Kind::Cmm);
     desk.machine.write(32, &[0xABCD, 0x0001]).unwrap();
     assert_eq!(desk.read(32, 4), [0xABCD, 0x0001, 0x5432, 0xFFFE]);
 }
 
 #[test]
-fn addresses_outside_the_blocks_are_refused() {
+fn registers_refuse_unmapped_address() {
     let mut machine = Desk::new(Kind::Cmm).machine;
     for (address, count) in [(39, 1), (36, 4), (60, 4), (112, 1), (30, 10), (110, 3), (500, 100), (578, 1), (65535, 2)]
     {
@@ -308,7 +308,7 @@ fn addresses_outside_the_blocks_are_refused() {
 }
 
 #[test]
-fn blocks_may_be_moved() {
+fn register_layout_relocates_blocks() {
     let layout = RegisterLayout { identity: 1000, status: 2000, ..RegisterLayout::default() };
     let mut desk = Desk::at(Counter::new(Kind::Cmm, 1.0), MachineOptions { layout, ..MachineOptions::default() });
     assert_eq!(desk.read(1000, 1), [0x5247]);
@@ -317,7 +317,7 @@ fn blocks_may_be_moved() {
 }
 
 #[test]
-fn a_whole_job_runs_on_each_kind_of_machine_in_each_order() {
+fn whole_job_per_kind_and_word_order() {
     for kind in [Kind::Cmm, Kind::Grinder] {
         for order in [WordOrder::Big, WordOrder::Little] {
             let body = Counter::new(kind, 5.0);
@@ -395,7 +395,7 @@ fn check_outbox(desk: &mut Desk, start: u32) {
 
 /// What each command is answered in each state, and where it leads at once; rows are the states in order.
 #[test]
-fn every_command_in_every_state_is_answered_as_the_contract_says() {
+fn commands_answer_by_state_table() {
     use Command::*;
     use State::*;
     let allowed: [(Command, &[(State, State)]); 10] = [
@@ -428,7 +428,7 @@ fn every_command_in_every_state_is_answered_as_the_contract_says() {
 }
 
 #[test]
-fn in_every_state_a_stranger_may_only_abort() {
+fn non_owner_may_only_abort() {
     for state in State::ALL {
         for command in Command::ALL {
             for (owner, epoch) in [(8, 1), (9, 2), (9, 0)] {
@@ -447,7 +447,7 @@ fn in_every_state_a_stranger_may_only_abort() {
 }
 
 #[test]
-fn an_unknown_command_is_answered_so() {
+fn unknown_command_answer() {
     for command in [0, 11, 0xFFFF] {
         let mut desk = Desk::ready(Kind::Cmm);
         let frame = CommandFrame { command, ..desk.frame(Command::Prepare) };
@@ -456,7 +456,7 @@ fn an_unknown_command_is_answered_so() {
 }
 
 #[test]
-fn a_command_written_again_changes_nothing() {
+fn repeated_command_is_idempotent() {
     let mut desk = Desk::ready(Kind::Grinder);
     desk.accept(Command::Prepare);
     let frame = desk.frame(Command::Start);
@@ -480,7 +480,7 @@ fn a_command_written_again_changes_nothing() {
 }
 
 #[test]
-fn a_frame_that_is_not_sound_is_not_looked_at() {
+fn corrupt_command_frame_ignored() {
     let mut desk = Desk::ready(Kind::Cmm);
     let before = desk.status();
     let sound = desk.frame(Command::Prepare);
@@ -502,7 +502,7 @@ fn a_frame_that_is_not_sound_is_not_looked_at() {
 }
 
 #[test]
-fn a_command_is_looked_at_when_its_last_register_is_written() {
+fn command_acts_on_last_register_write() {
     let mut desk = Desk::ready(Kind::Cmm);
     let words = desk.frame(Command::Prepare).registers(WordOrder::Big);
     for (at, word) in words.iter().enumerate() {
@@ -513,7 +513,7 @@ fn a_command_is_looked_at_when_its_last_register_is_written() {
 }
 
 #[test]
-fn start_needs_the_token_the_job_the_cycle_and_the_digest() {
+fn start_requires_token_job_and_digest() {
     let mut desk = Desk::ready(Kind::Cmm);
     desk.accept(Command::Prepare);
     let good = desk.frame(Command::Start);
@@ -535,7 +535,7 @@ fn start_needs_the_token_the_job_the_cycle_and_the_digest() {
 }
 
 #[test]
-fn a_payload_that_changes_after_prepare_stops_the_start() {
+fn start_refuses_changed_payload() {
     let mut desk = Desk::ready(Kind::Cmm);
     desk.accept(Command::Prepare);
     desk.send(1, &[1; 64], [99; 32]);
@@ -543,7 +543,7 @@ fn a_payload_that_changes_after_prepare_stops_the_start() {
 }
 
 #[test]
-fn a_token_dies() {
+fn token_invalidated_by_events() {
     let kills: [(&str, ClientAction); 6] = [
         ("HOLD", |desk| assert_eq!(desk.command(Command::Hold), Answer::NotAllowed as u16)),
         ("CLAIM", |desk| desk.accept(Command::Claim)),
@@ -569,7 +569,7 @@ fn a_token_dies() {
 }
 
 #[test]
-fn a_token_lives_for_thirty_seconds() {
+fn token_expires_after_30_s() {
     let mut desk = Desk::ready(Kind::Grinder);
     desk.accept(Command::Prepare);
     desk.wait(30 * S - 20 * MS);
@@ -586,7 +586,7 @@ fn a_token_lives_for_thirty_seconds() {
 }
 
 #[test]
-fn a_job_and_cycle_begin_once_whatever_became_of_them() {
+fn job_and_cycle_start_once() {
     let ends: [(&str, ClientAction); 4] = [
         ("complete", |desk| {
             desk.wait(6 * S);
@@ -627,7 +627,7 @@ fn a_job_and_cycle_begin_once_whatever_became_of_them() {
 }
 
 #[test]
-fn prepare_says_what_is_wrong() {
+fn prepare_answers_each_refusal() {
     let mut desk = Desk::new(Kind::Grinder);
     desk.accept(Command::Claim);
     assert_eq!(desk.command(Command::Prepare), Answer::Payload as u16, "nothing in force");
@@ -655,7 +655,7 @@ fn prepare_says_what_is_wrong() {
 }
 
 #[test]
-fn hold_and_resume_lose_nothing() {
+fn hold_resume_preserves_progress() {
     let mut desk = Desk::ready(Kind::Grinder);
     desk.accept(Command::Prepare);
     desk.accept(Command::Start);
@@ -678,7 +678,7 @@ fn hold_and_resume_lose_nothing() {
 }
 
 #[test]
-fn a_stopped_job_leaves_what_it_has_and_an_aborted_one_nothing() {
+fn stop_leaves_result_abort_none() {
     for state in [State::Execute, State::Holding, State::Held] {
         let mut desk = Desk::in_state(state);
         let start = desk.status().begun_by;
@@ -718,7 +718,7 @@ fn acknowledge_must_name_the_job() {
 }
 
 #[test]
-fn a_machine_whose_client_is_silent_holds() {
+fn silent_client_causes_hold() {
     let mut desk = Desk::in_state(State::Execute);
     desk.machine.set_speed(0.1);
     desk.wait(10 * S);
@@ -743,7 +743,7 @@ fn a_machine_whose_client_is_silent_holds() {
 }
 
 #[test]
-fn the_beats_of_a_stranger_keep_no_machine_moving() {
+fn non_owner_heartbeat_ignored() {
     for order in [WordOrder::Big, WordOrder::Little] {
         let options = MachineOptions { word_order: order, ..MachineOptions::default() };
         let mut desk = Desk::at(Counter::new(Kind::Cmm, 5.0), options);
@@ -774,7 +774,7 @@ fn the_beats_of_a_stranger_keep_no_machine_moving() {
 }
 
 #[test]
-fn silence_matters_to_motion_alone() {
+fn heartbeat_timeout_only_in_motion() {
     for state in State::ALL.into_iter().filter(|s| *s != State::Execute && *s != State::Prepared) {
         let mut desk = Desk::in_state(state);
         desk.machine.tick(9 * S / 2);
@@ -783,7 +783,7 @@ fn silence_matters_to_motion_alone() {
 }
 
 #[test]
-fn a_claim_is_taken_over_only_from_a_silent_client() {
+fn claim_takeover_from_silent_client() {
     let mut desk = Desk::ready(Kind::Cmm);
     desk.accept(Command::Prepare);
     desk.wait(10 * S);
@@ -811,7 +811,7 @@ fn a_claim_is_taken_over_only_from_a_silent_client() {
 }
 
 #[test]
-fn what_opens_while_it_moves_is_a_fault() {
+fn interlock_open_in_motion_faults() {
     for (bit, fault) in [(interlock::GUARDS, 1), (interlock::CLAMPED, 30), (interlock::SUPPLIES, 3)] {
         let mut desk = Desk::in_state(State::Execute);
         let start = desk.status().begun_by;
@@ -834,7 +834,7 @@ fn what_opens_while_it_moves_is_a_fault() {
 }
 
 #[test]
-fn a_fault_of_the_physics_ends_the_job() {
+fn physics_fault_ends_job() {
     let body = Counter::new(Kind::Cmm, 5.0);
     let (fault, asked) = (body.fault.clone(), body.calls.clone());
     let mut desk = Desk::at(body, MachineOptions::default());
@@ -850,7 +850,7 @@ fn a_fault_of_the_physics_ends_the_job() {
 }
 
 #[test]
-fn pages_may_be_repeated_and_not_skipped() {
+fn inbox_accepts_repeat_refuses_skip() {
     let mut desk = Desk::new(Kind::Cmm);
     let bytes: Vec<u8> = (0..501).map(|i| i as u8).collect();
     let registers = registers_of(&bytes);
@@ -885,7 +885,7 @@ fn pages_may_be_repeated_and_not_skipped() {
 }
 
 #[test]
-fn a_payload_comes_into_force_only_if_it_is_whole_and_of_this_part() {
+fn payload_in_force_needs_crc_and_part() {
     let mut desk = Desk::ready(Kind::Cmm);
     let before = desk.read(120, 72);
     let header = desk.header(1, &[1; 100], 123, [7; 32]);
@@ -903,7 +903,7 @@ fn a_payload_comes_into_force_only_if_it_is_whole_and_of_this_part() {
 }
 
 #[test]
-fn a_header_that_cannot_be_taken_is_refused() {
+fn inbox_refuses_bad_header() {
     let mut desk = Desk::new(Kind::Cmm);
     for (kind, bytes) in [(0, 100), (2, 100), (3, 100), (4, 100), (1, 0), (1, (64 << 20) + 1)] {
         let mut header = desk.header(kind, &[], 0, [0; 32]);
@@ -922,7 +922,7 @@ fn a_header_that_cannot_be_taken_is_refused() {
 }
 
 #[test]
-fn the_snapshot_rises_with_every_change_and_can_be_torn() {
+fn status_snapshot_counts_and_tears() {
     let mut desk = Desk::ready(Kind::Cmm);
     let before = desk.read(64, 1)[0];
     assert_eq!(desk.read(64, 1)[0], before, "reading is not a change");
@@ -936,7 +936,7 @@ fn the_snapshot_rises_with_every_change_and_can_be_torn() {
 }
 
 #[test]
-fn beats_go_both_ways_until_the_application_freezes() {
+fn heartbeats_stop_on_freeze() {
     let mut desk = Desk::in_state(State::Execute);
     desk.write_beat(4711, 9);
     let before = desk.read(92, 1)[0];
@@ -957,7 +957,7 @@ fn beats_go_both_ways_until_the_application_freezes() {
 }
 
 #[test]
-fn a_reboot_forgets_all_but_what_was_begun() {
+fn reboot_preserves_only_last_begun() {
     for (state, after) in [
         (State::Idle, State::Idle),
         (State::Prepared, State::Idle),
@@ -979,7 +979,7 @@ fn a_reboot_forgets_all_but_what_was_begun() {
 }
 
 #[test]
-fn the_log_tells_a_job_from_end_to_end() {
+fn handshake_log_of_whole_job() {
     let mut desk = Desk::ready(Kind::Cmm);
     desk.accept(Command::Prepare);
     desk.accept(Command::Start);
@@ -1016,7 +1016,7 @@ fn the_log_tells_a_job_from_end_to_end() {
 }
 
 #[test]
-fn a_job_that_ended_tells_how_its_client_beat() {
+fn ended_event_has_beat_statistics() {
     let mut desk = Desk::in_state(State::Execute);
     desk.wait(S);
     desk.machine.tick(2100 * MS);
@@ -1034,7 +1034,7 @@ fn a_job_that_ended_tells_how_its_client_beat() {
 }
 
 #[test]
-fn a_log_is_bounded() {
+fn handshake_log_is_bounded() {
     let mut desk = Desk::ready(Kind::Cmm);
     for _ in 0..70_000 {
         desk.machine.write(59, &[0xFFFF]).unwrap();
@@ -1044,7 +1044,7 @@ fn a_log_is_bounded() {
 
 /// Commands in any order, with right and wrong numbers, while time passes and things happen at the machine.
 #[test]
-fn whatever_a_client_does_a_job_begins_at_most_once() {
+fn random_commands_start_job_once() {
     use rand::RngExt;
     let mut all = 0;
     for seed in 0..300 {

@@ -117,7 +117,7 @@ async fn serve() -> Serving {
 }
 
 #[tokio::test]
-async fn a_whole_job_runs_over_tcp_on_two_units_of_one_port() {
+async fn whole_job_over_tcp_two_units() {
     let serving = serve().await;
     let mut cmm = connect(&serving, 1).await;
     let mut grinder = connect(&serving, 2).await;
@@ -130,7 +130,7 @@ async fn a_whole_job_runs_over_tcp_on_two_units_of_one_port() {
 }
 
 #[tokio::test]
-async fn a_whole_job_runs_over_a_serial_line_with_two_units() {
+async fn whole_job_over_rtu_two_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
     let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let port = tokio_serial::SerialStream::open(&tokio_serial::new(serving.path().unwrap().to_str().unwrap(), 115_200));
@@ -142,7 +142,7 @@ async fn a_whole_job_runs_over_a_serial_line_with_two_units() {
 }
 
 #[tokio::test]
-async fn a_paced_line_takes_the_time_of_its_baud_rate() {
+async fn rtu_paced_line_follows_baud_rate() {
     let line = Line::paced(9600);
     let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], line, SharedFaultPlan::none()).unwrap();
     let port = tokio_serial::SerialStream::open(&tokio_serial::new(serving.path().unwrap().to_str().unwrap(), 9600));
@@ -155,7 +155,7 @@ async fn a_paced_line_takes_the_time_of_its_baud_rate() {
 }
 
 #[tokio::test]
-async fn unknown_functions_units_and_addresses_get_their_exceptions() {
+async fn tcp_exceptions_for_unknown_requests() {
     let serving = serve().await;
     let mut wire = connect(&serving, 1).await;
     assert_eq!(wire.read_coils(0, 1).await.unwrap(), Err(ExceptionCode::IllegalFunction));
@@ -172,7 +172,7 @@ async fn unknown_functions_units_and_addresses_get_their_exceptions() {
 }
 
 #[tokio::test]
-async fn a_client_that_falls_silent_makes_the_machine_hold() {
+async fn tcp_silent_client_causes_hold() {
     let options = MachineOptions { speed: 0.001, lost_after_ms: 300, ..MachineOptions::default() };
     let machine = SimulatedMachine::new(Box::new(Counter::new(Kind::Cmm, 20.0)), 5, options);
     let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
@@ -199,7 +199,7 @@ async fn a_client_that_falls_silent_makes_the_machine_hold() {
 }
 
 #[tokio::test]
-async fn a_serving_that_stops_closes_its_port_and_keeps_its_machines() {
+async fn serving_stop_closes_port() {
     let serving = serve().await;
     let addr = serving.local_addr().unwrap();
     let mut raw = TcpStream::connect(addr).await.unwrap();
@@ -216,7 +216,7 @@ async fn a_serving_that_stops_closes_its_port_and_keeps_its_machines() {
 }
 
 #[tokio::test]
-async fn what_is_not_modbus_closes_its_own_connection_alone() {
+async fn non_modbus_closes_only_own_connection() {
     let serving = serve().await;
     let mut other = connect(&serving, 1).await;
     for junk in
@@ -278,7 +278,7 @@ async fn broken(fault: Fault) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn each_fault_of_the_wire_breaks_what_it_says() {
+async fn tcp_wire_faults_alter_reply() {
     let changed = |at: usize, to: u8| {
         let mut bytes = good(1);
         bytes[at] = to;
@@ -301,7 +301,7 @@ async fn each_fault_of_the_wire_breaks_what_it_says() {
 }
 
 #[tokio::test]
-async fn a_late_answer_comes_late_and_whole() {
+async fn delayed_reply_arrives_whole() {
     let delay = Duration::from_millis(60);
     let began = Instant::now();
     assert_eq!(broken(Fault::DelayReply(delay)).await, good(1));
@@ -309,7 +309,7 @@ async fn a_late_answer_comes_late_and_whole() {
 }
 
 #[tokio::test]
-async fn a_connection_can_end_in_the_middle_of_a_frame_or_fall_silent() {
+async fn disconnect_and_silence_faults() {
     let serving = serve().await;
     serving.faults().set(FaultPlan::new(0).once(When::Nth(2), Fault::Disconnect(5)).once(When::Nth(3), Fault::Silence));
     let mut raw = TcpStream::connect(serving.local_addr().unwrap()).await.unwrap();
@@ -334,7 +334,7 @@ async fn a_connection_can_end_in_the_middle_of_a_frame_or_fall_silent() {
 }
 
 #[tokio::test]
-async fn words_can_be_exchanged() {
+async fn word_swap_fault() {
     let serving = serve().await;
     serving.faults().set(FaultPlan::new(0).times(2, 1, When::Reading(4), Fault::WordSwap));
     let mut wire = connect(&serving, 1).await;
@@ -344,7 +344,7 @@ async fn words_can_be_exchanged() {
 }
 
 #[tokio::test]
-async fn a_command_can_be_lost_on_the_way_there_or_on_the_way_back() {
+async fn drop_request_and_drop_reply_faults() {
     let serving = serve().await;
     let claim =
         CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
@@ -362,7 +362,7 @@ async fn a_command_can_be_lost_on_the_way_there_or_on_the_way_back() {
 }
 
 #[tokio::test]
-async fn a_request_can_be_carried_out_again_later() {
+async fn carry_out_again_fault() {
     let serving = serve().await;
     serving.faults().set(FaultPlan::new(0).once(When::Writing(460), Fault::CarryOutAgain(2)));
     let mut wire = connect(&serving, 1).await;
@@ -376,7 +376,7 @@ async fn a_request_can_be_carried_out_again_later() {
 }
 
 #[tokio::test]
-async fn an_application_can_freeze_thaw_reboot_and_tear() {
+async fn freeze_thaw_reboot_and_tear_faults() {
     let serving = serve().await;
     let faults = FaultPlan::new(0)
         .once(When::Nth(1), Fault::Freeze)
@@ -397,7 +397,7 @@ async fn an_application_can_freeze_thaw_reboot_and_tear() {
 }
 
 #[tokio::test]
-async fn a_machine_can_reboot_in_a_state() {
+async fn reboot_fault_in_state() {
     for state in [State::Prepared, State::Execute, State::Complete] {
         let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine(Kind::Cmm))]).await.unwrap();
         serving.faults().set(FaultPlan::new(0).once(When::InState(state), Fault::Reboot));
@@ -433,7 +433,7 @@ async fn a_machine_can_reboot_in_a_state() {
 }
 
 #[tokio::test]
-async fn chance_breaks_the_same_requests_for_the_same_seed() {
+async fn seeded_faults_are_reproducible() {
     let seed = 20_261_121;
     let mut runs = Vec::new();
     for _ in 0..2 {
@@ -464,7 +464,7 @@ fn open(serving: &Serving) -> tokio_serial::SerialStream {
 }
 
 #[tokio::test]
-async fn a_serial_line_answers_only_what_is_sound_and_for_its_units() {
+async fn rtu_answers_only_own_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
     let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let mut port = open(&serving);
@@ -483,7 +483,7 @@ async fn a_serial_line_answers_only_what_is_sound_and_for_its_units() {
 }
 
 #[tokio::test]
-async fn a_serial_line_finds_its_frames_again_after_noise() {
+async fn rtu_resyncs_after_noise() {
     let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let mut port = open(&serving);
     let (ask, answer) = (rtu_frame(1, &READ), rtu_frame(1, &[3, 2, 0x52, 0x47]));
@@ -510,7 +510,7 @@ async fn a_serial_line_finds_its_frames_again_after_noise() {
 }
 
 #[tokio::test]
-async fn a_serial_line_breaks_as_it_is_told() {
+async fn rtu_wire_faults_alter_reply() {
     let good = rtu_frame(1, &[3, 2, 0x52, 0x47]);
     let mut flipped = good.clone();
     flipped[5] ^= 1;
@@ -539,7 +539,7 @@ async fn a_serial_line_breaks_as_it_is_told() {
 
 #[cfg(unix)]
 #[tokio::test]
-async fn a_pseudo_terminal_changes_no_byte_and_outlives_its_client() {
+async fn pty_is_transparent_and_persistent() {
     let mut pty = Pty::open().unwrap();
     let every: Vec<u8> = (0..=255).collect();
     for _ in 0..3 {
@@ -554,7 +554,7 @@ async fn a_pseudo_terminal_changes_no_byte_and_outlives_its_client() {
 
 #[cfg(unix)]
 #[tokio::test]
-async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
+async fn pty_symlink_at_cell_file_path() {
     let folder = tempfile::tempdir().unwrap();
     let name = folder.path().join("cmm");
     // A link that an older simulator left behind is replaced; a file of somebody else is not.
@@ -577,7 +577,7 @@ async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
 }
 
 #[tokio::test]
-async fn junk_in_a_sound_frame_breaks_nothing() {
+async fn random_pdu_never_breaks_server() {
     use rand::RngExt;
     let seed = 4242;
     let mut rng = regrind_sim::rng(seed);

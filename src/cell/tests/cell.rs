@@ -214,7 +214,7 @@ impl<'f> TestRun<'f> {
 }
 
 #[test]
-fn a_whole_run_grinds_twice_and_is_accepted() {
+fn run_accepted_after_two_cycles() {
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_to_rest();
     assert_eq!(run.cell.state(), State::Complete);
@@ -228,7 +228,7 @@ fn a_whole_run_grinds_twice_and_is_accepted() {
 }
 
 #[test]
-fn a_run_may_begin_with_a_measurement() {
+fn run_begins_with_measurement() {
     let begin_with = FirstStep::Measure;
     let mut run = TestRun::new(CellPlan { begin_with, ..plan() }, |_| figures(5.0, 0.5));
     run.start().run_to_rest();
@@ -237,7 +237,7 @@ fn a_run_may_begin_with_a_measurement() {
 }
 
 #[test]
-fn the_uncertainty_counts_only_where_the_plan_says_so() {
+fn with_uncertainty_decides_acceptance() {
     for (with_uncertainty, accepted) in [(true, false), (false, true)] {
         let tolerance = Tolerance { with_uncertainty, ..plan().tolerance };
         let mut run = TestRun::new(CellPlan { tolerance, max_cycles: 1, ..plan() }, |_| figures(7.0, 1.0));
@@ -247,7 +247,7 @@ fn the_uncertainty_counts_only_where_the_plan_says_so() {
 }
 
 #[test]
-fn every_judgement_has_its_end() {
+fn verdict_sequences_and_end_states() {
     type Sequence = fn(u32) -> Figures;
     let sequences: [(Sequence, &[Verdict], State); 7] = [
         (
@@ -288,7 +288,7 @@ fn every_judgement_has_its_end() {
 }
 
 #[test]
-fn a_parameter_beyond_its_tolerance_is_asked_for_and_confirmed_by_resuming() {
+fn parameter_beyond_holds_until_resume() {
     let mut run = TestRun::new(plan(), |_| figures(30.0, 6.0));
     run.start().run_until(State::Execute(Phase::Compensate));
     let asks = vec!["wheel radius is off by 249.00 um".to_owned()];
@@ -303,7 +303,7 @@ fn a_parameter_beyond_its_tolerance_is_asked_for_and_confirmed_by_resuming() {
 }
 
 #[test]
-fn a_gain_below_what_the_recipe_calls_one_is_none() {
+fn stalled_below_stall_limit() {
     // From 6.0 to 5.5 um is 8 %, and half a micrometre.
     let judged = |stall_um: f64, forecast_um: Option<f64>| {
         let forecast = forecast_um.map(|um| Forecast { rms_mm: 1e-3 * um, sigma_mm: 1e-5, floor_mm: None });
@@ -322,7 +322,7 @@ fn a_gain_below_what_the_recipe_calls_one_is_none() {
 }
 
 #[test]
-fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
+fn tolerance_compare_uses_pv_998() {
     let most = Tolerance { pv_of: PvPoints::MostPoints, ..plan().tolerance };
     let found = Figures { pv_robust_mm: Some(0.0069), ..figures(8.0, 0.5) };
     let [pv, rms] = most.compare(&found);
@@ -342,7 +342,7 @@ fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
 }
 
 #[test]
-fn a_part_is_accepted_with_the_probability_that_the_recipe_asks_for() {
+fn conformity_by_acceptance_probability() {
     // u = 0.1 um below a limit of 1 um.
     let below = |deviates: f64| {
         let rms = RecordedInterval::from_expanded(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
@@ -392,7 +392,7 @@ fn figures_with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
 }
 
 #[test]
-fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
+fn conformity_by_form_interval() {
     // Nine micrometres of points, of which the probe made two.
     let judged = |pv_um: [f64; 3], rms_um: [f64; 3]| {
         plan().tolerance.compare(&figures_with_form(pv_um, rms_um)).map(|of| of.conformity)
@@ -416,7 +416,7 @@ fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
 }
 
 #[test]
-fn a_figure_without_a_limit_is_told_without_one() {
+fn judgement_omits_absent_limit() {
     let open = CellPlan { tolerance: Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance }, ..plan() };
     let mut run = TestRun::new(open, |_| figures_with_form([6.0, 6.4, 7.0], [0.4, 0.5, 0.6]));
     run.start().run_to_rest();
@@ -428,7 +428,7 @@ fn a_figure_without_a_limit_is_told_without_one() {
 }
 
 #[test]
-fn at_the_floor_no_further_pass_is_ground() {
+fn forecast_at_floor_stalls() {
     // 1.2 um are found, give or take 0.15; another pass is expected to leave 1.05, and none can leave less than the floor.
     let with_floor = |floor_um: f64| {
         let forecast = Some(Forecast { rms_mm: 1.05e-3, sigma_mm: 2e-5, floor_mm: Some(floor_um / 1e3) });
@@ -444,7 +444,7 @@ fn at_the_floor_no_further_pass_is_ground() {
 }
 
 #[test]
-fn a_run_that_ends_above_its_best_pass_names_it() {
+fn ending_names_best_cycle() {
     let mut run = TestRun::new(CellPlan { max_cycles: 3, ..plan() }, |k| match k {
         1 => figures(30.0, 6.0),
         2 => figures(9.0, 1.5),
@@ -456,7 +456,7 @@ fn a_run_that_ends_above_its_best_pass_names_it() {
 }
 
 #[test]
-fn a_tolerance_without_a_limit_comes_back_from_the_record_without_one() {
+fn infinite_tolerance_round_trip() {
     let open = Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance };
     let recorded = serde_json::to_string(&open).unwrap();
     assert!(recorded.contains("\"pv_mm\":null"), "{recorded}");
@@ -465,7 +465,7 @@ fn a_tolerance_without_a_limit_comes_back_from_the_record_without_one() {
 }
 
 #[test]
-fn a_figure_is_in_tolerance_out_of_it_or_neither() {
+fn verdict_accept_undecided_or_stalled() {
     // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the figure without it.
     let expecting = |rms_um: f64| Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: Some(rms_um / 1.2e3) };
     let judged = |pv_um: f64, rms_um: f64, next_rms_um: f64| {
@@ -501,7 +501,7 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
 }
 
 #[test]
-fn what_was_left_out_counts_until_it_is_touched_again() {
+fn outliers_hold_until_remeasured() {
     let left_out = |pv_um: f64, rms_um: f64| {
         let places = "point 17 at (1.0, 2.0) mm by -50.0 um".to_owned();
         Some(Box::new(OutlierFigures { pv_mm: pv_um / 1e3, rms_mm: rms_um / 1e3, places, again: false }))
@@ -549,7 +549,7 @@ fn what_was_left_out_counts_until_it_is_touched_again() {
 }
 
 #[test]
-fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
+fn stalled_without_forecast_improvement() {
     let expecting = |rms_um: f64| Some(Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: None });
     // The first pass goes on whatever is forecast: nobody knows yet what a correction can do.
     let mut run = TestRun::new(plan(), |k| Figures {
@@ -564,7 +564,7 @@ fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
 }
 
 #[test]
-fn one_worse_cycle_is_forgiven() {
+fn diverging_once_continues() {
     let mut run =
         TestRun::new(plan(), |k| [figures(20.0, 4.0), figures(22.0, 4.0), figures(6.0, 0.9)][k as usize - 1].clone());
     run.start().run_to_rest();
@@ -602,7 +602,7 @@ fn hold_at_every_step(what: &str, interrupt: fn(&mut TestRun)) {
 }
 
 #[test]
-fn hold_and_resume_at_every_step_lead_to_the_same_end() {
+fn hold_and_resume_at_every_step() {
     hold_at_every_step("held", |run| {
         run.send(hold());
         run.run_to_rest();
@@ -613,7 +613,7 @@ fn hold_and_resume_at_every_step_lead_to_the_same_end() {
 }
 
 #[test]
-fn a_running_machine_is_told_to_hold_and_to_resume() {
+fn hold_and_resume_running_machine() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(hold()), [Command::HoldMachine { device: Device::Grinder }]);
@@ -622,7 +622,7 @@ fn a_running_machine_is_told_to_hold_and_to_resume() {
 }
 
 #[test]
-fn stop_at_every_step_ends_in_order() {
+fn stop_at_every_step() {
     for state in undisturbed_states() {
         let mut run = TestRun::accepted_after_two_passes();
         run.start().run_until(state);
@@ -637,7 +637,7 @@ fn stop_at_every_step_ends_in_order() {
 }
 
 #[test]
-fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
+fn abort_and_fault_at_every_step() {
     let fault = Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() };
     for state in undisturbed_states() {
         for event in [abort(), fault.clone()] {
@@ -661,7 +661,7 @@ fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
 }
 
 #[test]
-fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
+fn unconfirmed_abort_ends_by_timeout() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
     for _ in 0..2 {
@@ -694,7 +694,7 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
 }
 
 #[test]
-fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
+fn link_loss_suspends_and_reconciles() {
     let cases = [
         (Reconciliation::Running, State::Execute(Phase::Grind(JobStep::Run))),
         (Reconciliation::Held, State::Held(Phase::Grind(JobStep::Run))),
@@ -717,7 +717,7 @@ fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
 }
 
 #[test]
-fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
+fn started_job_is_never_restarted() {
     let not_started = |device| Event::Reconciled { device, cycle: 1, outcome: Reconciliation::NotStarted };
     let device = Device::Grinder;
     let reconcile = State::Execute(Phase::Grind(JobStep::Reconcile));
@@ -781,7 +781,7 @@ fn what_was_seen_to_begin_is_never_said_not_to_have_begun() {
 }
 
 #[test]
-fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
+fn machine_reboot_requires_operator() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     let device = Device::Grinder;
@@ -798,7 +798,7 @@ fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
 }
 
 #[test]
-fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
+fn condition_lost_suspends_until_back() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Run)));
     let condition = Condition::Signals;
@@ -815,7 +815,7 @@ fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
 }
 
 #[test]
-fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next_number() {
+fn failed_gate_holds_and_remeasures() {
     let failures = [
         (GateFailure::NoPart, AlarmId::NoPart),
         (GateFailure::Contacts, AlarmId::Contacts),
@@ -838,7 +838,7 @@ fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next
 }
 
 #[test]
-fn figures_outside_their_gates_are_never_judged() {
+fn figures_outside_gates_hold() {
     let bad = [
         (Figures { shift_mm: 9.0, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
         (Figures { turn_rad: 3.1, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
@@ -863,7 +863,7 @@ fn figures_outside_their_gates_are_never_judged() {
 }
 
 #[test]
-fn a_machine_starts_only_while_the_other_is_clear() {
+fn start_requires_other_machine_clear() {
     let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.open_commands.clear();
@@ -874,7 +874,7 @@ fn a_machine_starts_only_while_the_other_is_clear() {
 }
 
 #[test]
-fn a_restarted_program_asks_before_it_goes_on() {
+fn restart_at_every_step() {
     hold_at_every_step("restarted", |run| {
         run.open_commands.clear();
         run.send(Event::Restarted { actor: actor() });
@@ -888,7 +888,7 @@ fn a_restarted_program_asks_before_it_goes_on() {
 }
 
 #[test]
-fn a_machine_at_another_runs_job_is_left_alone_also_by_an_abort() {
+fn abort_spares_machine_of_another_run() {
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Run))).open_commands.clear();
     run.send(Event::Restarted { actor: actor() });
@@ -901,7 +901,7 @@ fn a_machine_at_another_runs_job_is_left_alone_also_by_an_abort() {
 }
 
 #[test]
-fn a_result_that_is_gone_is_measured_once_more_by_a_persons_word() {
+fn declared_over_remeasures_lost_result() {
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect))).open_commands.clear();
     run.send(hold());
@@ -914,7 +914,7 @@ fn a_result_that_is_gone_is_measured_once_more_by_a_persons_word() {
 }
 
 #[test]
-fn a_job_that_a_person_declares_over_is_given_back_before_the_next() {
+fn declared_over_discards_result_first() {
     let over = |device| Event::DeclaredOver { actor: actor(), device, evidence: "it stands at its end".into() };
     for (device, next) in
         [(Device::Grinder, State::Held(Phase::Transfer)), (Device::Cmm, State::Held(Phase::Measure(JobStep::Send)))]
@@ -962,7 +962,7 @@ fn a_job_that_a_person_declares_over_is_given_back_before_the_next() {
 }
 
 #[test]
-fn a_machine_that_goes_astray_again_is_told_to_hold_again() {
+fn uncommanded_motion_holds_again() {
     let device = Device::Cmm;
     let progress = |done| Event::Progressed { device, done, total: 10 };
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -978,7 +978,7 @@ fn a_machine_that_goes_astray_again_is_told_to_hold_again() {
 }
 
 #[test]
-fn what_cannot_be_recorded_is_not_begun() {
+fn record_failure_prevents_start() {
     let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
@@ -988,7 +988,7 @@ fn what_cannot_be_recorded_is_not_begun() {
 }
 
 #[test]
-fn a_command_that_does_not_come_on_record_leaves_the_cell_held_and_not_waiting() {
+fn command_not_on_record_holds_cell() {
     for state in undisturbed_states() {
         let mut run = TestRun::accepted_after_two_passes();
         run.start().run_until(state).open_commands.clear();
@@ -1036,7 +1036,7 @@ fn a_command_that_does_not_come_on_record_leaves_the_cell_held_and_not_waiting()
 }
 
 #[test]
-fn what_fails_again_and_again_holds_the_cell_after_five_times() {
+fn repeated_failure_holds_after_five() {
     let device = Device::Grinder;
     let lost = || Event::LinkLost { device, why: "the check number is wrong".into() };
     let back = || Event::LinkBack { device, boot_id: 7 };
@@ -1118,7 +1118,7 @@ fn what_fails_again_and_again_holds_the_cell_after_five_times() {
 }
 
 #[test]
-fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborted() {
+fn flapping_link_holds_or_aborts_motion() {
     let device = Device::Grinder;
     let (run_step, asked) = (Phase::Grind(JobStep::Run), Phase::Grind(JobStep::Reconcile));
     let lost = || Event::LinkLost { device, why: "the check number is wrong".into() };
@@ -1169,7 +1169,7 @@ fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborte
 }
 
 #[test]
-fn a_stop_that_overtakes_the_preparation_of_a_cycle_ends_with_the_job_of_the_one_before() {
+fn stop_during_prepare_of_next_cycle() {
     let device = Device::Grinder;
     let mut run = TestRun::new(plan(), |_| figures(30.0, 6.0));
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Run)));
@@ -1188,7 +1188,7 @@ fn a_stop_that_overtakes_the_preparation_of_a_cycle_ends_with_the_job_of_the_one
 }
 
 #[test]
-fn a_command_that_was_withdrawn_before_the_stop_does_not_end_it() {
+fn stop_ignores_withdrawn_command() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(stop());
@@ -1199,7 +1199,7 @@ fn a_command_that_was_withdrawn_before_the_stop_does_not_end_it() {
 }
 
 #[test]
-fn a_job_at_which_the_machine_still_is_does_not_end_by_a_persons_word() {
+fn declared_over_with_active_job() {
     let device = Device::Grinder;
     let over = || Event::DeclaredOver { actor: actor(), device, evidence: "it stands".into() };
     let (asked, discard) = (Phase::Grind(JobStep::Reconcile), Phase::Grind(JobStep::Discard));
@@ -1224,7 +1224,7 @@ fn a_job_at_which_the_machine_still_is_does_not_end_by_a_persons_word() {
 }
 
 #[test]
-fn a_job_that_vanishes_is_asked_about_and_ends_by_a_persons_word() {
+fn vanished_job_reconciles_and_holds() {
     for (device, next) in
         [(Device::Grinder, State::Held(Phase::Transfer)), (Device::Cmm, State::Held(Phase::Measure(JobStep::Send)))]
     {
@@ -1274,7 +1274,7 @@ fn a_job_that_vanishes_is_asked_about_and_ends_by_a_persons_word() {
 }
 
 #[test]
-fn a_result_that_a_machine_will_not_forget_is_given_up_by_a_persons_word() {
+fn declared_over_drops_refused_result() {
     let cases = [
         (Phase::Grind(JobStep::Acknowledge), Device::Grinder, State::Held(Phase::Transfer)),
         (Phase::Measure(JobStep::Acknowledge), Device::Cmm, State::Held(Phase::Register)),
@@ -1292,7 +1292,7 @@ fn a_result_that_a_machine_will_not_forget_is_given_up_by_a_persons_word() {
 }
 
 #[test]
-fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
+fn unconfirmed_stop_aborts() {
     let device = Device::Grinder;
     for is_told in [true, false] {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1311,7 +1311,7 @@ fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
 }
 
 #[test]
-fn that_orders_cannot_come_in_is_an_alarm_until_they_can() {
+fn control_lost_raises_alarm() {
     for state in undisturbed_states() {
         let mut run = TestRun::accepted_after_two_passes();
         run.start().run_until(state);
@@ -1326,7 +1326,7 @@ fn that_orders_cannot_come_in_is_an_alarm_until_they_can() {
 }
 
 #[test]
-fn every_event_has_an_answer_in_every_state() {
+fn transition_table_is_complete() {
     let rows = transition_table();
     let states: std::collections::BTreeSet<_> = rows.iter().map(|row| row.state).collect();
     let events: std::collections::BTreeSet<_> = rows.iter().map(|row| row.event.clone()).collect();
@@ -1363,7 +1363,7 @@ fn every_event_has_an_answer_in_every_state() {
 }
 
 #[test]
-fn decisions_are_compared_without_their_texts() {
+fn is_same_decision_ignores_texts() {
     let raised = |id: AlarmId, what: &str| {
         let mut alarm = id.generic_alarm();
         alarm.what = what.to_owned();
@@ -1401,7 +1401,7 @@ fn fingerprint(rows: &[Row]) -> u64 {
 }
 
 #[test]
-fn events_and_commands_are_named_as_they_are_recorded() {
+fn event_and_command_names_match_serde() {
     for event in sample_events(1) {
         assert_eq!(serde_json::to_value(&event).unwrap()["event"], event.name());
     }
@@ -1416,7 +1416,7 @@ fn events_and_commands_are_named_as_they_are_recorded() {
 }
 
 #[test]
-fn every_alarm_says_what_to_do() {
+fn alarm_names_device_code_and_message() {
     let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() });
@@ -1426,7 +1426,7 @@ fn every_alarm_says_what_to_do() {
 }
 
 #[test]
-fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next_start() {
+fn clear_confirmed_lapses_at_next_start() {
     let asked = |commands: &[Command]| commands.iter().any(|c| matches!(c, Command::AskWhetherClear { .. }));
     let word = |device| Event::ClearConfirmed { actor: actor(), device };
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1471,7 +1471,7 @@ fn lost_while_holding<'f>() -> TestRun<'f> {
 }
 
 #[test]
-fn a_machine_that_was_told_to_hold_is_not_called_held_before_it_says_so() {
+fn held_requires_machine_confirmation() {
     let device = Device::Grinder;
     let mut run = lost_while_holding();
     let due = run.cell.next_deadline().unwrap();
@@ -1495,7 +1495,7 @@ fn a_machine_that_was_told_to_hold_is_not_called_held_before_it_says_so() {
 }
 
 #[test]
-fn a_machine_that_stays_out_of_sight_while_it_should_hold_ends_in_the_safe_sequence() {
+fn unconfirmed_hold_aborts() {
     let mut run = lost_while_holding();
     run.now = run.cell.next_deadline().unwrap();
     let commands = run.send(Event::Deadline);
@@ -1504,7 +1504,7 @@ fn a_machine_that_stays_out_of_sight_while_it_should_hold_ends_in_the_safe_seque
 }
 
 #[test]
-fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
+fn reconnect_holds_running_machine() {
     // Suspended by the lost link, then held by a person: the machine may still grind.
     let device = Device::Grinder;
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1526,7 +1526,7 @@ fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
 }
 
 #[test]
-fn a_machine_that_is_seen_held_once_more_as_it_is_told_to_go_on_is_no_news() {
+fn unholding_ignores_stale_machine_held() {
     let device = Device::Grinder;
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
@@ -1545,7 +1545,7 @@ fn a_machine_that_is_seen_held_once_more_as_it_is_told_to_go_on_is_no_news() {
 }
 
 #[test]
-fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_told() {
+fn motion_while_held_commands_hold() {
     let device = Device::Grinder;
     let moves = Event::Progressed { device, done: 17, total: 1000 };
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1570,7 +1570,7 @@ fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_t
 }
 
 #[test]
-fn a_machine_in_manual_mode_holds_what_moves_and_nothing_is_started_beside_it() {
+fn manual_mode_holds_and_blocks_start() {
     let by_hand = |device| Event::NotAutomatic { device, message: "it is in manual mode".into() };
     for device in Device::BOTH {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1614,7 +1614,7 @@ fn a_machine_in_manual_mode_holds_what_moves_and_nothing_is_started_beside_it() 
 }
 
 #[test]
-fn a_suspended_machine_in_manual_mode_does_not_go_on_by_itself() {
+fn manual_mode_holds_suspended_machine() {
     let (device, condition) = (Device::Grinder, Condition::Supplies);
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
@@ -1626,7 +1626,7 @@ fn a_suspended_machine_in_manual_mode_does_not_go_on_by_itself() {
 }
 
 #[test]
-fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
+fn motion_of_idle_machine_holds_both() {
     let (moves, strays) = (Device::Grinder, Device::Cmm);
     let progress = Event::Progressed { device: strays, done: 3, total: 10 };
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1653,7 +1653,7 @@ fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
 }
 
 #[test]
-fn a_job_without_progress_is_told_and_then_held() {
+fn progress_timeout_alarms_then_holds() {
     let device = Device::Grinder;
     let run_state = State::Execute(Phase::Grind(JobStep::Run));
     let due = |run: &TestRun<'_>| run.cell.next_deadline().unwrap() - run.now;
@@ -1687,7 +1687,7 @@ fn a_job_without_progress_is_told_and_then_held() {
 }
 
 #[test]
-fn a_command_that_has_waited_is_given_only_where_it_is_still_wanted() {
+fn wants_rejects_outdated_commands() {
     let device = Device::Grinder;
     let start = Command::StartMachine { device, cycle: 1 };
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1828,7 +1828,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 2000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn whatever_comes_the_promises_hold(choices in prop::collection::vec((any::<u16>(), prop::bool::weighted(0.8), 0_u8..3), 0..120)) {
+    fn invariants_under_random_events(choices in prop::collection::vec((any::<u16>(), prop::bool::weighted(0.8), 0_u8..3), 0..120)) {
         play_random_events(&choices)?;
     }
 }

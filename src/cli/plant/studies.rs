@@ -424,7 +424,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_value_goes_with_every_other_into_the_recipe() {
+    fn variations_form_full_factorial() {
         let vary = ["a.b=1,2", "c=\"x\",true,0.5"].map(|text| variation(text).unwrap());
         let sets = every_one(&vary);
         assert_eq!(sets.len(), 6);
@@ -440,7 +440,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_have_the_interval_of_the_book() {
+    fn wilson_interval_matches_newcombe() {
         // 81 of 263: 0.2553 to 0.3662 (Newcombe 1998, table I, method 3).
         let [low, high] = wilson(81, 263);
         assert!((low - 25.53).abs() < 0.01 && (high - 36.62).abs() < 0.01, "{low} {high}");

@@ -2,9 +2,9 @@
 //! with the same functions.
 //!
 //! ```text
-//!  Door      the cell opens it in its run folder; it accepts one client after another
-//!  Caller    an accepted client: its user, as identified by the operating system, and its two directions
-//!  Knocked   the side of the client: the half that it reads from, and the half that it writes to
+//!  Endpoint                 the cell opens it in its run folder; it accepts one client after another
+//!  Client                   an accepted client: its user, as identified by the operating system, and its two directions
+//!  CellReader, CellWriter   the side of the client: the half that it reads from, and the half that it writes to
 //! ```
 
 #[cfg(unix)]
@@ -26,11 +26,11 @@ mod tests {
     use super::*;
 
     /// Echoes one line to each of `clients` clients.
-    async fn echo(mut door: Endpoint, clients: usize) {
+    async fn echo(mut endpoint: Endpoint, clients: usize) {
         for _ in 0..clients {
-            let caller = door.accept().await.unwrap();
-            assert!(caller.actor().unwrap().station.ends_with(&format!("process {}", std::process::id())));
-            let (says, mut tell) = caller.into_halves();
+            let client = endpoint.accept().await.unwrap();
+            assert!(client.actor().unwrap().station.ends_with(&format!("process {}", std::process::id())));
+            let (says, mut tell) = client.into_halves();
             let mut line = String::new();
             // A client that only checks for a listener sends nothing.
             if BufReader::new(says).read_line(&mut line).await.is_ok_and(|read| read > 0) {
@@ -40,12 +40,12 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn a_line_gets_an_answer_while_the_door_is_open() {
+    async fn door_answers_lines_while_open() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path();
         assert!(!is_listening(folder) && exchange_line(folder, b"x\n", Duration::from_secs(5)).is_err());
-        let door = Endpoint::open(folder).unwrap();
-        let clients = tokio::spawn(echo(door, 3));
+        let endpoint = Endpoint::open(folder).unwrap();
+        let clients = tokio::spawn(echo(endpoint, 3));
         assert!(is_listening(folder));
         assert_eq!(exchange_line(folder, b"hold\n", Duration::from_secs(5)).unwrap(), "hold\n");
         let (mut says, mut tell) = open_connection(folder).await.unwrap();

@@ -11,31 +11,31 @@ use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, ReadHalf, WriteHalf};
 use tokio::net::windows::named_pipe::{ClientOptions, NamedPipeClient, NamedPipeServer};
 
 /// Windows error code ERROR_PIPE_BUSY: every instance of the pipe has a client, and the next instance is not ready yet.
-const ALL_TAKEN: i32 = 231;
+const PIPE_BUSY: i32 = 231;
 /// Timeout of a client that waits for a free instance, and the pause between two attempts.
-const FOR_AN_END: Duration = Duration::from_secs(2);
-const BETWEEN_TRIES: Duration = Duration::from_millis(20);
+const PIPE_WAIT_TIMEOUT: Duration = Duration::from_secs(2);
+const PIPE_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Data from an accepted client.
-pub(crate) type CallerSays = ReadHalf<NamedPipeServer>;
+pub(crate) type ClientReader = ReadHalf<NamedPipeServer>;
 /// Data to an accepted client.
-pub(crate) type TellCaller = WriteHalf<NamedPipeServer>;
+pub(crate) type ClientWriter = WriteHalf<NamedPipeServer>;
 /// Data from the cell, at the client.
-pub(crate) type CellSays = ReadHalf<NamedPipeClient>;
+pub(crate) type CellReader = ReadHalf<NamedPipeClient>;
 /// Data to the cell, at the client.
-pub(crate) type TellCell = WriteHalf<NamedPipeClient>;
+pub(crate) type CellWriter = WriteHalf<NamedPipeClient>;
 
 /// Named pipe that accepts clients.
-pub(crate) struct Door {
+pub(crate) struct Endpoint {
     name: String,
     /// Instance of the pipe for the next client.
     next: NamedPipeServer,
 }
 
-impl Door {
+impl Endpoint {
     /// Opens the pipe of a run folder.
     pub(crate) fn open(folder: &Path) -> io::Result<Self> {
-        let name = name_of(folder)?;
+        let name = pipe_name(folder)?;
         let next = regrind_windows::listen(&name, true).map_err(|error| match error.kind() {
             // Windows reports a name in use as access denied.
             io::ErrorKind::PermissionDenied => {
@@ -52,56 +52,56 @@ impl Door {
     }
 
     /// Returns `None`: a pipe is not watched, because nobody can remove it.
-    pub(crate) fn mark(&self) -> Option<Mark> {
+    pub(crate) fn mark(&self) -> Option<EndpointIdentity> {
         None
     }
 
     /// Waits for the next client and returns it.
-    pub(crate) async fn let_in(&mut self) -> io::Result<Caller> {
+    pub(crate) async fn accept(&mut self) -> io::Result<Client> {
         if let Err(error) = self.next.connect().await {
             // The client disconnected before it was accepted; the instance can serve the next one.
             let _ = self.next.disconnect();
             return Err(error);
         }
         let next = regrind_windows::listen(&self.name, false)?;
-        Ok(Caller(std::mem::replace(&mut self.next, next)))
+        Ok(Client(std::mem::replace(&mut self.next, next)))
     }
 }
 
-/// Identity of a door. It has no value on Windows, where no door is watched.
+/// Identity of a endpoint. It has no value on Windows, where no endpoint is watched.
 #[derive(Clone)]
-pub(crate) enum Mark {}
+pub(crate) enum EndpointIdentity {}
 
-impl Mark {
+impl EndpointIdentity {
     pub(crate) fn is_in_place(&self) -> bool {
         match *self {}
     }
 
-    pub(crate) fn open_again(&self) -> io::Result<Door> {
+    pub(crate) fn open_again(&self) -> io::Result<Endpoint> {
         match *self {}
     }
 }
 
-/// Does nothing: on Windows there is no door outside a run folder.
-pub(crate) fn take_away_at(_: &Path) {}
+/// Does nothing: on Windows there is no endpoint outside a run folder.
+pub(crate) fn remove_endpoint_at(_: &Path) {}
 
-/// Returns false: on Windows there is no door outside a run folder.
-pub(crate) fn is_open_at(_: &Path) -> bool {
+/// Returns false: on Windows there is no endpoint outside a run folder.
+pub(crate) fn is_listening_at(_: &Path) -> bool {
     false
 }
 
-/// Returns an error: on Windows there is no door outside a run folder.
-pub(crate) fn ask_at(_: &Path, _: &[u8], _: Duration) -> io::Result<String> {
+/// Returns an error: on Windows there is no endpoint outside a run folder.
+pub(crate) fn exchange_line_at(_: &Path, _: &[u8], _: Duration) -> io::Result<String> {
     Err(io::ErrorKind::NotFound.into())
 }
 
 /// Does nothing: a pipe ends with its last instance, and is in no folder.
-pub(crate) fn take_away(_: &Path) {}
+pub(crate) fn remove_endpoint(_: &Path) {}
 
 /// Accepted client.
-pub(crate) struct Caller(NamedPipeServer);
+pub(crate) struct Client(NamedPipeServer);
 
-impl Caller {
+impl Client {
     /// Returns the person at the other end, as identified by the operating system. It lets only this user connect.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let process = regrind_windows::client_process(&self.0);
@@ -109,18 +109,18 @@ impl Caller {
         Ok(Actor { name: regrind_windows::own_name()?, station })
     }
 
-    pub(crate) fn into_halves(self) -> (CallerSays, TellCaller) {
+    pub(crate) fn into_halves(self) -> (ClientReader, ClientWriter) {
         tokio::io::split(self.0)
     }
 }
 
 /// Returns false without a check: a process can be suspended here only by a debugger, whose user knows about it.
-pub(crate) fn has_gone(_: &CallerSays) -> bool {
+pub(crate) fn is_closed(_: &ClientReader) -> bool {
     false
 }
 
 /// Returns the name of the pipe of a run folder. Different paths to the same folder give the same name.
-fn name_of(folder: &Path) -> io::Result<String> {
+fn pipe_name(folder: &Path) -> io::Result<String> {
     let whole = std::fs::canonicalize(folder)?;
     let digest = Sha256::digest(whole.as_os_str().as_encoded_bytes());
     let digits: String = digest[..16].iter().map(|byte| format!("{byte:02x}")).collect();
@@ -128,16 +128,16 @@ fn name_of(folder: &Path) -> io::Result<String> {
 }
 
 /// Returns true if a process listens on the pipe of a run folder.
-pub(crate) fn is_open(folder: &Path) -> bool {
-    let Ok(name) = name_of(folder) else { return false };
-    on_a_thread_of_its_own(async move { connected(&name).await.map(drop) }).is_ok()
+pub(crate) fn is_listening(folder: &Path) -> bool {
+    let Ok(name) = pipe_name(folder) else { return false };
+    block_on_thread(async move { connect_pipe(&name).await.map(drop) }).is_ok()
 }
 
 /// Sends a line to the cell of a run folder, and returns the line of its answer. `patience` is the timeout.
-pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
-    let (name, line) = (name_of(folder)?, line.to_owned());
-    on_a_thread_of_its_own(async move {
-        let mut pipe = BufReader::new(connected(&name).await?);
+pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
+    let (name, line) = (pipe_name(folder)?, line.to_owned());
+    block_on_thread(async move {
+        let mut pipe = BufReader::new(connect_pipe(&name).await?);
         pipe.write_all(&line).await?;
         let mut text = String::new();
         tokio::time::timeout(patience, pipe.read_line(&mut text)).await??;
@@ -146,28 +146,26 @@ pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<
 }
 
 /// Opens a lasting connection to the cell of a run folder.
-pub(crate) async fn knock(folder: &Path) -> io::Result<(CellSays, TellCell)> {
-    connected(&name_of(folder)?).await.map(tokio::io::split)
+pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
+    connect_pipe(&pipe_name(folder)?).await.map(tokio::io::split)
 }
 
-async fn connected(name: &str) -> io::Result<NamedPipeClient> {
+async fn connect_pipe(name: &str) -> io::Result<NamedPipeClient> {
     let began = Instant::now();
     loop {
         match ClientOptions::new().open(name) {
             Ok(pipe) if regrind_windows::is_of_this_user(&pipe)? => return Ok(pipe),
             Ok(_) => return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the pipe belongs to another user")),
-            Err(error) if error.raw_os_error() == Some(ALL_TAKEN) && began.elapsed() < FOR_AN_END => {}
+            Err(error) if error.raw_os_error() == Some(PIPE_BUSY) && began.elapsed() < PIPE_WAIT_TIMEOUT => {}
             Err(error) => return Err(error),
         }
-        tokio::time::sleep(BETWEEN_TRIES).await;
+        tokio::time::sleep(PIPE_RETRY_INTERVAL).await;
     }
 }
 
 /// Runs a future to its end from synchronous code. Only asynchronous code can stop waiting before a pipe answers, and
 /// the caller can itself be part of a runtime. The future therefore gets a thread and a runtime of its own.
-fn on_a_thread_of_its_own<T: Send + 'static>(
-    what: impl Future<Output = io::Result<T>> + Send + 'static,
-) -> io::Result<T> {
+fn block_on_thread<T: Send + 'static>(what: impl Future<Output = io::Result<T>> + Send + 'static) -> io::Result<T> {
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)
     })?;
@@ -179,24 +177,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_has_one_name_however_its_folder_is_called() {
+    fn pipe_name_ignores_path_spelling() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path().join("Run");
         std::fs::create_dir(&folder).unwrap();
         for same in [folder.join("."), home.path().join("run"), folder.join("..").join("RUN")] {
-            assert_eq!(name_of(&same).unwrap(), name_of(&folder).unwrap(), "{same:?}");
+            assert_eq!(pipe_name(&same).unwrap(), pipe_name(&folder).unwrap(), "{same:?}");
         }
-        assert_ne!(name_of(home.path()).unwrap(), name_of(&folder).unwrap());
-        assert!(name_of(&home.path().join("absent")).is_err());
+        assert_ne!(pipe_name(home.path()).unwrap(), pipe_name(&folder).unwrap());
+        assert!(pipe_name(&home.path().join("absent")).is_err());
     }
 
     #[tokio::test]
-    async fn a_door_that_is_open_is_not_opened_by_another_program() {
+    async fn door_refuses_second_open() {
         let home = tempfile::tempdir().unwrap();
-        let door = Door::open(home.path()).unwrap();
-        let refused = Door::open(home.path()).err().expect("a second door").to_string();
+        let endpoint = Endpoint::open(home.path()).unwrap();
+        let refused = Endpoint::open(home.path()).err().expect("a second endpoint").to_string();
         assert!(refused.contains("another program"), "{refused}");
-        drop(door);
-        Door::open(home.path()).unwrap();
+        drop(endpoint);
+        Endpoint::open(home.path()).unwrap();
     }
 }

@@ -97,14 +97,14 @@ mod tests {
     }
 
     #[test]
-    fn the_contact_of_a_wheel_is_its_chord() {
+    fn contact_width_is_wheel_chord() {
         // 20 um deep with 12.5 mm: half the chord is sqrt(12.5^2 - 12.48^2).
         assert!((contact_width_mm(12.5, 0.02) - 2.0 * (12.5f64.powi(2) - 12.48f64.powi(2)).sqrt()).abs() < 1e-12);
         assert_eq!((contact_width_mm(12.5, 0.0), contact_width_mm(0.0, 1.0)), (0.0, 0.0));
     }
 
     #[test]
-    fn the_spacing_is_that_of_the_sparser_direction() {
+    fn point_spacing_of_sparser_direction() {
         let found = point_spacing_mm(&grid(60, 30, [102.0 / 59.0, 62.0 / 29.0]));
         assert!((found - 62.0 / 29.0).abs() < 1e-12, "{found}");
         assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cutoff_must_suit_wheel_and_points() {
+    fn check_cutoff_of_contact_and_spacing() {
         let contact = contact_width_mm(12.5, 0.02);
         assert!(check_cutoff(5.0, contact, 2.14).is_ok());
         let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else {

@@ -535,7 +535,7 @@ mod tests {
     }
 
     #[test]
-    fn from_nothing_the_mean_of_all_passes_is_taken_back() {
+    fn adaptive_gain_is_mean_of_passes() {
         // An error far above the noise is used in full; its gains are those of a plain mean, slightly larger for a
         // machine that may drift.
         let mut known = begin(GainRule::Adaptive, None);
@@ -549,7 +549,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_stands_out_of_the_scatter_nothing_is_taken_back() {
+    fn gain_is_zero_within_noise() {
         // Known noise of 1 um in one band: of 2 um rms Wiener's share is 1 - 1.02 / 4, of 0.5 um it is 0.
         let gain = |rms_mm: f64| after(&begin(GainRule::Adaptive, Some(1e-3)), &none(), &map(|_| rms_mm)).gains()[0][1];
         assert!((gain(2e-3) - (1.0 - (1.0 + PROCESS_NOISE) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
@@ -568,7 +568,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scatter_that_was_stated_as_a_whole_is_a_guess_in_each_band_until_passes_tell() {
+    fn band_noise_prior_from_repeatability() {
         // Three bands, a third of the stated 1 um^2 in each: of a mean with this square 1 - (1 - 1 / e) remains, of
         // one far above it nearly all.
         let known = begin(GainRule::Wavelength, Some(1e-3));
@@ -589,7 +589,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_has_changed_is_believed_at_once() {
+    fn adaptive_gain_rises_after_change() {
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=4 {
             known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
@@ -604,7 +604,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fixed_gain_stays_what_it_is() {
+    fn fixed_gain_stays_constant() {
         for share in [0.0, 0.8, 1.2] {
             let mut known = begin(GainRule::Fixed(share), None);
             let mut correction = none();
@@ -624,7 +624,7 @@ mod tests {
     }
 
     #[test]
-    fn a_response_below_one_is_made_up_for() {
+    fn response_below_one_is_compensated() {
         let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
         let answer = Response {
             slope: 0.9,
@@ -655,7 +655,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_ground_as_it_was_commanded_teaches_nothing() {
+    fn learning_ignores_wrong_response_sense() {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
         let asked = none().compensating(&first, None);
@@ -680,7 +680,7 @@ mod tests {
     }
 
     #[test]
-    fn a_better_response_counts_for_what_is_still_seen() {
+    fn response_estimate_corrects_next_passes() {
         // A part that answers with 0.8 of the command. By hand, in units of the error: the second pass leaves 0.2 and
         // yields the response. With a gain of 0.505 the mean is 0.901, of which 0.987 remains for a noise variance of
         // 0.2^2 / 2.02: the third pass leaves 0.1105. Then 0.344, 0.935, 0.9945 and 0.0701. The grid of the error is
@@ -722,7 +722,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scatter_that_was_stated_too_small_is_found_out() {
+    fn learning_raises_small_repeatability() {
         let mut known = begin(GainRule::Adaptive, Some(1e-4));
         for pass in 1..=5 {
             known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
@@ -751,7 +751,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_shared_out_over_the_bands_as_the_filter_does_it() {
+    fn band_noise_split_matches_filter() {
         // White noise leaves at a place the sum of the squares of what one point leaves at all places: one point in
         // the middle, and points everywhere for the mean that includes the border.
         let known = begin(GainRule::Wavelength, None);
@@ -782,7 +782,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_and_no_scatter_are_no_trouble() {
+    fn learning_handles_zero_error_and_noise() {
         for repeatability_mm in [None, Some(0.0), Some(1e-3)] {
             for rule in [GainRule::Wavelength, GainRule::Adaptive, GainRule::Fixed(1.0)] {
                 let mut known = begin(rule, repeatability_mm);
@@ -806,7 +806,7 @@ mod tests {
     }
 
     #[test]
-    fn no_pass_goes_below_its_scallops_and_they_count_once() {
+    fn forecast_counts_scallops_once() {
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=3 {
             known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
@@ -825,7 +825,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_cannot_be_are_seen() {
+    fn learning_state_detects_bad_values() {
         let known = after(&begin(GainRule::Wavelength, None), &none(), &map(|[x, _]| 1e-3 * x));
         assert!(known.is_valid());
         let broken = |change: fn(&mut LearningState)| {

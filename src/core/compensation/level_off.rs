@@ -80,7 +80,7 @@ mod tests {
     const GRID: Grid = Grid { columns: 31, rows: 9, first_mm: [0.0, 0.0], spacing_mm: [1.0, 2.0] };
 
     #[test]
-    fn the_nearest_is_the_nearest() {
+    fn nearest_known_matches_brute_force() {
         let seeds = [0, 40, 95, 200, 260];
         let known: Vec<bool> = (0..GRID.len()).map(|k| seeds.contains(&k)).collect();
         let far = |a: usize, b: usize| {
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slope_goes_to_nothing_within_the_distance() {
+    fn level_off_fades_slope_within_distance() {
         let known: Vec<bool> = (0..GRID.len()).map(|k| k % GRID.columns <= 10).collect();
         let values = (0..GRID.len()).map(|k| if known[k] { 0.1 * GRID.place_mm(k)[0] } else { 0.0 }).collect();
         let slopes = vec![[0.1, 0.0]; GRID.len()];

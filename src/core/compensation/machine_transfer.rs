@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn of_two_machines_it_is_what_is_worked_out_by_hand() {
+    fn shared_learning_two_machines_by_hand() {
         // One band; means of a power of 5 and 5, v = 0.5 * 2 = 1: P = 4. A share of 0.25, twice (one comparison):
         // k = 0.5, t = c = 2, w = 1/3, 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
         let flat = |value: f64| machine(GainRule::Adaptive, vec![value; GRID.len()], [0.5, 2.0]);
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn machines_that_have_nothing_in_common_teach_nothing_and_machines_that_are_alike_all() {
+    fn shared_learning_by_machine_similarity() {
         for rule in [GainRule::Adaptive, GainRule::Wavelength] {
             let other = machine(rule, field(1), [0.5, 1e-9]);
             let begun = |alike: &MachineSimilarity| fresh(rule).seeded_from(&[&other], alike, GRID).unwrap();
@@ -371,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn how_much_machines_differ_is_found_again() {
+    fn machine_similarity_is_recovered() {
         let (common, rule) = (field(7), GainRule::Wavelength);
         for share in [0.0, 0.01, 0.1, 0.5, 1.0f64] {
             let mut alike = MachineSimilarity::default();
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_of_machines_does_not_matter() {
+    fn shared_learning_ignores_machine_order() {
         let rule = GainRule::Wavelength;
         let machines: Vec<_> =
             (0..4).map(|k| machine(rule, field(k), [0.3 + 0.2 * k as f64, 1e-2 * (k + 1) as f64])).collect();
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn own_passes_soon_outweigh_what_others_taught() {
+    fn own_passes_outweigh_shared_learning() {
         // However certain the others are.
         let rule = GainRule::Adaptive;
         let other = machine(rule, vec![5.0; GRID.len()], [0.02, 1e-4]);
@@ -441,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_machine_was_told_is_not_its_own_word() {
+    fn borrowed_learning_is_not_shared() {
         let rule = GainRule::Adaptive;
         let (one, mut told) = (machine(rule, field(1), [0.1, 1e-3]), machine(rule, field(1), [0.1, 1e-3]));
         told.bands[0].borrowed = 0.9;
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn other_grids_are_taken_and_other_bands_left_alone() {
+    fn shared_learning_resamples_other_grids() {
         let (rule, wave) = (GainRule::Wavelength, |[x, y]: [f64; 2]| (0.2 * x).sin() + 0.05 * y);
         let on = |grid: Grid| (0..grid.len()).map(|k| wave(grid.place_mm(k))).collect::<Vec<f64>>();
         let finer = Grid { columns: 81, rows: 61, spacing_mm: [0.5, 0.5], ..GRID };
@@ -474,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_cost_more_than_it_tells_is_not_taught() {
+    fn shared_learning_refuses_unfit_state() {
         let honest = machine(GainRule::Wavelength, field(1).iter().map(|v| 1e-3 * v).collect(), [0.3, 1e-8]);
         assert_eq!(honest.transfer_obstacle(), None);
         assert_eq!(fresh(GainRule::Wavelength).transfer_obstacle(), None);
@@ -495,7 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn a_response_that_was_told_is_not_told_again() {
+    fn borrowed_response_is_not_shared() {
         let rule = GainRule::Fixed(1.0);
         let values: Vec<f64> = field(3).iter().map(|v| 1e-3 * v).collect();
         let mut own = machine(rule, values.clone(), [0.3, 1e-8]);
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn waves_that_nobody_compared_are_not_taken_over() {
+    fn bands_without_comparison_not_shared() {
         let compared = |is_own, share, whole| Comparison { is_own, shares: vec![(5.0, Some(share))], whole };
         let mut alike = MachineSimilarity { comparisons: vec![compared(false, 0.02, 0.01)] };
         assert_eq!(alike.own_share(2.5), None);

@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_taken_back_and_the_pass_cuts_everywhere() {
+    fn next_pass_reverses_error_without_air() {
         let step = next(&first(), &map([0.004, -0.012, 0.0, 0.002]), 1.0).unwrap();
         assert_eq!(step.correction.values_mm, [-0.004, 0.012, 0.0, -0.002]);
         assert_eq!((step.correction.cycle, step.depth_mm, step.air_share), (2, 0.0125, 0.0));
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn corrections_add_up_and_the_gain_counts() {
+    fn corrections_accumulate_with_gain() {
         let once = next(&first(), &map([0.004; 4]), 0.5).unwrap();
         let twice = next(&once.correction, &map([0.002; 4]), 0.5).unwrap();
         assert!(twice.correction.values_mm.iter().all(|v| (v + 0.003).abs() < 1e-15));
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_are_kept() {
+    fn next_pass_limits_depth_and_budget() {
         let far = next(&first(), &map([0.0, 0.051, 0.0, 0.0]), 1.0);
         assert!(matches!(far, Err(NextPassError::TooLarge { x_mm: 1.0, y_mm: 0.0, .. })), "{far:?}");
         // 49 um where it stands proud, and 13.5 um everywhere.
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn the_normal_tail_is_that_of_the_tables() {
+    fn normal_tail_matches_tables() {
         for (z, tail) in [(0.0, 0.5), (1.0, 0.158_655_254), (-1.0, 0.841_344_746), (3.0, 0.001_349_898), (9.0, 0.0)] {
             assert!((normal_tail(z) - tail).abs() < 1e-7, "{z}");
         }

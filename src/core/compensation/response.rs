@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn every_way_to_answer_is_told() {
+    fn response_classifies_every_sense() {
         assert_eq!(answered(|x, y| -error(x, y)).sense, ResponseKind::AsCommanded);
         assert_eq!(answered(|x, y| -0.8 * error(x, y)).sense, ResponseKind::AsCommanded);
         assert_eq!(answered(error).sense, ResponseKind::Flipped);
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_change_within_the_scatter_tells_nothing() {
+    fn response_unclear_within_noise() {
         let flat = map(|_, _| 1e-5);
         let none = Correction::zero(GRID, 0.0);
         assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, ResponseKind::Unclear);

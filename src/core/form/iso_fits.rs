@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn of_one_form_it_is_what_the_figures_of_one_form_are() {
+    fn iso_fits_match_iso_10110() {
         let aperture = Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 20.0 };
         for places in [disc(1.3), disc(4.0), disc(8.0)] {
             let fits = IsoFits::new(&places, Some([0.0; 2])).unwrap();
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_changes_nothing_and_a_sphere_has_power_alone() {
+    fn iso_fits_of_motion_and_sphere() {
         let places = disc(2.0);
         let fits = IsoFits::new(&places, None).unwrap();
         let of = |form: &dyn Fn(f64, f64) -> f64| {
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_places_and_places_on_a_line_have_no_figures() {
+    fn iso_fits_refuse_few_or_collinear() {
         assert!(IsoFits::new(&disc(2.0)[..11], None).is_none());
         let line: Vec<[f64; 2]> = (0..40).map(|k| [f64::from(k), 0.5 * f64::from(k)]).collect();
         assert!(IsoFits::new(&line, None).is_none() && IsoFits::new(&[[3.0; 2]; 40], None).is_none());

@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn zernike_terms_are_those_of_the_surfaces_of_that_name() {
+    fn zernike_basis_matches_surface() {
         use crate::surface::analytic::{Zernike, ZernikeDefinition, ZernikeNormalisation};
         for numbering in [ZernikeNumbering::Fringe, ZernikeNumbering::Noll, ZernikeNumbering::Ansi] {
             let basis = PolynomialBasis::Zernike { numbering, centre_mm: [1.0, -2.0], radius_mm: 20.0 };

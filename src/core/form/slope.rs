@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_has_its_slope_at_every_length() {
+    fn slope_of_plane_at_every_length() {
         let all = vec![true; NODES];
         for length in [0.1, 2.0, 3.0, 12.0] {
             let found = slope_of(|x, y| 3e-6 * x - 4e-6 * y + 1.0, &all, length).unwrap();
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wave_is_flattened_by_the_integration_as_it_should() {
+    fn slope_of_wave_attenuated_by_sinc() {
         // sin(kx) over a length L has the slope k cos(kx) sinc(kL/2); its rms over whole waves is k sinc / sqrt 2.
         let (k, all) = (std::f64::consts::TAU / 12.0, vec![true; NODES]);
         for length in [2.0, 4.0, 6.0] {
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_measured_has_no_slope() {
+    fn slope_skips_invalid_nodes() {
         let mut valid = vec![true; NODES];
         valid[15 * 41 + 20] = false;
         let spike = |x: f64, y: f64| if (x, y) == (0.0, 0.0) { 1.0 } else { 0.0 };

@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_has_its_slope_at_every_place() {
+    fn slopes_at_match_plane() {
         for (places, wanted) in
             [(grid(1.0), None), (grid(2.0), Some(9.0)), (scattered(300), None), (scattered(60), None)]
         {
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wave_is_flattened_as_a_difference_over_the_length_flattens_it() {
+    fn slopes_at_attenuate_wave_by_sinc() {
         // sin(kx) over a length L has the slope k cos(kx) sinc(kL/2).
         let k = std::f64::consts::TAU / 20.0;
         for (places, wanted) in [(grid(1.0), 2.0), (grid(1.0), 5.0), (grid(1.0), 8.0), (scattered(2400), 6.0)] {
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_far_apart_have_slopes_over_as_long_as_they_need_and_few_places_have_none() {
+    fn slopes_at_scan_lines_and_few_points() {
         // A scan: 0.2 mm along, 4 mm across.
         let scan: Vec<[f64; 2]> =
             (0..11).flat_map(|j| (0..301).map(move |i| [0.2 * f64::from(i), 4.0 * f64::from(j)])).collect();

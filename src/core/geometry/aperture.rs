@@ -423,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn places_by_hand() {
+    fn contains_by_hand() {
         let inside = |a: &Aperture, x, y| a.contains(x, y);
         let [rectangle, circle, ellipse, annulus, l] = &all_kinds()[..] else { panic!() };
         assert!(inside(rectangle, 2.5, -1.5) && !inside(rectangle, 2.6, -2.0));
@@ -455,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn the_distance_is_that_to_the_nearest_place_of_the_outline() {
+    fn aperture_distance_matches_outline() {
         for aperture in all_kinds() {
             let outline = aperture.outline_mm(20_000);
             assert!(outline.len() >= 20_000);
@@ -469,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_and_reach_hold_the_outline_and_touch_it() {
+    fn aperture_bounds_match_outline() {
         for aperture in all_kinds() {
             let [least, most] = aperture.bounds();
             let outline = aperture.outline_mm(4000);
@@ -484,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_outlines_are_refused_by_name() {
+    fn aperture_refuses_degenerate_outline() {
         let circle = |radius_mm| Aperture::Circle { centre_mm: [0.0; 2], radius_mm }.validate();
         for bad in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e7] {
             assert!(matches!(circle(bad), Err(ApertureError::Size { key: "radius_mm", .. })), "{bad}");
@@ -499,7 +499,7 @@ mod tests {
     }
 
     #[test]
-    fn polygons_that_are_not_simple_are_refused() {
+    fn aperture_refuses_non_simple_polygon() {
         let polygon = |corners: &[[f64; 2]]| Aperture::Polygon { corners_mm: corners.to_vec() }.validate();
         assert_eq!(polygon(&[[0.0, 0.0], [1.0, 0.0]]), Err(ApertureError::CornerCount { count: 2 }));
         let closed = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.0]];
@@ -517,7 +517,7 @@ mod tests {
     }
 
     #[test]
-    fn kinds_are_read_by_name_with_the_centre_left_out() {
+    fn aperture_kinds_read_from_toml() {
         let read = |text: &str| toml::from_str::<Aperture>(text);
         let circle = Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 30.0 };
         assert_eq!(read("kind = 'circle'\nradius_mm = 30").unwrap(), circle);

@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_of_many_is_named_and_none_of_a_spread_cloud() {
+    fn far_off_names_lone_point() {
         let mut points: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect();
         assert_eq!(find_far_off(&points), None);
         points[17] = Point::new(1e6, 0.0, 0.0);

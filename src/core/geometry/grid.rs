@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_grid_reaches_from_border_to_border() {
+    fn grid_over_reaches_borders() {
         let grid = Grid::over([[-1.0, 2.0], [3.0, 5.5]].into_iter(), 1.0).unwrap();
         assert_eq!((grid.columns, grid.rows), (5, 5));
         assert_eq!(grid.place_mm(0), [-1.0, 2.0]);
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_node_is_within_half_a_cell() {
+    fn grid_nearest_node_and_resample() {
         let grid = Grid { columns: 3, rows: 2, first_mm: [-1.0, 5.0], spacing_mm: [1.0, 2.0] };
         for (place, node) in [([-1.4, 5.9], Some(0)), ([0.6, 6.1], Some(5)), ([1.6, 5.0], None), ([0.0, 3.9], None)] {
             assert_eq!(grid.nearest(place), node, "{place:?}");
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn values_between_nodes_are_bilinear_and_level_off_outside() {
+    fn grid_interpolates_bilinearly() {
         let grid = Grid { columns: 3, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 2.0] };
         let plane = |[x, y]: [f64; 2]| 1.0 + 2.0 * x - 0.5 * y;
         let values: Vec<f64> = (0..6).map(|k| plane(grid.place_mm(k))).collect();

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_in_order_and_the_same_grid_shuffled() {
+    fn recognise_grid_of_shuffled_points() {
         let points = grid(101, 57, 0.1133, 0.124);
         let order = recognise_grid(&points).unwrap();
         assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_first_is_a_grid_too() {
+    fn recognise_grid_columns_first() {
         let mut points = grid(40, 30, 1.0, 2.0);
         points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
         let order = recognise_grid(&points).unwrap();
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn a_round_aperture_leaves_holes() {
+    fn recognise_grid_with_holes() {
         let points: Vec<_> =
             grid(81, 81, 0.5, 0.5).into_iter().filter(|p| (p.x - 12.7).hypot(p.y - 21.1) <= 20.001).collect();
         let order = recognise_grid(&points).unwrap();
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_to_a_file_does_not_hide_the_grid() {
+    fn recognise_grid_of_rounded_points() {
         let mut points = grid(333, 222, 102.0 / 332.0, 62.0 / 221.0);
         for p in &mut points {
             p.x = (p.x * 1e4).round() / 1e4;
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_grid_is_not_taken_for_one() {
+    fn recognise_grid_refuses_non_grids() {
         let mut scattered = grid(50, 50, 1.0, 1.0);
         for (k, p) in scattered.iter_mut().enumerate() {
             p.x += 0.3 * (k as f64 * 1.7).sin();

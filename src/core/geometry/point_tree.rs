@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_nearest_are_those_of_asking_every_point() {
+    fn nearest_points_match_brute_force() {
         let at = |k: usize| [0.754_877_666, 0.569_840_291, 0.381_966_011].map(|step| (k as f64 * step).fract()).into();
         let mut points: Vec<Point> = (0..3000).map(at).collect();
         // Some points twice, and many at one place.
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn few_points_and_strange_ones_are_no_trouble() {
+    fn nearest_of_few_and_non_finite_points() {
         assert_eq!(PointTree::new([].into_iter()).nearest(&Point::origin(), 4).count(), 0);
         let two = PointTree::new([Point::origin(), Point::new(3.0, 0.0, 0.0)].into_iter());
         assert_eq!(two.nearest(&Point::new(2.0, 0.0, 0.0), 4).collect::<Vec<_>>(), [(1, 1.0), (0, 4.0)]);

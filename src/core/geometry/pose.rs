@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_about_z_by_hand() {
+    fn exp_rotates_quarter_about_z() {
         // The screw of pitch zero about the vertical line through (1, 0): v = -omega x q.
         let pose = Pose::exp(&Twist::new(0.0, -PI / 2.0, 0.0, 0.0, 0.0, PI / 2.0));
         let moved = pose.transform_point(&Point::new(2.0, 0.0, 5.0));
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_is_a_rotation_and_its_inverse_is_exp_of_the_opposite() {
+    fn exp_inverse_is_exp_of_opposite() {
         for m in twists() {
             let pose = Pose::exp(&m);
             assert!((pose.rotation * pose.rotation.transpose() - Matrix3::identity()).amax() < 1e-15);
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_round_trip_and_bad_rows_are_named() {
+    fn pose_from_rows_round_trip() {
         let pose = Pose::exp(&Twist::new(1.0, 2.0, 3.0, 0.1, 0.2, -0.3));
         let read = Pose::from_rows(pose.to_rows()).unwrap();
         assert!((read.rotation - pose.rotation).amax() < 1e-15);

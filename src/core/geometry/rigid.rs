@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_planted_motion_is_found_to_rounding_at_every_angle() {
+    fn fit_rigid_recovers_planted_motion() {
         let from = points(&OBSERVED);
         for count in [3, 4, 5] {
             for angle in [0.0, 1e-9, 0.01, 1.0, 2.0, std::f64::consts::PI] {
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_that_is_off_is_the_worst_one() {
+    fn fit_rigid_names_worst_point() {
         let from = points(&OBSERVED);
         let mut to = from.clone();
         to[3].z += 4.0;
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mirror_image_is_refused_where_the_points_can_tell() {
+    fn fit_rigid_refuses_mirror_image() {
         let from = points(&OBSERVED);
         let to: Vec<Point> = from.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
         assert!(
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fixes_no_pose_is_refused() {
+    fn fit_rigid_refuses_degenerate_points() {
         let from = points(&OBSERVED);
         let line = points(&[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0001], [5.0, 5.0, 5.0]]);
         assert!(matches!(fit_rigid(&line, &from[..4]), Err(RigidError::Collinear { share }) if share < 1e-3));

@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_lies_on_the_surface_and_runs_to_and_fro() {
+    fn grid_targets_alternate_on_surface() {
         let found = targets(&dome(), Side::Normal, &Layout::GridPoints([10, 5]), 1.0).unwrap();
         assert_eq!(found.len(), 50);
         for Target { point, normal } in &found {
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn spacing_spiral_and_points() {
+    fn targets_of_each_layout() {
         let spaced = targets(&dome(), Side::Normal, &Layout::GridSpacing(2.0), 0.0).unwrap();
         assert_eq!(spaced.len(), 21 * 11);
         let spiral = targets(&dome(), Side::Normal, &Layout::SpiralPoints(400), 1.0).unwrap();
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outline_and_a_margin_keep_targets_away_from_the_edge() {
+    fn targets_respect_outline_and_margin() {
         let round = dome().with_outline(crate::geometry::Aperture::Circle { radius_mm: 8.0, centre_mm: [0.0, 0.0] });
         let found = targets(&round, Side::Normal, &Layout::GridSpacing(0.5), 2.0).unwrap();
         let farthest = found.iter().map(|t| t.point.x.hypot(t.point.y)).fold(0.0, f64::max);
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_laid_is_said() {
+    fn targets_refuse_bad_layout() {
         let lay = |layout: Layout, margin| targets(&dome(), Side::Normal, &layout, margin);
         assert!(matches!(lay(Layout::GridSpacing(0.0), 0.0), Err(PatternError::Spacing { .. })));
         assert!(matches!(lay(Layout::GridSpacing(1e-9), 0.0), Err(PatternError::TooMany { .. })));
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn targets_of_a_sphere_are_on_its_upper_half() {
+    fn sphere_targets_on_upper_half() {
         let centre = Point::new(1.0, 2.0, 3.0);
         for Target { point, normal } in sphere_targets(centre, 12.5, 25) {
             assert!(((point - centre).norm() - 12.5).abs() < 1e-12 && normal.z > 0.17);

@@ -108,7 +108,7 @@ mod tests {
     use crate::measuring::sphere_targets;
 
     #[test]
-    fn a_planted_sphere_is_found_from_its_upper_half() {
+    fn fit_sphere_from_upper_half() {
         let centre = Point::new(-300.0, 40.0, 12.0);
         let on = |radius| sphere_targets(centre, radius, 25).into_iter().map(|t| t.point).collect::<Vec<_>>();
         for radius in [14.0, 0.3, 400.0] {
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_shows_in_the_uncertainty() {
+    fn fit_sphere_sigma_from_noise() {
         // Residuals alternate between +1 um and -1 um.
         let sign = |k: usize| if k.is_multiple_of(2) { 1e-3 } else { -1e-3 };
         let targets = sphere_targets(Point::origin(), 14.0, 40);
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_sphere_is_refused() {
+    fn fit_sphere_refuses_degenerate_points() {
         assert_eq!(fit_sphere(&[Point::origin(); 4]), Err(SphereFitError::TooFew { points: 4 }));
         assert_eq!(fit_sphere(&[Point::origin(); 9]), Err(SphereFitError::Degenerate));
         let plane: Vec<Point> = (0..9).map(|k| Point::new(f64::from(k % 3), f64::from(k / 3), 0.0)).collect();

@@ -51,7 +51,7 @@ mod tests {
         ThermalExpansion { part_per_k: 11.5e-6, part_sigma_per_k: 1e-6, scales_per_k: 8e-6, temperature_sigma_k: 0.5 };
 
     #[test]
-    fn by_hand() {
+    fn thermal_expansion_by_hand() {
         // 3.5e-6 per kelvin more than the scales, over ten kelvins: 3.5 um on 100 mm.
         assert!((STEEL.length_factor(30.0) - 1.000_035).abs() < 1e-12);
         assert!((STEEL.length_factor_sigma(30.0) - (1.75e-6_f64).hypot(1e-5)).abs() < 1e-18);

@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn within_the_part_they_make_the_covariance_of_the_field() {
+    fn basis_reproduces_field_covariance() {
         for (smoothness, near) in
             [(Smoothness::Exponential, 0.05), (Smoothness::Matern2, 0.02), (Smoothness::SquaredExponential, 0.02)]
         {
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shorter_waves_would_have_is_told() {
+    fn basis_reports_truncated_variance() {
         let waves = Basis::over(&PART, Anisotropy::NONE, 200, 0);
         let left = [20.0, 5.0, 1.0].map(|range_mm| waves.standard_deviations(Smoothness::Exponential, range_mm).1);
         assert!(left[0] < 0.2 && left[1] > 0.3 && left[2] > 0.8 && left[2] < 1.0, "{left:?}");
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn polynomials_over_the_part_are_independent_and_only_long_smooth_fields_have_them() {
+    fn basis_polynomials_are_orthogonal() {
         let waves = Basis::over(&PART, Anisotropy::NONE, 10, 4);
         let count = waves.degrees.len();
         assert_eq!(count, 12);
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_grid_a_field_is_what_it_is_at_each_of_its_places() {
+    fn basis_on_grid_matches_points() {
         let waves = Basis::over(&PART, Anisotropy::from_angle(0.4, 2.0), 60, 4);
         let grid = BasisGrid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
         let coefficients: Vec<f64> = (0..60).map(|k| (f64::from(k) * 0.7).sin()).collect();

@@ -206,7 +206,7 @@ mod tests {
         Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
 
     #[test]
-    fn of_one_point_it_is_what_is_worked_out_by_hand() {
+    fn dense_one_point_by_hand() {
         // By hand, k = 4 and s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
         let model =
             DensePosterior::fit(&Observations::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPERPARAMETERS).unwrap();
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
+    fn dense_random_effect_by_hand() {
         // By hand, k = 4, s^2 = 0.25 and e^2 = 2.25: the field gets the share 4 / 6.5 of the deviation 3.
         let stated = DMatrix::from_element(1, 1, 1.5);
         let model = DensePosterior::fit(
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn of_two_points_of_a_path_it_is_what_is_worked_out_by_hand() {
+    fn dense_noise_autocorrelation_by_hand() {
         // Both points lie at one place, so the field is the same at both. With a noise autocorrelation of 0.5, K =
         // [4.25 4.125; 4.125 4.25]; its elements sum to 16.75.
         let drifting = Hyperparameters { noise_autocorrelation: 0.5, ..HYPERPARAMETERS };
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn effects_take_off_what_moves_all_points_and_say_how_well_they_are_known() {
+    fn dense_estimates_fixed_effects() {
         let places = places(120);
         let effects = DMatrix::from_fn(120, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
         let planted = DVector::from_column_slice(&[40.0, 0.3, -0.2]);
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn moving_everything_moves_nothing() {
+    fn dense_is_translation_invariant() {
         let at = places(80);
         let away: Vec<[f64; 2]> = at.iter().map(|[x, y]| [x + 1e4, y - 3e3]).collect();
         let fit = |places: &[[f64; 2]]| {
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_model_is_refused_in_words() {
+    fn dense_refuses_bad_input() {
         let of = |observed: &Observations, hyperparameters| {
             DensePosterior::fit(observed, hyperparameters).err().unwrap().to_string()
         };

@@ -161,7 +161,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn along_its_lay_a_field_is_wider_and_its_range_is_the_mean_of_both() {
+    fn anisotropic_field_range_by_direction() {
         let field = Field { anisotropy: Anisotropy::from_angle(0.5, 4.0), ..Field::new(2.0, 30.0) };
         let at = |r: f64, angle: f64| field.covariance_mm2([1.0, 1.0], [1.0 + r * angle.cos(), 1.0 + r * angle.sin()]);
         let alike = Field::new(2.0, 30.0).covariance_mm2([0.0; 2], [20.0, 0.0]);
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_field_is_refused_in_words() {
+    fn field_check_refuses_bad_values() {
         let of = |field: Field| field.check().err().map(|error| error.to_string()).unwrap_or_default();
         assert!(of(Field::new(0.0, 1.0)).contains("the field is 0 mm"));
         assert!(of(Field::new(1.0, f64::INFINITY)).contains("the range is inf mm"));

@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn in_batches_it_tells_what_all_points_at_once_tell() {
+    fn incremental_batches_match_dense() {
         let observed = observed(120, 0);
         let growing = updated_in_batches(&observed, &[10, 1, 49, 60]);
         let exact = DensePosterior::fit(&observed, HYPERPARAMETERS).unwrap().predict(&requested(0).0);
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn beside_effects_it_tells_field_and_effects_together() {
+    fn incremental_effects_match_dense() {
         let observed = observed(120, 3);
         let growing = updated_in_batches(&observed, &[60, 60]);
         let dense = DensePosterior::fit(&observed, HYPERPARAMETERS).unwrap();
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn what_will_be_touched_is_known_better_whatever_will_be_found() {
+    fn update_with_expected_lowers_sigma() {
         let observed = observed(60, 3);
         let mut growing = updated_in_batches(&observed, &[60]);
         let before: Vec<Prediction> = growing.predictions().collect();
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_off_by_ten_scatters_is_a_surprise_and_one_as_expected_is_none() {
+    fn standardized_innovation_of_outlier() {
         let observed = observed(121, 3);
         let first: Vec<usize> = (0..120).collect();
         let growing = updated_in_batches(&observed.subset(&first), &[120]);
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
+    fn incremental_random_effect_by_hand() {
         let hyperparameters =
             Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
         let (place, stated) = (vec![[1.0, 2.0]], DMatrix::from_element(1, 1, 1.5));
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_belong_together_is_refused() {
+    fn incremental_refuses_mismatch() {
         let (places, effects) = requested(3);
         let none = DMatrix::zeros(places.len(), 0);
         assert!(IncrementalPosterior::at_places(&places, &DMatrix::zeros(7, 3), &none, HYPERPARAMETERS).is_err());

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nodes_lie_between_the_points_and_what_is_level_or_tilted_stays_so() {
+    fn intermediate_rows_reproduce_plane() {
         let places: Vec<[f64; 2]> = (0..96).map(|k| [4.0 * f64::from(k % 12), 3.0 * f64::from(k / 12)]).collect();
         let between = over(&places).unwrap();
         assert!(between.nodes.len() > 3 * places.len() / 2 && between.nodes.len() < 6 * places.len());
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_smooth_column_is_told_as_if_it_were_known_everywhere() {
+    fn intermediate_rows_of_curved_column() {
         let places: Vec<[f64; 2]> = (0..400).map(|k| [4.0 * f64::from(k % 20), 3.0 * f64::from(k / 20)]).collect();
         let between = over(&places).unwrap();
         let bent = |x: f64, y: f64| (0.03 * x).sin() + 1e-3 * x * y + (0.02 * y).cos();
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn over_a_quarter_that_nobody_touched_there_is_none() {
+    fn intermediate_skips_unmeasured_area() {
         let all = (0..900).map(|k| [2.0 * f64::from(k % 30), 2.0 * f64::from(k / 30)]);
         let places: Vec<[f64; 2]> = all.filter(|[x, y]| *x < 30.0 || *y < 30.0).collect();
         let between = over(&places).unwrap();

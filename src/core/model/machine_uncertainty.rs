@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn of_one_point_they_are_what_is_worked_out_by_hand() {
+    fn machine_effects_of_one_point_by_hand() {
         let machine = MachineUncertainty {
             scale: [1e-6, 0.0, 3e-6],
             squareness_rad: [4e-6, 5e-6, 6e-6],
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_by_direction_has_the_same_variance_in_every_direction() {
+    fn probe_error_variance_is_isotropic() {
         let of = effects(MachineUncertainty { probe_mm: 3e-4, ..MachineUncertainty::default() }, [0.0; 2]);
         for k in 0..50_u32 {
             let (turn, rise) = (0.7 * f64::from(k), -0.98 + 0.04 * f64::from(k));
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axes_are_those_of_the_machine() {
+    fn machine_effects_use_machine_axes() {
         // The machine's x axis is the model's y axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let machine = MachineUncertainty { scale: [1e-6, 0.0, 0.0], ..MachineUncertainty::default() };
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_that_is_held_elsewhere_shows_as_its_motion_along_the_axes_of_the_model() {
+    fn fixture_pose_effects_by_hand() {
         // The machine's x axis is the model's y axis, its y axis the model's -x axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let centre = Point::new(1.0, 2.0, 3.0);
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_is_stated_there_is_no_column() {
+    fn machine_effects_empty_by_default() {
         let none = effects(MachineUncertainty::default(), [0.0; 2]);
         assert!(none.sources().is_empty());
         assert_eq!(none.columns(std::iter::once((Point::origin(), Vector::z()))).shape(), (1, 0));

@@ -102,7 +102,7 @@ mod tests {
     ];
 
     #[test]
-    fn it_is_that_of_the_tables() {
+    fn matern_matches_bessel_tables() {
         for (x, k2) in K {
             let (found, expected) = (correlation(Smoothness::Matern2, x / 4.0), 0.5 * x * x * k2);
             assert!((found / expected - 1.0).abs() < 1e-10, "{x}: {found} {expected}");
@@ -119,7 +119,7 @@ mod tests {
     const ALL: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
 
     #[test]
-    fn between_the_steps_it_is_as_exact() {
+    fn matern_interpolation_is_exact() {
         for k in 0..4000 {
             let x = 1e-4 + 0.011_37 * f64::from(k);
             let found = correlation(Smoothness::Matern2, x / 4.0);
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn at_one_range_each_has_fallen_to_a_seventh() {
+    fn matern_at_one_range() {
         for smoothness in ALL {
             assert!((correlation(smoothness, 1.0) - 0.138).abs() < 4e-3, "{}", correlation(smoothness, 1.0));
         }

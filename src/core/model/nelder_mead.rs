@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_hill_is_climbed() {
+    fn nelder_mead_finds_peak() {
         let hill = |[x, y]: [f64; 2]| -(x - 1.0).powi(2) - 30.0 * (y + 2.0 - 0.3 * x).powi(2);
         let (top, height) = maximize([-3.0, 4.0], [0.7, 0.9], 1e-4, hill);
         assert!((top[0] - 1.0).abs() < 1e-3 && (top[1] + 1.7).abs() < 1e-3 && height > -1e-6, "{top:?}");

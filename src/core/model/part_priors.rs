@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn of_two_parts_it_is_what_is_worked_out_by_hand() {
+    fn part_priors_of_two_parts_by_hand() {
         let mut taught = PartPriors::default();
         assert!(taught.fit(true).is_none());
         taught.update(true, &hyperparameters(10.0, 0.1));
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn many_parts_alike_teach_no_more_than_the_narrowest_factor_and_the_old_ones_fade() {
+    fn part_priors_forget_old_parts() {
         let mut lesson = None;
         let mut factors = Vec::new();
         for _ in 0..200 {
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn machines_count_as_one_part_each_and_what_they_differ_by_widens() {
+    fn part_priors_pool_machines() {
         let machine = |range_mm: f64| {
             let mut taught = PartPriors::default();
             (0..9).for_each(|_| taught.update(true, &hyperparameters(range_mm, 0.1)));
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_differ_widen_what_is_expected() {
+    fn part_priors_widen_with_spread() {
         let lesson = (0..12)
             .map(|k| hyperparameters(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
             .fold(None, |lesson, hyperparameters| Some(PartFit::updated(lesson, &hyperparameters)));
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_cannot_be_are_found() {
+    fn part_priors_detect_bad_values() {
         let good = PartFit::updated(None, &hyperparameters(15.0, 0.3));
         let of = |lesson| PartPriors { with_correction: Some(lesson), without_correction: None }.is_valid();
         assert!(of(good) && PartPriors::default().is_valid());

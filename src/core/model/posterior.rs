@@ -643,7 +643,7 @@ mod tests {
         Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
     #[test]
-    fn planted_parameters_are_found_again() {
+    fn hyperparameters_are_recovered() {
         let (mut sigma, mut range, mut scatter) = (0.0, 0.0, 0.0);
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
@@ -670,7 +670,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
+    fn noise_autocorrelation_is_recovered() {
         for drift in [0.0, 0.7, 0.9] {
             let planted = Hyperparameters { noise_autocorrelation: drift, ..PLANTED };
             // A strong drift leaves few independent touches, so the evidence for it varies by chance: the test uses the
@@ -700,7 +700,7 @@ mod tests {
     /// Next to a form, a strong drift looks like form. An estimate that misses the drift must assign it to the field,
     /// and must not count it as independent noise.
     #[test]
-    fn a_strong_drift_is_told_or_is_form() {
+    fn strong_autocorrelation_is_not_noise() {
         let planted = Hyperparameters { noise_autocorrelation: 0.9, ..PLANTED };
         for seed in 1..=5 {
             let told = Hyperparameters::estimate(&in_rows(planted, seed), Some(&Prior::for_size(102.0))).unwrap();
@@ -713,7 +713,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scale_of_everything_is_the_scale_of_what_is_found() {
+    fn hyperparameters_scale_with_data() {
         let observed = simulated(PLANTED, places(120), Vec::new(), 1);
         let tenfold = Observations {
             deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(),
@@ -731,7 +731,7 @@ mod tests {
     ///  -2 ln p = ln |K| + ln |H'K^-1 H| - ln |H'H| + m ln d'K^-1 (d - H b)
     /// ```
     #[test]
-    fn the_likelihood_is_that_of_the_covariance_that_the_waves_make() {
+    fn likelihood_matches_basis_covariance() {
         for (count, near) in [(60, 1e-6), (500, 0.2)] {
             let observed = simulated(PLANTED, places(count), Vec::new(), 3);
             let n = observed.places.len();

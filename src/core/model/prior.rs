@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_taught_counts_for_no_more_than_that_one_part_of_five_is_like_none_before() {
+    fn prior_density_has_heavy_tail() {
         let taught = Prior { range_mm: [8.0, 2.0], noise_ratio: [0.1, 2.0] };
         let [at, off] = [8.0, 8.0 * 25.0].map(|range_mm| taught.log_density(range_mm, 0.1));
         // By hand: ln(0.8 / ln^2 2 + 0.2 / (ln 6 ln 20)). At 25 times the range almost only the second term remains,
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_expected_is_refused_in_words() {
+    fn prior_check_refuses_bad_values() {
         let good = Prior::for_size(102.0);
         for (bad, words) in [
             (Prior { range_mm: [8.0, 1.0], ..good }, "the range has the median 8 and the factor 1;"),

@@ -45,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn they_are_normal_and_streams_have_nothing_to_do_with_each_other() {
+    fn normals_are_gaussian_and_independent() {
         const N: usize = 100_000;
         let draw = |stream| {
             let mut normals = NormalGenerator::new(7, stream);

@@ -201,7 +201,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn free_steps_leave_the_locked_coordinates_alone() {
+    fn free_directions_skip_locked() {
         let scaling = Scaling { centre: Point::new(10.0, 20.0, -5.0), size_mm: 30.0 };
         let locked = [true, false, false, false, true, true];
         let free = free_projector(&locked, &scaling);

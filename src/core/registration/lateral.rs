@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_of_a_map_is_lateral_uncertainty_times_slope() {
+    fn map_error_is_lateral_sigma_times_slope() {
         let e = lateral_error_of(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
         assert!((e.lateral_mm - 3.4).abs() < 1e-12, "{e:?}");
         // The steepest slope of the wave is h / w; patches see a little less of it.
@@ -225,14 +225,14 @@ mod tests {
     }
 
     #[test]
-    fn noise_of_points_that_lie_close_together_is_no_slope() {
+    fn slope_ignores_noise_of_close_points() {
         let plain = lateral_error_of(&waved([1.0; 6], false), 2.0).slope;
         let twins = lateral_error_of(&waved([1.0; 6], true), 2.0).slope;
         assert!((twins / plain - 1.0).abs() < 0.25, "{twins} against {plain}");
     }
 
     #[test]
-    fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
+    fn map_refused_above_error_limit() {
         let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
         let limits = MapLimits { max_lateral_mm: 1e3, ..MapLimits::default() };
         let unit = lateral_error_of(&at(1.0), limits.coverage_factor).error_mm;

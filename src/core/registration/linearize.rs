@@ -170,7 +170,7 @@ mod tests {
 
     /// Compares the row with the derivative of the distance to a fixed plane, with the sign of eq. (11).
     #[test]
-    fn the_row_is_the_derivative_of_the_distance() {
+    fn row_is_distance_derivative() {
         let scaling = Scaling { centre: Point::new(30.0, -20.0, 7.0), size_mm: 40.0 };
         let (p, normal) = (Point::new(55.0, 12.0, -3.0), Vector::new(0.2, -0.5, 0.9).normalize());
         let anchor = Point::new(54.0, 12.0, -2.0);
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn sliding_in_the_plane_changes_nothing() {
+    fn row_ignores_in_plane_motion() {
         let scaling = Scaling { centre: Point::origin(), size_mm: 1.0 };
         let normal = Vector::new(1.0, 1.0, 1.0).normalize();
         let row = scaling.row(&Point::new(3.0, 4.0, 5.0), &normal);

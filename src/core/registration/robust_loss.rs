@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_loss_is_the_square_near_zero_and_its_weight_is_half_its_slope_over_d() {
+    fn loss_weights_match_slope() {
         for loss in [Loss::None, Loss::Huber, Loss::Tukey] {
             let scaled = ScaledLoss::new(loss, 0.001);
             assert!((scaled.weigh(1e-6).1 / 1e-12 - 1.0).abs() < 1e-5);
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_robust_sigma_is_that_of_the_many() {
+    fn robust_sigma_ignores_outliers() {
         // Evenly spaced from -1 to 1: the median of |d| is 1/2.
         let even = (0..=2000).map(|k| f64::from(k) / 1000.0 - 1.0);
         let (median, sigma) = robust_median_and_sigma(even.clone());

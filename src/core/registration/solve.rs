@@ -90,14 +90,14 @@ mod tests {
     }
 
     #[test]
-    fn a_wide_ball_gives_the_least_squares_solution() {
+    fn wide_trust_region_is_least_squares() {
         let (gram, right) = problem();
         let m = Spectrum::new(&gram).step(&right, 6, 1e6);
         assert!((gram * m - right).norm() < 1e-12);
     }
 
     #[test]
-    fn a_narrow_ball_is_reached_and_the_step_is_optimal_on_it() {
+    fn small_trust_region_step_is_optimal() {
         let (gram, right) = problem();
         let spectrum = Spectrum::new(&gram);
         let free = spectrum.step(&right, 6, 1e6).norm();
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn a_direction_that_is_not_seen_is_not_moved_in() {
+    fn step_skips_undetermined_direction() {
         let mut gram = Matrix6::from_diagonal(&Vector6::new(4.0, 3.0, 2.0, 1.0, 0.5, 1e-14));
         gram[(0, 1)] = 0.5;
         gram[(1, 0)] = 0.5;
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_do_is_no_step() {
+    fn zero_gradient_gives_no_step() {
         let (gram, _) = problem();
         assert_eq!(Spectrum::new(&gram).step(&Vector6::zeros(), 6, 0.5).norm(), 0.0);
         assert_eq!(Spectrum::new(&Matrix6::zeros()).rank(1e-6, 0.0), 0);

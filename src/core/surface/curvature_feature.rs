@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_saddle_bends_as_it_should_and_seen_from_below_the_other_way() {
+    fn feature_curvatures_of_saddle() {
         let points = saddle();
         let f = middle(&fit_features(&points, Some(&vec![Vector::z(); points.len()])));
         assert!((f.curvatures[0] + 1.0 / 25.0).abs() < 1e-9 && (f.curvatures[1] - 1.0 / 40.0).abs() < 1e-9);
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offset_bends_less_on_its_outer_side_and_ends_where_it_folds() {
+    fn feature_offset_until_fold() {
         let points = saddle();
         let f = middle(&fit_features(&points, Some(&vec![Vector::z(); points.len()])));
         let up = f.offset(10.0, Side::Normal).unwrap();
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outlier_spoils_only_itself() {
+    fn feature_ignores_outlier() {
         let mut points = saddle();
         let beside = points.iter().position(|p| (p.x - 0.7).abs() < 1e-9 && p.y.abs() < 1e-9).unwrap();
         points[beside].z += 3.0;

@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disc_is_covered_and_turns_counter_clockwise() {
+    fn delaunay_covers_disc_ccw() {
         let (points, t) = triangulated(&sunflower(3000, 0.0));
         let disc = std::f64::consts::PI * 900.0;
         assert!((area(&t, &points) / disc - 1.0).abs() < 0.02);
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shuffled_grid_has_the_triangles_of_the_grid_in_order() {
+    fn delaunay_of_shuffled_grid() {
         let node = |k: usize| Point::new((k % 173) as f64 * 0.1, (k / 173) as f64 * 0.1, 0.0);
         let in_order: Vec<Point> = (0..173 * 149).map(node).collect();
         let shuffled: Vec<Point> = (0..173 * 149).map(|k| node(k * 7919 % (173 * 149))).collect();
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_know_each_other_after_trimming() {
+    fn delaunay_neighbours_after_trimming() {
         let (_, t) = triangulated(&sunflower(2000, 0.5));
         for (f, across) in t.neighbours.iter().enumerate() {
             for (k, &n) in across.iter().enumerate() {
@@ -347,14 +347,14 @@ mod tests {
     }
 
     #[test]
-    fn the_hole_of_an_annulus_is_not_bridged() {
+    fn delaunay_leaves_annulus_hole() {
         let (points, t) = triangulated(&sunflower(3000, 0.5));
         let annulus = std::f64::consts::PI * 900.0 * 0.75;
         assert!((area(&t, &points) / annulus - 1.0).abs() < 0.03, "{}", area(&t, &points) / annulus);
     }
 
     #[test]
-    fn the_median_is_the_middle_one_however_the_values_lie() {
+    fn median_matches_sorting() {
         let exact = |mut values: Vec<f64>| {
             values.sort_by(f64::total_cmp);
             values[values.len() / 2]
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_clouds_are_named() {
+    fn delaunay_refuses_degenerate_clouds() {
         let map = Projector::Plane {
             origin: Point::origin(),
             axes: [crate::geometry::Vector::x(), crate::geometry::Vector::y(), crate::geometry::Vector::z()],

@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn normals_of_a_bi_cubic_are_exact_to_the_border() {
+    fn grid_normals_of_bicubic_are_exact() {
         let z = |x: f64, y: f64| 0.01 * x * x * x * y * y * y - 0.2 * x * y * y + 0.3 * x;
         let gradient =
             |x: f64, y: f64| [0.03 * x * x * y.powi(3) - 0.2 * y * y + 0.3, 0.03 * x.powi(3) * y * y - 0.4 * x * y];
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn short_lines_and_holes_fall_back_to_the_nodes_there_are() {
+    fn grid_normals_at_holes() {
         let (mut points, _) = grid_topology(7, 4, |x, y| 0.3 * x - 0.1 * y);
         points[9] = Point::new(f64::NAN, f64::NAN, f64::NAN);
         let lattice = GridTopology::new(7, 4, &points, true);
@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jump_lands_in_the_cell_pointed_at_and_stops_at_the_edge() {
+    fn grid_advance_stops_at_edge() {
         let (_, lattice) = grid_topology(9, 8, |_, _| 0.0);
         let from = lattice.facet_at(1, 1, 0);
         // u = 3.6, v = 2.2 from the lower left of cell (1, 1): cell (4, 3), the half at its lower right.
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn a_search_begins_at_a_whole_cell() {
+    fn grid_search_starts_in_whole_cell() {
         let (mut points, _) = grid_topology(9, 8, |_, _| 0.0);
         points[..4 * 9].fill(Point::new(f64::NAN, f64::NAN, f64::NAN));
         let lattice = GridTopology::new(9, 8, &points, true);

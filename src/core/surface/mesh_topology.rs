@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_lie_across_the_opposite_edge() {
+    fn mesh_neighbours_across_opposite_edge() {
         let (points, corners) = fan();
         let mesh = MeshTopology::new(&points, corners).unwrap();
         assert_eq!(mesh.neighbours[0], [1, 3, BORDER]);
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn the_way_round_a_vertex_meets_every_facet_inside_and_at_the_border() {
+    fn mesh_vertex_ring_meets_all_facets() {
         let (points, corners) = fan();
         let mesh = MeshTopology::new(&points, corners).unwrap();
         let met = |vertex| {
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_walk_crosses_the_worst_edge_and_stops_at_the_border() {
+    fn mesh_advance_stops_at_border() {
         let (points, corners) = fan();
         let mesh = MeshTopology::new(&points, corners).unwrap();
         assert_eq!(mesh.advance(0, &[-0.5, 0.9, 0.6]), Some(1));
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_solid_has_no_border() {
+    fn closed_mesh_has_no_border() {
         let (points, corners) = fan();
         assert!(!MeshTopology::new(&points, corners).unwrap().is_closed());
         let corner = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(Point::from);
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn meshes_that_are_no_surface_are_refused() {
+    fn mesh_refuses_non_surfaces() {
         let (points, mut corners) = fan();
         corners[1] = [2, 1, 4];
         assert!(matches!(MeshTopology::new(&points, corners.clone()), Err(SurfaceError::Orientation { .. })));

@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_planted_is_found_on_grids_and_on_scattered_points() {
+    fn surface_noise_is_recovered() {
         for jitter_mm in [0.0, 0.5] {
             for scatter_mm in [1e-3, 1e-2] {
                 let found_mm = nominal(jitter_mm, scatter_mm).noise_sigma_mm();

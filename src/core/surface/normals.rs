@@ -372,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cubic_is_fitted_exactly_whatever_the_frame_leans() {
+    fn normal_fit_of_cubic_is_exact() {
         let z = |x: f64, y: f64| 0.4 * x - 0.2 * y + 0.05 * x * x - 0.02 * x * y + 0.01 * y * y * y;
         let at = Point::new(1.0, 2.0, z(1.0, 2.0));
         let exact = Vector::new(-(0.4 + 0.1 - 0.04), -(-0.2 - 0.02 + 0.12), 1.0).normalize();
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bowl_has_the_curvature_of_its_sphere_towards_the_normal() {
+    fn normal_fit_curvature_of_bowl() {
         let radius = 40.0f64;
         let z = |x: f64, y: f64| radius - (radius * radius - x * x - y * y).sqrt();
         let at = Point::new(6.0, -3.0, z(6.0, -3.0));
@@ -393,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_direction_of_a_cylinder_is_its_axis_when_it_bulges_towards_the_normal_least() {
+    fn normal_fit_direction_of_cylinder() {
         // A gutter along x: it bends towards +z in y (curvature 1/20) and not at all in x.
         let z = |_x: f64, y: f64| y * y / 40.0;
         let fitted = fit_to_neighbours(Point::origin(), Vector::z(), around(Point::origin(), z, 24).into_iter());
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_that_do_not_determine_a_cubic_get_less() {
+    fn normal_fit_with_few_neighbours() {
         // Points on a line do not determine even a plane: the fit returns the mean normal.
         let line = (1..30).map(|k| Point::new(f64::from(k) * 0.1, 0.0, 0.0));
         assert_eq!(fit_to_neighbours(Point::origin(), Vector::z(), line).normal, Vector::z());
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rings_are_those_of_going_round_every_neighbour() {
+    fn two_rings_match_plain_walk() {
         let points: Vec<Point> = around(Point::origin(), |x, y| 0.1 * x * y, 600);
         let map = crate::surface::plane_projection::PlaneProjection::Xy.choose(&points).unwrap().1;
         let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
@@ -441,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn four_normals_are_those_of_one_at_a_time() {
+    fn four_normals_match_single() {
         let z = |x: f64, y: f64| 0.3 * x - 0.02 * x * y + 0.01 * y * y * y;
         let points: Vec<Point> = around(Point::origin(), z, 400);
         let map = crate::surface::plane_projection::PlaneProjection::Xy.choose(&points).unwrap().1;

@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn auto_takes_the_simplest_that_is_one_to_one() {
+    fn auto_projection_picks_simplest() {
         let chosen = |points: &[Point]| PlaneProjection::Auto.choose(points).unwrap().0;
         assert_eq!(chosen(&cap(60.0, 4000)), PlaneProjection::Xy);
         assert_eq!(chosen(&cap(120.0, 4000)), PlaneProjection::Spherical);
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fold_is_an_error_with_its_share() {
+    fn projection_refuses_fold() {
         let two_sheets: Vec<_> =
             cap(60.0, 2000).into_iter().flat_map(|p| [p, Point::new(p.x + 0.01, p.y, p.z - 30.0)]).collect();
         assert!(matches!(PlaneProjection::Xy.choose(&two_sheets), Err(SurfaceError::NoProjection { .. })));
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn the_stereographic_map_keeps_longitudes_and_knows_the_sphere() {
+    fn stereographic_map_of_sphere() {
         let points = cap(120.0, 3000);
         let (_, map) = PlaneProjection::Spherical.choose(&points).unwrap();
         let Projector::Sphere { centre, radius_mm, axes } = &map else { panic!("{map:?}") };

@@ -138,7 +138,7 @@ mod tests {
     use crate::surface::{Nominal, PlaneProjection, Side};
 
     #[test]
-    fn four_at_a_time_agree_with_one_at_a_time() {
+    fn project_x4_matches_single_projection() {
         let z = |x: f64, y: f64| 3.0 * (0.11 * x + 0.2).sin() * (0.07 * y - 0.4).cos();
         let cloud: Vec<Point> = (0..41 * 31)
             .map(|k| (f64::from(k % 41) * 0.8 - 16.0, f64::from(k / 41) * 0.9 - 13.0))
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn over_a_grid_they_jump_to_their_facets_and_over_the_edge_they_do_not() {
+    fn project_x4_jumps_and_stops_at_edge() {
         let cloud = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect::<Vec<_>>();
         let nominal = Nominal::from_points(cloud.clone(), PlaneProjection::Auto).unwrap();
         let surface = OffsetSurface::new(&nominal, 0.5, Side::Normal).unwrap();

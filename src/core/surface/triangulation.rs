@@ -563,7 +563,7 @@ mod tests {
     }
 
     #[test]
-    fn without_four_points_on_a_circle_there_is_only_one() {
+    fn edges_unique_without_cocircular() {
         for count in (3..60).chain([1000, 30_000]) {
             assert!(!checked(&scattered(count, count as u64)).1, "{count} points");
         }
@@ -576,7 +576,7 @@ mod tests {
     }
 
     #[test]
-    fn points_on_circles_and_lines_are_divided_somehow() {
+    fn edges_of_cocircular_and_grid_points() {
         assert!(checked(&grid(150, 110)).1);
         checked(&grid(2, 500));
         checked(&grid(500, 2));
@@ -593,7 +593,7 @@ mod tests {
     }
 
     #[test]
-    fn a_few_points_in_whole_numbers_meet_every_special_case() {
+    fn edges_of_small_integer_points() {
         let mut next = noise(1);
         for _ in 0..4000 {
             let (count, size) = (3 + (9.0 * next()) as usize, 2.0 + 4.0 * next());
@@ -607,7 +607,7 @@ mod tests {
     }
 
     #[test]
-    fn points_on_one_line_have_no_triangle() {
+    fn edges_of_collinear_points() {
         for [du, dv] in [[0.0, 1.0], [1.0, 0.0], [1.0, 2.0]] {
             let line: Vec<_> = (0..300).map(|k| [f64::from(k) * du, f64::from(k) * dv]).collect();
             assert_eq!(checked(&line).0, 0);
@@ -615,7 +615,7 @@ mod tests {
     }
 
     #[test]
-    fn points_far_from_the_origin_keep_their_order() {
+    fn edges_of_points_far_from_origin() {
         let far: Vec<_> = scattered(3000, 5).into_iter().map(|[u, v]| [1e9 + u, -1e9 + v]).collect();
         let (mut places, _) = in_order(&far);
         places.dedup();

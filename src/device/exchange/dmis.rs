@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_touches_each_target_from_over_the_part_and_its_output_says_what_it_is_of() {
+    fn dmis_program_identifies_its_output() {
         let about =
             DmisHeader { part: "SN-7", cycle: 2, identity: PLAN, sensor: "PROBE6", coordinates: Coordinates::Centres };
         let text = program(&plan(), &about);

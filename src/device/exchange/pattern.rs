@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stars_stand_for_anything() {
+    fn pattern_star_matches_anything() {
         let fits = |pattern: &str, name: &str| Pattern::new(pattern).fits(name);
         assert!(fits("M1_1.txt", "M1_1.txt") && !fits("M1_1.txt", "M1_1.txt~") && !fits("M1_1.txt", "xM1_1.txt"));
         assert!(fits("M1_*.txt", "M1_.txt") && fits("M1_*.txt", "M1_12.txt") && !fits("M1_*.txt", "ref_1.txt"));
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn one_star_pairs_two_names() {
+    fn pattern_star_pairs_names() {
         let points = Pattern::new("M1_*.txt");
         assert_eq!(points.star("M1_12.txt"), Some("12"));
         assert_eq!(
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn part_and_cycle_are_filled_in_and_cannot_leave_the_folder() {
+    fn pattern_fill_stays_in_folder() {
         let filled = Pattern::new("{part}_c{cycle}.*").filled("../A 7", 3, 2);
         assert_eq!(filled.as_str(), "_.._A_7_c2.*");
         assert_eq!(file_word(""), "_");

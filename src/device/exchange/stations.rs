@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_is_placed_by_order_by_name_and_by_distances() {
+    fn station_placed_by_order_or_distance() {
         let placed = place_station("3", &seen(&[0, 1, 2, 3], false), &nominal(4), 0.1).unwrap();
         assert!(is_planted(&placed) && placed.missing.is_empty() && placed.residuals.len() == 4);
         let placed = place_station("3", &seen(&[3, 0, 4, 1], true), &nominal(4), 0.1).unwrap();
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn exchanged_and_moved_points_are_named() {
+    fn station_names_swapped_or_moved_point() {
         let message = place_station("3", &seen(&[0, 2, 1, 3, 4], false), &nominal(5), 0.1).unwrap_err().to_string();
         assert!(
             message.contains("station 3: reference point b is off by")
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_matched_is_refused_in_words() {
+    fn station_refuses_unmatched_points() {
         let cases = [
             (seen(&[0, 1, 2, 3, 4], false), 4, "extra"),
             (seen(&[0, 1], false), 4, "3 are required"),

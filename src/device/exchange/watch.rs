@@ -96,7 +96,7 @@ mod tests {
     use std::fs;
 
     #[test]
-    fn a_file_settles_when_it_stops_changing() {
+    fn watch_file_settles_when_unchanged() {
         let home = tempfile::tempdir().unwrap();
         let mut watch = Watch::new(home.path(), Duration::from_secs(2));
         let at = Duration::from_secs;

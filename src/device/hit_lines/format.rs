@@ -310,7 +310,7 @@ mod tests {
     ];
 
     #[test]
-    fn each_example_is_read_by_its_own_format_and_by_no_other() {
+    fn line_format_examples_are_distinct() {
         for (format, line) in EXAMPLES {
             for (other, _) in EXAMPLES {
                 let read = LineParser { format: other, ..LineParser::default() }.read(line);
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_lost_or_gained_anything_is_refused_with_the_place() {
+    fn line_parser_refuses_damaged_line() {
         let reading = LineParser::default();
         for (line, why) in [
             ("100.000,200.000", "it has 2 values instead of 3: it is incomplete"),
@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn no_character_of_a_line_can_be_lost_behind_the_mark_and_be_another_number() {
+    fn line_parser_detects_lost_character() {
         let reading = LineParser::default();
         let line = "-12.345,0.007,123.400";
         let whole = reading.read(line).unwrap().position_mm;
@@ -374,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn marks_separators_units_and_axes_are_those_of_the_cell_file() {
+    fn line_parser_follows_cell_file() {
         let german = LineParser { mark: ',', separator: Separator::Semicolon, ..LineParser::default() };
         assert_eq!(german.read("1,500;-2,250;0,125").unwrap().position_mm, [1.5, -2.25, 0.125]);
         assert!(german.read("1.500;-2.250;0.125").is_err());

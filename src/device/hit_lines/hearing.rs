@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn a_refused_line_holds_and_takes_no_good_one_along() {
+    fn refused_line_holds_session() {
         let mut heard = session(4);
         hear(&mut heard, "0.000,0.000,1.500");
         hear(&mut heard, "PROBE 1");
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_list_is_over_when_the_cell_file_says_that_the_probe_is_clear() {
+    fn session_completes_when_probe_clear() {
         let mut heard = session(1);
         heard.finish_if_clear(Some(Duration::ZERO));
         assert_eq!(heard.state, State::Execute);
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_that_was_turned_and_a_line_that_was_not_asked_for_are_told() {
+    fn session_reports_rotary_and_stray_line() {
         let mut heard = session(2);
         heard.rules.parser.format = super::super::LineFormat::DecimalRotary;
         hear(&mut heard, "0.000,0.000,1.500,0.0");
@@ -384,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_line_loses_no_point_that_there_is() {
+    fn link_lost_preserves_points() {
         let mut heard = session(3);
         hear(&mut heard, "0.000,0.000,1.500");
         let gone = DeviceError::Disconnected { machine: "x".into(), operation: "reading" };

@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_the_same_however_their_bytes_come_and_whatever_ends_them() {
+    fn line_splitter_any_chunks_and_endings() {
         let bytes = b"1,2,3\r\n4,5,6\r7,8,9\n\r\n  \r\n10,11";
         for piece in 1..bytes.len() {
             let mut lines = LineSplitter::default();
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_ends_is_given_up_once_and_the_next_line_is_whole_again() {
+    fn line_splitter_drops_endless_line() {
         let mut lines = LineSplitter::default();
         let gathered = lines.push(&[[b'7'; 1000].as_slice(), b"\r\n1,2,3\r\n"].concat());
         assert!(

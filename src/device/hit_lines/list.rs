@@ -183,7 +183,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_point_belongs_to_the_nearest_target_and_to_none_beyond_the_limit() {
+    fn touch_assigned_to_nearest_target() {
         let mut list = TargetList::new(&plan(3), Coordinates::Centres, false, RULES);
         // Centre of a ball of 1.5 mm radius.
         assert_eq!(list.assign("a", [5.2, 0.1, 1.6], at(0)), Ok(TouchAssignment::First(101)));
@@ -204,7 +204,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_same_line_at_once_is_one_touch_and_later_another_one() {
+    fn duplicate_line_is_one_touch() {
         let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, RULES);
         let centre = [0.0, 0.0, 1.5];
         assert_eq!(list.assign("a", centre, at(0)), Ok(TouchAssignment::First(100)));
@@ -223,7 +223,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn where_any_points_will_do_each_touch_is_one() {
+    fn free_points_accept_every_touch() {
         let mut list = TargetList::new(&plan(2), Coordinates::Centres, true, RULES);
         assert_eq!(list.assign("a", [900.0, 0.0, 0.0], at(0)), Ok(TouchAssignment::First(0)));
         assert_eq!(list.assign("a", [900.0, 0.0, 0.0], at(1)), Ok(TouchAssignment::DuplicateLine));

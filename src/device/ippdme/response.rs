@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn the_four_kinds_are_told_apart() {
+    fn response_parses_four_kinds() {
         assert_eq!(said("00001 &"), ResponseContent::Acknowledged);
         assert_eq!(said("00001 % "), ResponseContent::Complete);
         assert_eq!(Response::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNSOLICITED);
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn properties_are_found_by_their_names() {
+    fn response_properties_by_name() {
         let ResponseContent::Data(data) = said("00014 # Q(0), Z(5.12) ,X( 1.5E1),IJK(0,0,1), Tool.AvrRadius(1.5)")
         else {
             panic!()
@@ -159,13 +159,13 @@ mod tests {
     }
 
     #[test]
-    fn a_property_that_comes_twice_is_none() {
+    fn duplicate_property_is_none() {
         let ResponseContent::Data(data) = said("00014 # X(1), X(2)") else { panic!() };
         assert_eq!(value(&data, "X"), None);
     }
 
     #[test]
-    fn a_line_of_nothing_but_parentheses_is_refused() {
+    fn response_refuses_deep_nesting() {
         assert!(Response::read(&format!("00001 # {}", "A(".repeat(30_000))).is_err());
     }
 
@@ -173,7 +173,7 @@ mod tests {
         /// No line from a server makes a parser panic. A line that parses as a command is written back as the same
         /// command.
         #[test]
-        fn any_line_is_read_or_refused(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
+        fn response_parse_never_panics(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
             let _ = Response::read(&line);
             if let Ok((tag, command)) = crate::ippdme::Command::read(&line) {
                 let written = command.line(tag);
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_are_read_however_they_are_quoted() {
+    fn response_error_quoting_variants() {
         let read = |line: &str| match said(line) {
             ResponseContent::Error(error) => (error.severity, error.number, error.cause, error.text),
             other => panic!("{other:?}"),

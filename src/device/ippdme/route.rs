@@ -423,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shuffled_grid_is_walked_almost_without_a_step_too_many() {
+    fn route_shortens_shuffled_grid() {
         let route = Route::find(&shuffled(), None, &VOLUME, &machine()).unwrap();
         assert!(route.travel_m < 0.107 && route.plan_order_m > 0.3, "{} and {}", route.travel_m, route.plan_order_m);
         let mut all: Vec<usize> = route.legs.iter().flat_map(Leg::targets).collect();
@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn a_careful_beginning_stays_the_beginning() {
+    fn route_preserves_careful_start() {
         let careful = CarefulStart { target_count: 5, speed_mm_s: 0.5 };
         let route =
             Route::find(&Plan { careful_start: Some(careful), ..shuffled() }, None, &VOLUME, &machine()).unwrap();
@@ -440,7 +440,7 @@ mod tests {
     }
 
     #[test]
-    fn a_position_outside_of_the_volume_is_named_before_anything_moves() {
+    fn route_refuses_position_out_of_volume() {
         let outside = plan([[0.0, 0.0, 0.0], [99.0, 0.0, 77.0]].into_iter());
         let Err(DeviceError::OutOfVolume { axis, target, value_mm, .. }) =
             Route::find(&Plan { safe_height_mm: 30.0, ..outside }, None, &VOLUME, &machine())
@@ -451,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_scanned_and_the_rest_is_touched() {
+    fn route_scans_rows_touches_rest() {
         // Two careful targets, a row of eight and a row of eight back, a single target, and three of a sphere.
         let row = |y: f64, there: bool| (0..8).map(move |k| [f64::from(if there { k } else { 7 - k }), y, 0.0]);
         let spread = [[30.0, 0.0, 0.0], [40.0, 9.0, 0.0]].into_iter();
@@ -469,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_row_is_several_scans() {
+    fn route_splits_long_row() {
         let plan = plan((0..1000).map(|k| [0.01 * f64::from(k), 0.0, 0.0]));
         let route = Route::find(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs, [Leg::Scan(0..400), Leg::Scan(400..800), Leg::Scan(800..1000)]);

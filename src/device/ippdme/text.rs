@@ -286,7 +286,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_sixteen_digits_at_most_and_come_back() {
+    fn decimal_16_digits_round_trip() {
         for (value, text) in [
             (0.0, "0"),
             (-0.0, "0"),

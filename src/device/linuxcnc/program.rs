@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_writes_down_that_it_begins_and_ends() {
+    fn framed_program_logs_begin_and_end() {
         let pass = pass("G64 P0.0001 Q0", "M2\n");
         let framed = frame(&pass, 1).unwrap();
         let text = String::from_utf8(framed.text.clone()).unwrap();
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_was_framed_before_is_read_as_it_was() {
+    fn framed_program_round_trip() {
         for rounds in [1, 2, 30] {
             let framed = frame(&pass("G61", "M2\n"), rounds).unwrap();
             assert_eq!(Program::read(&framed.name, 2, framed.text.clone()), Some(framed));
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn spark_out_is_the_same_program_once_more_and_another_file() {
+    fn spark_out_repeats_framed_program() {
         let pass = pass("G61", "M2\n");
         let (once, thrice) = (frame(&pass, 1).unwrap(), frame(&pass, 3).unwrap());
         assert_ne!(once.name, thrice.name);
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_is_followed_as_the_controller_likes_is_none() {
+    fn frame_requires_path_control_mode() {
         for (mode, end) in [
             ("", "M2\n"),
             ("G64", "M2\n"),
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_whole_in_a_record_is_not_there() {
+    fn program_record_ignores_partial_line() {
         let read = ProgramRecord::read;
         assert_eq!(read(""), ProgramRecord::default());
         assert_eq!(read("prepared 0000002a\nbegin"), ProgramRecord { token: Some(42), begun: 0, ended: 0 });

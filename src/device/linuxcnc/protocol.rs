@@ -354,13 +354,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sent_is_what_the_server_was_seen_to_take() {
+    fn request_lines_match_session() {
         let sent: Vec<_> = requests().iter().map(|request| request.line().unwrap()).collect();
         assert_eq!(sent, SESSION.map(|(asked, _)| asked));
     }
 
     #[test]
-    fn answers_are_the_same_in_halves_merged_and_byte_by_byte() {
+    fn replies_match_for_any_chunking() {
         let all: String = SESSION.map(|(_, answer)| answer).concat();
         for size in [1, 2, 3, 7, 16, 1000] {
             let (mut lines, mut waiting, mut found) = (LineSplitter::default(), PendingRequests::default(), Vec::new());
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_names_something_else_answers_nothing() {
+    fn unrelated_line_is_no_answer() {
         let run = Request::Set(Set::Run);
         assert_eq!(run.answer("SET NAK"), Some(Reply::Refused));
         assert_eq!(run.answer("set run ack"), Some(Reply::Acknowledged));
@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_sent_that_would_be_two_lines_or_not_plain() {
+    fn request_line_refuses_injection() {
         for path in ["/a\r\nset run", "/a\nb", "/\u{e4}", &"x".repeat(5000)] {
             assert_eq!(Request::Set(Set::Open(path.to_owned())).line(), None, "{path}");
         }
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_lines_is_no_conversation() {
+    fn line_flood_is_not_protocol() {
         let mut waiting = PendingRequests::default();
         waiting.push(Request::Get(Get::Mode), ());
         let told: Vec<_> = (0..102).map(|_| waiting.match_line("ERROR what")).collect();

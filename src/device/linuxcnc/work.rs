@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_the_program_wrote_says_that_it_ran_to_its_end() {
+    fn judge_complete_only_by_record() {
         let (work, idle) = (work(), seen(Interpreter::Idle, "/nc/p.ngc"));
         let complete = Verdict::Ended(State::Complete, Outcome::Complete, Fault::None);
         let aborted = Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None);
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn what_broke_a_program_off_is_told() {
+    fn judge_reports_fault_cause() {
         let mut work = work();
         let idle = seen(Interpreter::Idle, "/nc/p.ngc");
         let failed = |fault| Verdict::Ended(State::Faulted, Outcome::Failed, fault);
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_for_ends_as_it_was_asked() {
+    fn judge_requested_outcome() {
         let (running, idle) = (seen(Interpreter::Running, "/nc/p.ngc"), seen(Interpreter::Idle, "/nc/p.ngc"));
         for (wanted, on_the_way, state) in
             [(Outcome::Aborted, State::Aborting, State::Aborted), (Outcome::Stopped, State::Stopping, State::Complete)]
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_of_somebody_else_is_none_of_ours() {
+    fn judge_foreign_program() {
         let work = work();
         let of = |interpreter| judged(&work, &seen(interpreter, "/nc/other.ngc"), record(0, 0));
         assert_eq!(of(Interpreter::Running), Verdict::Foreign(State::Execute));
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_are_counted_by_the_line_that_falls_back() {
+    fn progress_counts_spark_out_rounds() {
         let mut work = work();
         let (name, text) = ("p".to_owned(), Vec::new());
         let program = Program { name, cycle: 1, text, lines: (6, 100), rounds: 2, map: [0; 32] };

@@ -533,7 +533,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_was_taken_before_the_program_ended_is_known() {
+    fn stored_result_recognised_by_hash() {
         let run = tempfile::tempdir().unwrap();
         std::fs::create_dir(run.path().join("cycle-1")).unwrap();
         std::fs::write(run.path().join("cycle-1/result.csv"), "1,2,3").unwrap();
@@ -543,7 +543,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_became_of_the_pass_of_an_interrupted_run_is_nothing_that_this_program_knows() {
+    async fn interrupted_pass_reconciles_unknown() {
         let job = Job { job: 7, cycle: 2, digest: 3 };
         let armed = Armed { job, start_sequence: 1, token: 0, boot_id: 0 };
         assert!(matches!(resumed_machine().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));

@@ -90,7 +90,7 @@ mod tests {
         #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
         #[test]
-        fn whatever_a_block_holds_becomes_a_value_or_an_error(
+        fn register_block_gives_value_or_error(
             which in any::<prop::sample::Index>(),
             changes in prop::collection::vec((any::<prop::sample::Index>(), prop::sample::select(vec![0, 1, 0x7f, 0x80, 0xf0, 0xff])), 0..5),
             noise in prop::collection::vec(any::<u8>(), 0..130),

@@ -419,7 +419,7 @@ mod tests {
     use crate::{Target, TargetKind};
 
     #[test]
-    fn words_go_high_first_or_low_first_and_bytes_always_high_first() {
+    fn codec_word_and_byte_order() {
         // 0x12345678, and -2.5e-7, whose bits are 0xBE90C6F7A0B5ED8D.
         for (order, whole, real) in [
             (WordOrder::Big, [0x1234, 0x5678], [0xbe90, 0xc6f7, 0xa0b5, 0xed8d]),
@@ -436,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn check_numbers_are_the_standard_ones() {
+    fn crc16_and_crc32_match_standard() {
         assert_eq!(crc16(b"123456789"), 0x4b37);
         assert_eq!(crc32(&[0x3132, 0x3334, 0x3536, 0x3738]), 0x9ae0_daaf); // "12345678"
         // The request "read two registers from 0 of unit 1" ends in C4 0B on the line: low byte first.
@@ -444,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_frame_is_the_one_of_the_contract() {
+    fn command_frame_layout() {
         let frame = CommandFrame {
             sequence: 0x0001_0002,
             command: Command::Start,
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_is_laid_out_as_the_contract_says() {
+    fn plan_word_layout() {
         let words = plan().words(WordOrder::Big);
         assert_eq!(words.len(), (64 + 56) / 2);
         assert_eq!(words[..4], [1, 0, 0, 1]);
@@ -499,7 +499,7 @@ mod tests {
     }
 
     #[test]
-    fn map_and_pass_are_laid_out_as_the_contract_says() {
+    fn map_and_pass_word_layout() {
         let map = CorrectionMap {
             grid: Grid { columns: 2, rows: 3, first_mm: [-1.0, -2.0], spacing_mm: [2.0, 4.0] },
             values_mm: vec![0.0, 0.5, -0.25, 0.0, 0.0, 1.0],
@@ -531,14 +531,14 @@ mod tests {
     }
 
     #[test]
-    fn the_identity_does_not_depend_on_the_wire() {
+    fn identity_independent_of_word_order() {
         let bytes = bytes_of(&plan().words(WordOrder::Big));
         assert_eq!(plan().identity(), <[u8; 32]>::from(Sha256::digest(&bytes)));
         assert_ne!(plan().words(WordOrder::Big), plan().words(WordOrder::Little));
     }
 
     #[test]
-    fn what_no_machine_could_take_is_named() {
+    fn plan_invalid_field_is_named() {
         let mut bad = plan();
         bad.targets[0].point_mm[2] = f64::NAN;
         assert!(bad.invalid_field().is_some_and(|(field, ..)| field.contains("target 9")));
@@ -554,7 +554,7 @@ mod tests {
     }
 
     #[test]
-    fn points_come_in_both_formats() {
+    fn point_decodes_both_formats() {
         let mut writer = Writer::new(WordOrder::Little);
         writer.u32(70_000).u16(1).u16(5).f64s(&[1.5, -2.5, 3.5]);
         let words = writer.finish();
@@ -570,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn no_number_that_is_none_comes_through() {
+    fn point_decode_refuses_non_finite() {
         for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             let mut writer = Writer::new(WordOrder::Big);
             writer.u32(3).u16(1).u16(0).f64s(&[0.0, value, 0.0]);
@@ -582,7 +582,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_registers_read_as_something_and_never_panic(words in prop::collection::vec(any::<u16>(), 0..70), at in 0_usize..80) {
+        fn registers_decode_never_panics(words in prop::collection::vec(any::<u16>(), 0..70), at in 0_usize..80) {
             let registers = Registers::new(&words, WordOrder::Little);
             let _ = (registers.u32(at), registers.f64(at), registers.text(at, 16), registers.identity(at));
             let _ = decode_point(registers, 1, 1.0);
@@ -590,7 +590,7 @@ mod tests {
         }
 
         #[test]
-        fn values_survive_both_orders(whole in any::<u32>(), bits in any::<u64>()) {
+        fn values_round_trip_both_word_orders(whole in any::<u32>(), bits in any::<u64>()) {
             for order in [WordOrder::Big, WordOrder::Little] {
                 let mut writer = Writer::new(order);
                 writer.u32(whole).f64(f64::from_bits(bits));

@@ -574,7 +574,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_answer_is_whole_or_it_is_none() {
+    fn reply_check_refuses_mismatch() {
         let read = LinkRequest::Read { address: 64, count: 2 };
         let write = LinkRequest::Write { address: 40, words: Arc::from([1, 2, 3]) };
         assert_eq!(check(&read, Ok(Ok(Response::ReadHoldingRegisters(vec![7, 8])))), Ok(vec![7, 8]));
@@ -594,7 +594,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_on_a_serial_line_are_three_and_a_half_characters_apart() {
+    fn rtu_silence_is_3_5_characters() {
         let line = |baud| LineAddress::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
         assert_eq!(line(115_200).silence(), Duration::from_micros(1750));
         assert!((line(9_600).silence().as_secs_f64() - 4.0104e-3).abs() < 1e-6);
@@ -602,7 +602,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_line_waits_longer_after_every_failure_and_says_what_the_system_said() {
+    async fn link_backs_off_after_failures() {
         let wire =
             LineAddress::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
         let link = Link::new(wire, Duration::from_millis(50), Duration::ZERO).unwrap();

@@ -51,7 +51,7 @@ mod tests {
     }
 
     #[test]
-    fn swapped_words_are_told_where_the_other_order_is_good() {
+    fn signal_cause_names_swapped_words() {
         let float = |value: f32| [(value.to_bits() >> 16) as u16, value.to_bits() as u16];
         let [first, second] = float(20.25);
         let big = signal(SignalType::F32, WordOrder::Big);

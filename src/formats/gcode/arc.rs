@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arcs_run_where_the_centre_and_the_radius_say() {
+    fn arc_from_centre_or_radius() {
         let (from, to) = (Point::new(10.0, 0.0, 1.0), Point::new(0.0, 10.0, 3.0));
         let arc = Arc::new(Plane::XY, from, to, false, Centre::At([0.0, 0.0])).unwrap();
         assert!((arc.sweep - PI / 2.0).abs() < 1e-12);
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn chords_keep_to_their_tolerance() {
+    fn arc_chords_within_tolerance() {
         let (from, to) = (Point::new(0.0, 5.0, 10.0), Point::new(10.0, 5.0, 0.0));
         let arc = Arc::new(Plane::ZX, from, to, true, Centre::At([0.0, 0.0]));
         let arc = arc.or_else(|_| Arc::new(Plane::ZX, from, to, false, Centre::At([0.0, 0.0]))).unwrap();

@@ -800,7 +800,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_ships_is_without_faults() {
+    fn shipped_dialects_have_no_faults() {
         for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
             let dialect = shipped(name);
             assert_eq!((dialect.dialect.name.as_str(), dialect.faults()), (name, Vec::new()));
@@ -808,7 +808,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn faults_are_told_with_their_keys() {
+    fn dialect_faults_name_keys() {
         let keys = |change: &dyn Fn(&mut Dialect)| {
             let mut dialect = shipped("fanuc");
             change(&mut dialect);
@@ -835,7 +835,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_cannot_be_said_is_refused() {
+    fn post_refuses_unsupported_modes() {
         let [linuxcnc, fanuc, heidenhain] = ["linuxcnc", "fanuc", "heidenhain"].map(shipped);
         let blend = PathMode::Blend;
         assert_eq!(linuxcnc.post(&exactly(blend, 0.1, None, 0.1)).unwrap().mode[0], ["G64 P0.0001 Q0"]);
@@ -854,7 +854,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn arcs_are_refused_without_words_beyond_the_decimals_and_beyond_the_path() {
+    fn post_refuses_arcs_out_of_range() {
         let within = |dialect: &Dialect, um: f64| {
             let exactness = exactly(PathMode::Blend, 0.1, Some(0.1), 0.1);
             dialect.post(&Exactness { arcs_within_mm: Some(1e-3 * um), ..exactness }).map(|post| post.arcs.unwrap().1)
@@ -880,7 +880,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn names_and_numbers_are_those_that_a_control_takes() {
+    fn program_name_and_number_limits() {
         let fanuc = shipped("fanuc");
         assert_eq!(fanuc.name("free-form mirror", 2), "FREE_FORM_MIR_C2");
         assert_eq!(fanuc.name("7 \u{e9}", 65_535), "P7___C65535");

@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_six_decimals_and_no_exponent() {
+    fn push_fixed_six_decimals() {
         let text = |v: f64| {
             let mut text = Vec::new();
             push_fixed(&mut text, rounded(v));
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn every_number_of_decimals_is_written_alike() {
+    fn push_decimals_matches_format() {
         for decimals in 0..=6 {
             for count in [0, 1, -1, 9, 10, -10, 123_456_789, -1_000_000, 999_999] {
                 let mut text = Vec::new();
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn short_numbers_lose_their_zeros_only() {
+    fn short_trims_trailing_zeros() {
         assert_eq!([short(1000.0), short(0.0001), short(-2.5), short(0.0)], ["1000", "0.0001", "-2.5", "0"]);
     }
 }

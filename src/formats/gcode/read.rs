@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_and_comments_are_told_apart() {
+    fn block_splits_words_and_comments() {
         let block = block("n10 G1x-1.5 Y + 2. (to (here) z.25;rest").map(|b| b.words.len());
         // Blanks within a number are not accepted.
         assert!(block.is_err());
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_can_know_is_refused() {
+    fn block_refuses_unsupported_syntax() {
         for line in
             ["/G1 X1", "G1 X#5", "G1 X[1+2]", "O100 call", "G1 X", "G1 X--1", "(open", "G1 X1 $", "G1 X1e", "\u{e9}"]
         {

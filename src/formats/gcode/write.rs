@@ -718,7 +718,7 @@ mod tests {
     }
 
     #[test]
-    fn every_track_says_all_of_its_beginning() {
+    fn track_start_repeats_modal_words() {
         let text = write(&tracks(2), 4).unwrap();
         let lines: Vec<&str> = text.lines().skip_while(|line| !line.starts_with("G0")).collect();
         let first = ["G0 X-1.000000Y0.000000", "Z1.000000", "G1 Z0.000000F600", "X1.000000", "G0 Z5.000000"];
@@ -737,7 +737,7 @@ mod tests {
     }
 
     #[test]
-    fn every_dialect_has_its_own_words_numbers_and_frame() {
+    fn dialects_write_expected_lines() {
         let fanuc = [
             "%",
             "O7001 (PART_C1)",
@@ -815,7 +815,7 @@ mod tests {
     }
 
     #[test]
-    fn every_dialect_has_its_own_words_of_arcs() {
+    fn dialects_write_expected_arcs() {
         let linuxcnc = [
             "G21 G90 G94 G17 G40 G49 G80 G54",
             "G91.1",
@@ -857,7 +857,7 @@ mod tests {
     }
 
     #[test]
-    fn no_line_is_longer_than_a_control_reads_and_its_header_counts_right() {
+    fn line_length_and_header_count() {
         for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
             let dialect = shipped(name);
             let text = write_in(&dialect, &tracks(3), 6).unwrap();
@@ -869,7 +869,7 @@ mod tests {
     }
 
     #[test]
-    fn a_move_that_says_nothing_new_is_no_empty_block_and_numbers_begin_anew() {
+    fn redundant_move_and_block_number_wrap() {
         let feed = |x: f64| Move::Feed { to: Point::new(x, 0.0, 0.0), feed_mm_min: 600.0 };
         let still = vec![vec![Move::RapidZ(5.0), Move::RapidXy([0.0; 2]), feed(1.0), feed(1.0), feed(2.0)].into_iter()];
         let mut dialect = shipped("sinumerik");
@@ -881,7 +881,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dialect_cannot_write_is_refused() {
+    fn write_refuses_values_out_of_range() {
         let one = |at: Point, feed_mm_min: f64| {
             let moves = [Move::RapidZ(5.0), Move::RapidXy([0.0; 2]), Move::RapidZ(1.0)];
             vec![
@@ -903,7 +903,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_that_are_written_at_the_same_time_are_the_same_text() {
+    fn parallel_write_matches_serial() {
         let many = tracks(1000);
         let after_header = |text: String| text[text.find("G0").unwrap()..].to_owned();
         let [at_once, one_by_one] = [2000, u64::MAX].map(|points| after_header(write(&many, points).unwrap()));
@@ -914,7 +914,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_told_by_its_place_in_the_whole() {
+    fn write_error_names_move_number() {
         let mut many = tracks(1000);
         let broken = Move::Feed { to: Point::new(0.0, f64::NAN, 0.0), feed_mm_min: 600.0 };
         many[700] = vec![Move::RapidZ(5.0), broken].into_iter();

@@ -224,9 +224,9 @@ impl LockFolder {
         }
         let lock = File::from(file);
         // A lock file that others have damaged is still the lock, but its content is neither read nor changed.
-        let told = if may_write && !is_spoiled { lock.try_clone().ok() } else { None };
+        let holder_file = if may_write && !is_spoiled { lock.try_clone().ok() } else { None };
         let identity = [found.st_dev, found.st_ino];
-        Ok(LockFile { lock, told, is_spoiled, owner: found.st_uid, identity })
+        Ok(LockFile { lock, holder_file, is_spoiled, owner: found.st_uid, identity })
     }
 
     /// Creates a file with its mode. Succeeds also if another process creates it first.
@@ -283,7 +283,7 @@ const MAX_HOLDER_BYTES: u64 = 4096;
 pub(crate) struct LockFile {
     pub(crate) lock: File,
     /// File that stores the holder and the last epoch; `None` if it must not be written.
-    pub(crate) told: Option<File>,
+    pub(crate) holder_file: Option<File>,
     /// True if others have given the file additional names, or more bytes than a lock file has.
     pub(crate) is_spoiled: bool,
     owner: u32,
@@ -314,7 +314,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_folder_of_a_run_is_its_owners_or_its_groups() {
+    fn run_folder_permissions() {
         let home = tempfile::tempdir().unwrap();
         let mode = |folder: &Path| fs::metadata(folder).unwrap().mode() & 0o7777;
         let own = home.path().join("runs/a");
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn locks_lie_where_every_user_and_session_finds_them() {
+    fn first_for_all_finds_shared_folder() {
         let home = tempfile::tempdir().unwrap();
         let [shared, own] = ["shared", "own"].map(|name| home.path().join(name));
         for (folder, mode) in [(&shared, 0o1777), (&own, 0o755)] {

@@ -121,9 +121,10 @@ impl LockFolder {
         }
         let lock = File::open(&path).map_err(words)?;
         // Nobody can read a locked file: the holder and the epoch are stored in a file next to it.
-        let told = path.with_extension("txt");
-        let told = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(told).ok();
-        Ok(LockFile { lock, told, is_spoiled: false })
+        let path_of_holder = path.with_extension("txt");
+        let holder_file =
+            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path_of_holder).ok();
+        Ok(LockFile { lock, holder_file, is_spoiled: false })
     }
 
     /// Opens the lock file of a machine for this user.
@@ -146,7 +147,7 @@ impl LockFolder {
 pub(crate) struct LockFile {
     pub(crate) lock: File,
     /// File that stores the holder and the last epoch; `None` if it cannot be written.
-    pub(crate) told: Option<File>,
+    pub(crate) holder_file: Option<File>,
     /// True if others have given the file additional names, or more bytes than a lock file has.
     pub(crate) is_spoiled: bool,
 }

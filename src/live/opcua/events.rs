@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cycle_is_told_once_and_those_of_another_run_anew() {
+    fn cycle_events_once_per_run() {
         assert_eq!(cycles(&on("a", 1), &on("a", 3)), [Variant::UInt32(2), Variant::UInt32(3)]);
         assert!(cycles(&on("a", 3), &on("a", 3)).is_empty());
         assert_eq!(cycles(&on("a", 3), &on("b", 1)), [Variant::UInt32(1)]);

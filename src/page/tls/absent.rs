@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_certificate_is_refused_where_there_is_no_tls() {
+    fn certificate_refused_without_tls() {
         let refused = Tls::read(Path::new("cell.pem"), Path::new("cell.key")).err();
         assert!(matches!(refused, Some(TlsError::NotBuilt { certificate }) if certificate == Path::new("cell.pem")));
     }

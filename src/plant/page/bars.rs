@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_day_is_as_high_as_its_parts() {
+    fn bar_heights_match_counts() {
         let day = |ended, accepted, at_once| Day { day: "07-04".into(), count: Count { ended, accepted, at_once } };
         let svg = bars(&[day(0, 0, 0), day(10, 8, 2)]).into_string();
         assert_eq!(svg.matches("<rect").count(), 3, "{svg}");

@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_that_is_silent_is_never_shown_at_work() {
+    fn silent_cell_not_shown_running() {
         for heard in [None, Some(61.0), Some(1e9), Some(f64::NAN)] {
             let silent = cell("Execute", heard.filter(|heard| !heard.is_nan()), 0);
             assert_eq!(silent.display_state(), DisplayState::Silent);
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cell_tells_is_words() {
+    fn cell_card_escapes_html() {
         let card = card(&cell("Execute", Some(1.0), 0)).into_string();
         assert!(!card.contains("<script>") && !card.contains("<i>") && !card.contains('\u{202e}'), "{card}");
         assert!(card.contains("name=r%26s") && card.contains("1 – 2 min") && card.contains("SIMULATION"), "{card}");

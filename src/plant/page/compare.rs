@@ -193,7 +193,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_lie_between_values() {
+    fn quantile_interpolates() {
         let sorted = [1.0, 2.0, 4.0];
         assert_eq!(
             [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&sorted, share)),
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_that_is_worse_is_told_and_its_like_are_not() {
+    fn chances_flag_worse_cell() {
         let cell = |shift: f64| Cell {
             pv_um: (0..30).map(|k| 3.0 + shift + 0.05 * f64::from(k)).collect(),
             ..Cell::default()

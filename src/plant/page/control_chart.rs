@@ -251,7 +251,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_limits_are_those_of_a_worked_example() {
+    fn limits_match_nist_example() {
         // NIST/SEMATECH e-Handbook 6.3.2.2: ten batches, mean 50.81, mean range 1.8778, limits 45.82 and 55.80.
         let flow = [49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1];
         let limits = Limits::from_values(&flow).unwrap();
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn no_limit_lies_where_no_figure_can() {
+    fn lower_limit_is_never_negative() {
         let limits = Limits::from_values(&[1.0, 4.0, 1.0]).unwrap();
         assert_eq!(limits.lower, None);
         assert!(!limits.is_out(0.0));
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_has_another_shape_and_names_stay_words() {
+    fn control_chart_marks_out_of_limits() {
         let value = |um: f64| Value {
             run: 7,
             serial: "<b>\"&".into(),

@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_field_is_one_field_and_no_formula() {
+    fn csv_quoting_and_formula_guard() {
         assert_eq!(quoted("a \"b\",\r\nc"), "\"a \"\"b\"\",\r\nc\"");
         assert_eq!(quoted("=1+1"), "\"'=1+1\"");
         assert!(NUMBERS.iter().all(|name| COLUMNS.contains(name)));

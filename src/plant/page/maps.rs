@@ -195,7 +195,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_are_named_by_numbers_alone() {
+    fn query_accepts_run_numbers_only() {
         let of = |run, cycle| MapRequest { run, cycle };
         assert_eq!(parse_requests("run=17&run=18:2&run=9%3A1&x=3"), [of(17, None), of(18, Some(2)), of(9, Some(1))]);
         assert_eq!(parse_requests("run=1;DROP&run=&run=%3A&run=1:x"), []);
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_share_one_scale_and_what_is_none_is_said() {
+    fn maps_use_one_scale_and_show_errors() {
         let map = |um: f64, samples: bool| Map {
             run: 1,
             cycle: 2,

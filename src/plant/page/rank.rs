@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rank_sum_is_that_of_a_worked_example() {
+    fn rank_sum_matches_scipy() {
         // scipy.stats.mannwhitneyu(one, other, method="asymptotic"): U = 57, p = 0.14263.
         let one = [0.8, 0.83, 1.89, 1.04, 1.45, 1.38, 1.91, 1.64, 0.73, 1.46];
         let other = [1.15, 0.88, 0.9, 0.74, 1.21, 0.85, 0.81, 0.92];
@@ -88,14 +88,14 @@ mod tests {
     }
 
     #[test]
-    fn many_looks_make_chance_likelier() {
+    fn holm_correction() {
         let corrected = holm(&[Some(0.01), None, Some(0.04), Some(0.03)]);
         let near = |k: usize, known: f64| (corrected[k].unwrap() - known).abs() < 1e-12;
         assert!(near(0, 0.03) && near(2, 0.06) && near(3, 0.06) && corrected[1].is_none(), "{corrected:?}");
     }
 
     #[test]
-    fn the_tail_of_the_normal_distribution_is_known() {
+    fn erfc_matches_table() {
         for (x, known) in [(0.0, 1.0), (0.5, 0.479_500_122), (1.0, 0.157_299_207), (2.0, 0.004_677_735)] {
             assert!((erfc(x) / known - 1.0).abs() < 2e-7, "{x}");
         }

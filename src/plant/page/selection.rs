@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_values_and_never_text_of_a_question() {
+    fn condition_binds_names_as_parameters() {
         let hostile = "x' OR '1'='1";
         let (text, values) = selection(["", hostile, "", "", "R 5", ""]).condition();
         assert!(!text.contains(hostile) && text.ends_with("AND cell = $3 AND wheel = $4"), "{text}");
@@ -212,13 +212,13 @@ mod tests {
     }
 
     #[test]
-    fn an_address_says_what_is_looked_at() {
+    fn selection_query_string() {
         let query = selection(["a&b", "", "", "", "", ""]).query();
         assert_eq!(query, "recipe=a%26b&since=2026-07-01&until=2026-07-04&parts=simulated&at=last");
     }
 
     #[test]
-    fn what_is_no_day_is_refused() {
+    fn day_refuses_invalid_dates() {
         assert!(matches!(day("yesterday"), Err(Unmade::Nonsense(_))) && matches!(day(" "), Ok(None)));
         assert!(matches!(day("-9999-01-01"), Err(Unmade::Nonsense(_))));
     }

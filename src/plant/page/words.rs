@@ -79,12 +79,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_address_holds_any_text() {
+    fn encoded_escapes_any_text() {
         assert_eq!(encoded("a b&c=<\u{e4}>'"), "a%20b%26c%3D%3C%C3%A4%3E%27");
     }
 
     #[test]
-    fn the_interval_of_a_share_is_that_of_wilson() {
+    fn wilson_interval_matches_table() {
         // 8 of 10: 0.4902 to 0.9433, as in published tables.
         let [low, high] = wilson(8.0, 10.0);
         assert!((low - 0.4902).abs() < 1e-4 && (high - 0.9433).abs() < 1e-4, "{low} {high}");

@@ -250,7 +250,7 @@ fn made_anew(text: &str) -> (String, Vec<String>) {
 }
 
 #[test]
-fn what_is_made_stands_in_the_book() {
+fn generated_text_is_current() {
     for page in TYPED {
         let text = text_of(page);
         let (anew, _) = made_anew(&text);
@@ -266,7 +266,7 @@ fn what_is_made_stands_in_the_book() {
 }
 
 #[test]
-fn the_lists_that_are_made_are_all_that_there_are() {
+fn generated_lists_are_complete() {
     for (page, kind) in [("recipes.md", "recipe"), ("commissioning.md", "cell"), ("dialects.md", "dialect")] {
         let (_, found) = made_anew(&text_of(page));
         let listed: BTreeSet<String> = found

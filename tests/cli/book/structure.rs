@@ -42,7 +42,7 @@ fn listed() -> Vec<String> {
 }
 
 #[test]
-fn the_summary_lists_every_page_that_there_is() {
+fn summary_lists_every_page() {
     let listed = listed();
     for page in fs::read_dir(root().join("docs")).unwrap().map(|entry| entry.unwrap().path()) {
         let name = page.file_name().unwrap().to_string_lossy().into_owned();
@@ -54,7 +54,7 @@ fn the_summary_lists_every_page_that_there_is() {
 }
 
 #[test]
-fn every_link_of_a_page_leads_somewhere() {
+fn page_links_resolve() {
     for page in listed() {
         let text = text_of(&page);
         for link in links(&text) {
@@ -71,7 +71,7 @@ fn every_link_of_a_page_leads_somewhere() {
 }
 
 #[test]
-fn next_to_nothing_is_left_untyped() {
+fn few_blocks_are_untyped() {
     let mut untyped = 0;
     for page in TYPED {
         for block in blocks(&text_of(page)) {
@@ -87,7 +87,7 @@ fn next_to_nothing_is_left_untyped() {
 }
 
 #[test]
-fn a_source_that_a_page_points_at_is_there() {
+fn source_paths_in_pages_exist() {
     for page in TYPED {
         let text = text_of(page);
         for word in

@@ -70,66 +70,66 @@ async fn assert_resumed(bench: &mut Bench, ended: Result<Status, DeviceError>) {
 }
 
 #[tokio::test]
-async fn a_late_acknowledgement_is_waited_for() {
+async fn late_acknowledgement_accepted() {
     let (mut bench, ended) =
         run_with_touch_fault(Fault::LateAcknowledgement(Duration::from_millis(50)), patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn an_acknowledgement_that_does_not_come_in_time_ends_the_connection() {
+async fn acknowledgement_timeout_disconnects() {
     let (mut bench, ended) = run_with_touch_fault(Fault::LateAcknowledgement(Duration::from_secs(3600)), hasty()).await;
     assert!(matches!(ended, Err(DeviceError::TimedOut { .. })), "{ended:?}");
     assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn a_touch_that_is_never_said_to_be_over_ends_the_connection() {
+async fn touch_completion_timeout_disconnects() {
     let (mut bench, ended) = run_with_touch_fault(Fault::NoCompletion, hasty()).await;
     assert!(matches!(ended, Err(DeviceError::TimedOut { .. })), "{ended:?}");
     assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn data_that_come_twice_are_one_point() {
+async fn duplicate_data_is_one_point() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Twice, patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn a_line_that_comes_byte_for_byte_is_one_line() {
+async fn split_line_is_one_line() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Split, patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn fields_are_known_by_their_names_in_whatever_order_they_come() {
+async fn reordered_fields_found_by_name() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Reordered, patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn a_quality_that_comes_twice_spoils_no_coordinate() {
+async fn extra_quality_in_touch_ignored() {
     let (mut bench, ended) = run_with_touch_fault(Fault::UnaskedQuality, patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn a_garbled_line_is_no_point_and_ends_the_connection() {
+async fn garbled_line_disconnects() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Garbled, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Unreadable { .. })), "{ended:?}");
     assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn data_of_a_command_that_was_never_given_are_no_point() {
+async fn unrequested_data_disconnects() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Stranger, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Unreadable { .. })), "{ended:?}");
     assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn a_connection_that_ends_in_a_job_loses_no_point() {
+async fn disconnect_in_job_preserves_points() {
     let (mut bench, ended) = run_with_touch_fault(Fault::Disconnect, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Disconnected { .. })), "{ended:?}");
     let plan = bench.plan(8);
@@ -144,13 +144,13 @@ async fn a_connection_that_ends_in_a_job_loses_no_point() {
 }
 
 #[tokio::test]
-async fn an_error_in_a_session_that_is_being_opened_is_cleared_away() {
+async fn session_start_error_cleared() {
     let (mut bench, ended) = run_with_fault("GetPropX", 0, Fault::Twice, patient()).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn an_emergency_stop_faults_and_is_told_as_that() {
+async fn emergency_stop_in_job_faults() {
     let (mut bench, ended) = run_with_touch_fault(Fault::EmergencyStop, patient()).await;
     let status = ended.unwrap();
     assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::StopCircuit)));
@@ -160,7 +160,7 @@ async fn an_emergency_stop_faults_and_is_told_as_that() {
 }
 
 #[tokio::test]
-async fn an_emergency_stop_between_jobs_is_seen() {
+async fn emergency_stop_between_jobs_faults() {
     let limits = regrind::device::ippdme::Limits { alive: Duration::from_millis(5), ..patient() };
     let mut bench = Bench::new(FAST, limits).await;
     bench.cmm.connect().await.unwrap();
@@ -170,7 +170,7 @@ async fn an_emergency_stop_between_jobs_is_seen() {
 }
 
 #[tokio::test]
-async fn a_stop_that_a_server_only_warns_of_stops_all_the_same() {
+async fn travel_limit_warning_faults() {
     let mut bench = Bench::new(FAST, patient()).await;
     // Outside the volume of the machine, which is smaller than in the cell file.
     bench.faults.add("GoTo", 0, Fault::Severity(1));
@@ -188,7 +188,7 @@ async fn a_stop_that_a_server_only_warns_of_stops_all_the_same() {
 }
 
 #[tokio::test]
-async fn a_miss_that_needs_an_operator_is_not_tried_again() {
+async fn miss_needing_operator_not_retried() {
     let spec = regrind_sim::spec::CmmSpec { not_found_share: 1.0, ..regrind_sim::spec::CmmSpec::perfect() };
     let mut bench = Bench::measuring(spec, FAST, patient(), regrind_sim::dme::machine::Options::default()).await;
     bench.faults.add("PtMeas", 0, Fault::Severity(3));
@@ -199,7 +199,7 @@ async fn a_miss_that_needs_an_operator_is_not_tried_again() {
 }
 
 #[tokio::test]
-async fn an_abort_that_the_server_does_not_carry_out_is_not_taken_for_done() {
+async fn ignored_abort_is_link_error() {
     let mut bench = Bench::new(1.0, hasty()).await;
     bench.faults.add("AbortE", 0, Fault::AbortIgnored);
     let plan = bench.plan(8);
@@ -211,7 +211,7 @@ async fn an_abort_that_the_server_does_not_carry_out_is_not_taken_for_done() {
 }
 
 #[tokio::test]
-async fn a_silence_in_a_motion_is_asked_about_and_the_motion_goes_on() {
+async fn silent_motion_is_polled_and_continues() {
     let limits = regrind::device::ippdme::Limits { alive: Duration::from_millis(3), ..patient() };
     let mut bench = Bench::new(200.0, limits).await;
     let plan = bench.plan(8);

@@ -15,7 +15,7 @@ const FAST: f64 = 5000.0;
 const SLOW: f64 = 50.0;
 
 #[tokio::test]
-async fn a_plan_is_measured_and_its_points_are_those_of_the_part() {
+async fn ippdme_plan_measured_on_part() {
     let mut bench = Bench::new(FAST, patient()).await;
     let plan = Plan { careful_start: Some(CarefulStart { target_count: 2, speed_mm_s: 0.5 }), ..bench.plan(20) };
     let armed = bench.begin(&plan).await.unwrap();
@@ -31,7 +31,7 @@ async fn a_plan_is_measured_and_its_points_are_those_of_the_part() {
 }
 
 #[tokio::test]
-async fn the_part_in_a_frame_of_its_own_gives_the_same_points() {
+async fn part_frame_gives_same_points() {
     let bench = Bench::new(FAST, patient()).await;
     let plan = bench.plan(10);
     // The part's frame equals that of the machine here, once by zeros and once by a full turn.
@@ -47,7 +47,7 @@ async fn the_part_in_a_frame_of_its_own_gives_the_same_points() {
 }
 
 #[tokio::test]
-async fn points_come_ahead_each_once_and_in_the_order_of_the_plan() {
+async fn ippdme_read_ahead_in_plan_order() {
     let mut bench = Bench::new(500.0, patient()).await;
     let plan = bench.plan(15);
     bench.begin(&plan).await.unwrap();
@@ -67,7 +67,7 @@ async fn points_come_ahead_each_once_and_in_the_order_of_the_plan() {
 }
 
 #[tokio::test]
-async fn a_hold_retracts_and_a_resume_touches_what_is_left() {
+async fn hold_retracts_resume_touches_rest() {
     let mut bench = Bench::new(SLOW, patient()).await;
     let plan = bench.plan(10);
     bench.begin(&plan).await.unwrap();
@@ -86,7 +86,7 @@ async fn a_hold_retracts_and_a_resume_touches_what_is_left() {
 }
 
 #[tokio::test]
-async fn a_stop_ends_it_in_order_and_gives_no_measurement() {
+async fn stop_gives_no_measurement() {
     let mut bench = Bench::new(SLOW, patient()).await;
     let plan = bench.plan(20);
     bench.begin(&plan).await.unwrap();
@@ -99,7 +99,7 @@ async fn a_stop_ends_it_in_order_and_gives_no_measurement() {
 }
 
 #[tokio::test]
-async fn an_abort_ends_it_where_it_is_and_the_machine_can_be_used_again() {
+async fn abort_then_clear_allows_prepare() {
     let mut bench = Bench::new(1.0, patient()).await;
     let plan = bench.plan(20);
     bench.begin(&plan).await.unwrap();
@@ -113,7 +113,7 @@ async fn an_abort_ends_it_where_it_is_and_the_machine_can_be_used_again() {
 }
 
 #[tokio::test]
-async fn a_start_is_taken_once() {
+async fn start_accepted_once() {
     let mut bench = Bench::new(1.0, patient()).await;
     let plan = bench.plan(5);
     let armed = bench.begin(&plan).await.unwrap();
@@ -122,7 +122,7 @@ async fn a_start_is_taken_once() {
 }
 
 #[tokio::test]
-async fn a_program_that_is_started_again_says_that_the_points_are_gone() {
+async fn restarted_program_reports_lost_points() {
     let mut bench = Bench::new(SLOW, patient()).await;
     let plan = bench.plan(20);
     let armed = bench.begin(&plan).await.unwrap();
@@ -142,7 +142,7 @@ async fn a_program_that_is_started_again_says_that_the_points_are_gone() {
 }
 
 #[tokio::test]
-async fn a_plan_that_leads_out_of_the_volume_is_refused_before_anything_moves() {
+async fn plan_outside_volume_refused() {
     let mut bench = Bench::new(FAST, patient()).await;
     let plan = Plan { safe_height_mm: 450.0, ..bench.plan(5) };
     bench.cmm.connect().await.unwrap();
@@ -153,7 +153,7 @@ async fn a_plan_that_leads_out_of_the_volume_is_refused_before_anything_moves() 
 }
 
 #[tokio::test]
-async fn a_probe_of_another_radius_touches_nothing() {
+async fn wrong_probe_radius_faults() {
     let tools = vec![("NoTool".to_owned(), 0.0), ("Probe1".to_owned(), 1.52)];
     let mut bench = Bench::with(FAST, patient(), Options { tools, ..Options::default() }).await;
     let plan = bench.plan(5);
@@ -164,7 +164,7 @@ async fn a_probe_of_another_radius_touches_nothing() {
 }
 
 #[tokio::test]
-async fn a_tool_that_the_server_has_not_is_named_with_those_it_has() {
+async fn missing_tool_lists_available_tools() {
     let tools = vec![("Star".to_owned(), 1.5)];
     let mut bench = Bench::with(FAST, patient(), Options { tools, ..Options::default() }).await;
     let error = bench.cmm.connect().await.unwrap_err().to_string();
@@ -172,7 +172,7 @@ async fn a_tool_that_the_server_has_not_is_named_with_those_it_has() {
 }
 
 #[tokio::test]
-async fn a_real_machine_is_not_taken_for_a_simulation() {
+async fn real_machine_refused_as_simulation() {
     let class = "CartCMM".to_owned();
     let mut bench = Bench::with(FAST, patient(), Options { class, ..Options::default() }).await;
     let error = bench.cmm.connect().await.unwrap_err();
@@ -180,7 +180,7 @@ async fn a_real_machine_is_not_taken_for_a_simulation() {
 }
 
 #[tokio::test]
-async fn speeds_that_the_machine_keeps_lower_are_told_and_used() {
+async fn lower_machine_speed_is_reported() {
     let mut bench = Bench::with(FAST, patient(), Options { max_speeds_mm_s: [50.0, 2.0], ..Options::default() }).await;
     let plan = bench.plan(5);
     bench.begin(&plan).await.unwrap();
@@ -190,7 +190,7 @@ async fn speeds_that_the_machine_keeps_lower_are_told_and_used() {
 }
 
 #[tokio::test]
-async fn targets_that_are_missed_are_tried_again_and_then_told() {
+async fn missed_targets_retried_then_reported() {
     let spec = CmmSpec { not_found_share: 0.5, ..CmmSpec::perfect() };
     let mut bench = Bench::measuring(spec, FAST, patient(), Options::default()).await;
     let plan = bench.plan(20);
@@ -205,7 +205,7 @@ async fn targets_that_are_missed_are_tried_again_and_then_told() {
 }
 
 #[tokio::test]
-async fn a_second_client_waits_until_the_first_has_gone() {
+async fn second_client_connects_after_release() {
     let mut bench = Bench::new(FAST, patient()).await;
     bench.cmm.connect().await.unwrap();
     let mut other = bench.another();
@@ -215,7 +215,7 @@ async fn a_second_client_waits_until_the_first_has_gone() {
 }
 
 #[tokio::test]
-async fn a_job_that_nobody_looks_at_holds_by_itself() {
+async fn job_without_status_polls_holds() {
     let mut bench = Bench::new(SLOW, patient()).await;
     let mut settings = settings(bench.serving.local_addr().port(), patient());
     settings.silence_limit = std::time::Duration::ZERO;

@@ -31,7 +31,7 @@ fn serve() -> (Python, u16) {
 
 #[tokio::test]
 #[ignore = "needs a Python"]
-async fn a_cap_of_a_sphere_is_measured() {
+async fn other_server_measures_sphere_cap() {
     let (_python, port) = serve();
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
     let identity = cmm.connect().await.unwrap();

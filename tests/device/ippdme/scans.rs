@@ -54,7 +54,7 @@ async fn assert_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) 
 }
 
 #[tokio::test]
-async fn rows_are_scanned_and_each_point_lies_at_its_target() {
+async fn rows_scanned_at_their_targets() {
     let (mut bench, ended) = run_with_fault(None).await;
     assert_measured(&mut bench, ended).await;
     // A scan counts as one contact, however many points it brings: three rows and a touch, compared with 37 touches.
@@ -62,13 +62,13 @@ async fn rows_are_scanned_and_each_point_lies_at_its_target() {
 }
 
 #[tokio::test]
-async fn a_quality_that_nobody_asked_for_is_no_coordinate() {
+async fn extra_quality_in_scan_ignored() {
     let (mut bench, ended) = run_with_fault(Some(Fault::UnaskedQuality)).await;
     assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
-async fn lines_that_come_twice_or_byte_for_byte_are_one() {
+async fn duplicate_or_split_scan_line_is_one() {
     for fault in [Fault::Twice, Fault::Split] {
         let (mut bench, ended) = run_with_fault(Some(fault)).await;
         assert_measured(&mut bench, ended).await;
@@ -85,17 +85,17 @@ async fn assert_scan_refused(fault: Fault, says: &str) {
 }
 
 #[tokio::test]
-async fn a_point_that_is_missing_makes_no_other_one_wrong() {
+async fn scan_refuses_missing_point() {
     assert_scan_refused(Fault::PointLost, "one point at each target").await;
 }
 
 #[tokio::test]
-async fn points_that_stand_for_their_neighbours_are_refused() {
+async fn scan_refuses_shifted_points() {
     assert_scan_refused(Fault::PointsShifted, "the lateral distance").await;
 }
 
 #[tokio::test]
-async fn a_connection_that_ends_in_a_scan_takes_nothing_of_it_and_the_row_is_scanned_again() {
+async fn disconnect_in_scan_rescans_row() {
     let (mut bench, ended) = run_with_fault(Some(Fault::CutInScan)).await;
     let error = ended.unwrap_err();
     assert!(error.is_link(), "{error}");
@@ -108,7 +108,7 @@ async fn a_connection_that_ends_in_a_scan_takes_nothing_of_it_and_the_row_is_sca
 }
 
 #[tokio::test]
-async fn a_row_that_loses_the_surface_is_touched() {
+async fn row_losing_surface_is_touched() {
     let mut bench = scanning(FAST, CmmSpec { not_found_share: 0.1, ..CmmSpec::perfect() }).await;
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
@@ -135,7 +135,7 @@ async fn in_the_second_row(speed_mm_s: f64) -> Bench {
 }
 
 #[tokio::test]
-async fn a_hold_in_a_scan_begins_no_other_row_until_it_is_resumed() {
+async fn hold_in_scan_defers_next_row() {
     // The row ends after about five seconds.
     let mut bench = in_the_second_row(10.0).await;
     assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
@@ -148,7 +148,7 @@ async fn a_hold_in_a_scan_begins_no_other_row_until_it_is_resumed() {
 }
 
 #[tokio::test]
-async fn an_abort_in_a_scan_ends_it_there() {
+async fn abort_in_scan_ends_row() {
     // The row takes half a minute, and nobody waits for it.
     let mut bench = in_the_second_row(0.4).await;
     bench.cmm.abort().await.unwrap();
@@ -161,12 +161,12 @@ async fn an_abort_in_a_scan_ends_it_there() {
 }
 
 #[tokio::test]
-async fn numbers_that_come_in_another_order_are_no_points() {
+async fn scan_refuses_reordered_values() {
     assert_scan_refused(Fault::Reordered, "from the target").await;
 }
 
 #[tokio::test]
-async fn where_nobody_knows_the_radius_of_the_tool_rows_are_touched() {
+async fn unknown_tool_radius_touches_rows() {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     bench.serving.with(|server| server.machine().hide_radius());
     let plan = rows(&bench);
@@ -177,7 +177,7 @@ async fn where_nobody_knows_the_radius_of_the_tool_rows_are_touched() {
 }
 
 #[tokio::test]
-async fn a_probe_that_cannot_scan_is_told_as_a_matter_of_the_tool() {
+async fn non_scanning_probe_is_tool_fault() {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     bench.serving.with(|server| server.machine().disable_scanning());
     let plan = rows(&bench);

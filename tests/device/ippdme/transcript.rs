@@ -89,7 +89,7 @@ fn plan() -> Plan {
 }
 
 #[tokio::test]
-async fn a_session_is_written_as_the_standard_has_it() {
+async fn ippdme_session_golden_transcript() {
     let (port, heard) = canned(answers).await;
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
     cmm.connect().await.unwrap();
@@ -125,7 +125,7 @@ async fn a_session_is_written_as_the_standard_has_it() {
 }
 
 #[tokio::test]
-async fn an_abort_goes_out_while_a_motion_is_not_over() {
+async fn abort_sent_during_motion() {
     // The server never reports the end of the motion, but accepts the abort.
     let (port, heard) = canned(|said| if said.starts_with("GoTo") { None } else { answers(said) }).await;
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
@@ -142,7 +142,7 @@ async fn an_abort_goes_out_while_a_motion_is_not_over() {
 }
 
 #[tokio::test]
-async fn an_abort_behind_a_lost_connection_is_the_first_thing_over_the_next() {
+async fn abort_is_first_after_reconnect() {
     let (port, heard) = canned(|said| if said.starts_with("GoTo") { Some(HANGS_UP) } else { answers(said) }).await;
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
     cmm.connect().await.unwrap();
@@ -157,7 +157,7 @@ async fn an_abort_behind_a_lost_connection_is_the_first_thing_over_the_next() {
 }
 
 #[tokio::test]
-async fn a_touch_that_lies_where_it_was_not_sent_is_no_point() {
+async fn touch_off_target_faults() {
     let elsewhere = |said: &str| {
         if said.starts_with("PtMeas") { Some("# X(10), Y(20), Z(16.6)") } else { answers(said) }
     };
@@ -170,7 +170,7 @@ async fn a_touch_that_lies_where_it_was_not_sent_is_no_point() {
 }
 
 #[tokio::test]
-async fn a_touch_without_all_its_coordinates_is_no_point() {
+async fn touch_with_bad_coordinates_faults() {
     for line in ["# X(10), Y(20)", "# X(10), Y(20), Z(6.6), Z(6.7)", ""] {
         let (port, _) = match line {
             "" => canned(|said| if said.starts_with("PtMeas") { Some("") } else { answers(said) }).await,

@@ -37,7 +37,7 @@ fn refused(text: &str) -> Vec<(&str, u16)> {
 
 #[test]
 #[ignore = "needs the real measurements that REGRIND_DATA names"]
-fn every_good_command_comes_back_in_one_form() {
+fn vector_commands_round_trip() {
     let texts = files("txt");
     let (mut good, mut wrong) = (0, Vec::new());
     for (name, program) in files("prg") {
@@ -64,7 +64,7 @@ fn every_good_command_comes_back_in_one_form() {
 
 #[test]
 #[ignore = "needs the real measurements that REGRIND_DATA names"]
-fn every_bad_command_is_refused_by_its_number() {
+fn vector_bad_commands_give_error_code() {
     let (mut seen, mut wrong) = (0, Vec::new());
     for (name, text) in
         files("txt").iter().filter(|(name, _)| matches!(name.as_str(), "parserCmdErrors" | "numbersErrorCmd"))
@@ -83,7 +83,7 @@ fn every_bad_command_is_refused_by_its_number() {
 
 #[test]
 #[ignore = "needs the real measurements that REGRIND_DATA names"]
-fn every_answer_is_read() {
+fn vector_responses_parse() {
     let (mut good, mut wrong) = (0, Vec::new());
     for (name, answers) in
         files("res").iter().filter(|(name, _)| !matches!(name.as_str(), "parserResErrors" | "numbersErrorRes"))
@@ -101,7 +101,7 @@ fn every_answer_is_read() {
 
 #[test]
 #[ignore = "needs the real measurements that REGRIND_DATA names"]
-fn no_broken_number_becomes_a_value() {
+fn vector_broken_numbers_refused() {
     for (_, answers) in files("res").iter().filter(|(name, _)| name == "numbersErrorRes") {
         // A number with more digits than the standard allows is still a number.
         let broken = lines(answers).filter(|line| !line.contains("12345678901234567"));

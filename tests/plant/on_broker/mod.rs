@@ -79,7 +79,7 @@ fn no_fault(host: &mut Peer) {
 
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
-fn a_host_sees_what_the_cell_tells_and_its_commands_are_refused_and_recorded() {
+fn sparkplug_values_and_refused_commands() {
     let mut told = PublishingCell::new();
     let mut teller = told.publish();
     let birth = heard(&mut told.host, 0, "NBIRTH");
@@ -159,7 +159,7 @@ fn a_host_sees_what_the_cell_tells_and_its_commands_are_refused_and_recorded() {
 
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
-fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
+fn sparkplug_births_survive_restarts() {
     let mut told = PublishingCell::new();
     let mut teller = told.publish();
     heard(&mut told.host, 0, "NBIRTH");
@@ -195,7 +195,7 @@ fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
 
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
-fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
+fn sparkplug_killed_run_is_not_idle() {
     let mut told = PublishingCell::new();
     let recipe = small_recipe(told.home.path(), 1000.0).display().to_string();
     let (code, out, errors) = run(&["run", &recipe, "--cell", "sim", "--plant", "plant.toml"], told.home.path());
@@ -236,7 +236,7 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
 
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
-fn a_run_that_answers_no_more_is_not_told_as_it_was() {
+fn sparkplug_silent_run_is_unknown() {
     let mut told = PublishingCell::new();
     let mut teller = told.publish();
     let (running, folder, _) = held_run(told.home.path(), 200.0);
@@ -257,7 +257,7 @@ fn a_run_that_answers_no_more_is_not_told_as_it_was() {
 
 #[test]
 #[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
-fn a_broker_is_told_that_proves_itself_and_no_other() {
+fn broker_certificate_is_verified() {
     let [its, foreign] = [(), ()].map(|()| rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap());
     let lines =
         "allow_anonymous false\npassword_file FOLDER/passwords\ncertfile FOLDER/cert.pem\nkeyfile FOLDER/key.pem\n";

@@ -69,7 +69,7 @@ fn events(client: &mut Peer, what: &str, is_it: impl Fn(&Value) -> bool) -> Vec<
 
 #[test]
 #[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
-fn a_client_sees_the_model_of_packml_values_and_results_and_its_writes_are_refused_and_recorded() {
+fn opcua_values_and_refused_writes() {
     let home = home();
     let (mut teller, url) = start_publishing(home.path());
     let mut client = client(home.path(), &url);
@@ -212,7 +212,7 @@ fn read_pv(summary: &regrind::report::RunSummary) -> Value {
 
 #[test]
 #[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
-fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
+fn opcua_reconnects_after_server_kill() {
     let home = home();
     let (teller, url) = start_publishing(home.path());
     let mut first = client(home.path(), &url);
@@ -244,7 +244,7 @@ fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
 }
 
 #[test]
-fn a_server_for_other_computers_is_refused_with_the_way_to_do_it() {
+fn opcua_refuses_public_address() {
     let home = home();
     let text = "[plant]\ncell = \"cell-1\"\n\n[opcua]\nlisten = \"0.0.0.0:4840\"\n";
     fs::write(home.path().join("plant.toml"), text).unwrap();

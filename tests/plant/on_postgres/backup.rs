@@ -10,7 +10,7 @@ use crate::postgres::Postgres;
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_plant_comes_back_from_its_backup() {
+fn plant_restored_from_backup() {
     let mut plant = Plant::new();
     let (_, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);

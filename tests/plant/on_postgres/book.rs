@@ -39,7 +39,7 @@ fn typed(home: &Path, text: &str) -> String {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn the_page_of_the_plant_is_walked_through() {
+fn plant_guide_walked_through() {
     let mut postgres = Postgres::start();
     let home = TempDir::new().unwrap();
     let at = |name: &str| home.path().join(name);

@@ -51,7 +51,7 @@ fn first_rms_mm(run: &Path) -> f64 {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_second_cells_first_part_begins_with_what_the_first_one_taught() {
+fn second_cell_starts_from_learned_error() {
     let (mut plant, taught_by) = taught();
     // The similarity of the machines is unknown. In that case the learned form has no weight, and does no harm.
     let (alone, said) = made(&plant, "cell-2", "2");
@@ -91,7 +91,7 @@ fn a_second_cells_first_part_begins_with_what_the_first_one_taught() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn lessons_are_told_by_their_own_run_alone_and_read_by_asking() {
+fn learned_error_access_rights() {
     let (plant, _) = taught();
     assert_eq!(plant.asked_by("cell-2", "SELECT * FROM lesson").unwrap(), "");
     for by_hand in ["SELECT * FROM newest_lesson", "INSERT INTO lesson SELECT * FROM lesson", "DELETE FROM lesson"] {
@@ -117,7 +117,7 @@ fn lessons_are_told_by_their_own_run_alone_and_read_by_asking() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_lesson_that_cannot_be_believed_is_left_alone_and_told() {
+fn forged_learned_error_is_ignored() {
     let (plant, taught_by) = taught();
     states(&plant, "0.1");
     // An attacker with all rights to the database: a content under a wrong hash, and under the right one.

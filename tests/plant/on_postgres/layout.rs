@@ -4,7 +4,7 @@ use crate::Plant;
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_layout_that_is_not_ours_is_refused() {
+fn unknown_database_layout_refused() {
     let plant = Plant::new();
     let init = ["plant", "init", "--plant", "owner.toml"];
     assert!(plant.does(&init).contains("as it was"));
@@ -34,7 +34,7 @@ fn a_layout_that_is_not_ours_is_refused() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn what_cannot_be_reached_or_read_is_told_with_the_remedy() {
+fn connection_errors_name_remedy() {
     let mut plant = Plant::new();
     plant.cell("cell-1", &[]);
     let ship = ["ship", "--once", "--plant", "cell-1.toml"];

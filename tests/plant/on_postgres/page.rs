@@ -151,7 +151,7 @@ fn grinding(serial: &str) -> Value {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn what_one_cell_tells_amiss_leaves_the_others_alone() {
+fn malformed_cell_state_is_isolated() {
     let plant = Plant::new();
     let [one, two] = ["cell-1", "cell-2"].map(|name| cell(&plant, name));
     store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
@@ -165,7 +165,7 @@ fn what_one_cell_tells_amiss_leaves_the_others_alone() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
+fn overview_shows_cells_and_yield() {
     let plant = Plant::new();
     let [one, two, three] = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
     store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
@@ -214,7 +214,7 @@ fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn trends_have_the_limits_of_the_handbook_and_other_programs_read_them() {
+fn trend_control_limits_and_export() {
     let plant = Plant::new();
     let [one, two] = ["cell-1", "cell-2"].map(|name| cell(&plant, name));
     let serials: Vec<String> = (0..FLOW.len()).map(|k| format!("SN-{k:02}")).collect();
@@ -290,7 +290,7 @@ fn read_dfq(path: &Path) -> Value {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn cells_that_differ_are_told_and_parts_are_found() {
+fn cell_difference_and_part_search() {
     let plant = Plant::new();
     let cells = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
     let serials: Vec<String> = (0..120).map(|k| format!("SN-{k:03}")).collect();
@@ -336,7 +336,7 @@ fn cells_that_differ_are_told_and_parts_are_found() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn what_a_cell_is_called_or_says_is_words_on_every_page() {
+fn hostile_text_is_escaped_on_pages() {
     let plant = Plant::new();
     let one = cell(&plant, &HOSTILE[..80]);
     let mut told = grinding(HOSTILE);
@@ -399,7 +399,7 @@ fn what_a_cell_is_called_or_says_is_words_on_every_page() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_run_is_proven_before_anything_is_made_of_it() {
+fn unproven_run_gives_no_report() {
     let plant = Plant::new();
     let (folder, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
@@ -458,7 +458,7 @@ fn until_proven(shown: &ServedPage, path: &str) -> String {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
+fn page_recovers_from_lost_database() {
     let mut plant = Plant::new();
     let one = cell(&plant, "cell-1");
     plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
@@ -489,7 +489,7 @@ fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn the_page_is_for_who_has_its_key_and_changes_nothing() {
+fn plant_page_needs_key_and_is_read_only() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
     plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
@@ -542,7 +542,7 @@ fn the_page_is_for_who_has_its_key_and_changes_nothing() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
+fn grafana_queries_return_rows() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
     store_state(&plant, one, "1 second", None, &grinding("SN-1"));
@@ -595,7 +595,7 @@ fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql) and a browser (Debian package chromium)"]
-fn in_a_browser_every_page_fits_a_telephone_and_fetches_nothing_from_elsewhere() {
+fn plant_pages_fit_phone_screen() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
     store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));

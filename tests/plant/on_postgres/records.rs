@@ -28,7 +28,7 @@ pub fn made(plant: &Plant) -> (std::path::PathBuf, String) {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_cell_whose_run_was_left_is_not_called_idle() {
+fn cell_of_killed_run_is_not_idle() {
     let plant = Plant::new();
     plant.cell("cell-1", &[]);
     let told = || plant.sql("SELECT count(*) FROM cell_now WHERE told_at IS NOT NULL");
@@ -51,7 +51,7 @@ fn records(folder: &Path) -> Vec<Record> {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_run_is_shipped_once_proven_there_and_brought_back() {
+fn run_replicated_verified_and_fetched() {
     let plant = Plant::new();
     let (folder, name) = made(&plant);
     let before = records(&folder);
@@ -108,7 +108,7 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn large_files_lie_in_a_folder_and_are_put_right_there() {
+fn large_files_in_folder_are_repaired() {
     let plant = Plant::new();
     let (folder, name) = made(&plant);
     let files = plant.path("files");
@@ -147,7 +147,7 @@ fn cut(folder: &Path, keeps: usize) {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_journal_that_is_cut_after_it_was_shipped_is_found() {
+fn plant_detects_truncated_journal() {
     let plant = Plant::new();
     let (folder, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
@@ -170,7 +170,7 @@ fn a_journal_that_is_cut_after_it_was_shipped_is_found() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_plant_that_was_changed_is_found() {
+fn verify_detects_changed_plant() {
     let plant = Plant::new();
     let (_, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);

@@ -46,7 +46,7 @@ fn hex(text: &str) -> String {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_cell_reads_its_own_alone_and_writes_nothing_by_hand() {
+fn cell_account_reads_only_its_own() {
     let plant = Plant::new();
     plant.cell("cell-1", &[]);
     plant.cell("cell-2", &[]);
@@ -124,7 +124,7 @@ fn a_cell_reads_its_own_alone_and_writes_nothing_by_hand() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn forged_records_are_refused_and_put_down() {
+fn forged_records_become_incidents() {
     let plant = Plant::new();
     plant.cell("cell-1", &[]);
     plant.cell("cell-2", &[]);
@@ -190,7 +190,7 @@ fn forged_records_are_refused_and_put_down() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn words_of_sql_in_every_string_stay_words() {
+fn sql_injection_stays_text() {
     let plant = Plant::new();
     let name = "cell'; DROP TABLE regrind.cell; --";
     let enrol = ["plant", "enrol", name, "--plant", "owner.toml", "--password-file", "cell.password"];

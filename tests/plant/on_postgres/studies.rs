@@ -12,7 +12,7 @@ fn jobs(plant: &Plant) -> Vec<Value> {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
+fn study_runs_match_their_seeds() {
     let plant = Plant::new();
     plant.somebody("planner", "planner");
     ["farm-1", "farm-2"].iter().for_each(|name| plant.somebody(name, "worker"));

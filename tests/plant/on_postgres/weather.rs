@@ -273,7 +273,7 @@ fn is_once_and_whole(plant: &Plant, cells: &[Cell], parts: usize, seed: u64) {
 
 #[test]
 #[ignore = "needs PostgreSQL and mosquitto (Debian packages)"]
-fn records_arrive_once_and_no_part_is_begun_twice() {
+fn failures_duplicate_no_record_or_part() {
     weather(1, 2, 2);
 }
 

@@ -45,7 +45,7 @@ fn work(plant: &Plant) -> Vec<Value> {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn parts_are_made_in_the_order_in_which_they_are_due() {
+fn queue_runs_parts_by_due_date() {
     let plant = Plant::new();
     let approvers = approved(&plant);
     cell(&plant, "cell-1", &approvers);
@@ -95,7 +95,7 @@ fn parts_are_made_in_the_order_in_which_they_are_due() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_recipe_that_asks_for_nobody_is_made_by_itself() {
+fn queue_runs_without_confirmation() {
     let plant = Plant::new();
     plant.somebody("planner", "planner");
     let recipe = small_recipe(plant.home.path(), 1000.0);
@@ -113,7 +113,7 @@ fn a_recipe_that_asks_for_nobody_is_made_by_itself() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
+fn unsigned_recipe_refused_as_incident() {
     let plant = Plant::new();
     let approvers = approved(&plant);
     cell(&plant, "cell-1", &approvers);
@@ -161,7 +161,7 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
+fn expired_lease_is_refused() {
     let plant = Plant::new();
     let approvers = approved(&plant);
     ["cell-1", "cell-2"].iter().for_each(|name| cell(&plant, name, &approvers));
@@ -236,7 +236,7 @@ fn begun_and_died(plant: &Plant, run: &str, events: usize) {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
-fn a_run_that_cannot_be_gone_on_with_does_not_hold_up_its_cell() {
+fn dead_run_does_not_block_queue() {
     let plant = Plant::new();
     let approvers = approved(&plant);
     cell(&plant, "cell-1", &approvers);

@@ -570,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tolerance_and_what_is_seen_say_how_much_is_believed() {
+    fn parameter_shrinkage_uses_tolerance() {
         let mut options = ParameterOptions::new(12.5);
         options.tolerances[0] = Some(2e-3);
         let believed = |values_um: [f64; 2]| {

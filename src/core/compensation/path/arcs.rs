@@ -537,7 +537,7 @@ mod tests {
     }
 
     #[test]
-    fn a_planted_circle_is_one_arc_about_its_centre() {
+    fn arc_fits_planted_circle() {
         for y_mm in [0.0, 0.3] {
             let blocks: Vec<ProgramBlock> = ArcBlocks::new(track(quarter(y_mm), 300), &OPTIONS).collect();
             assert!(matches!(
@@ -558,7 +558,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mirror_turns_it_round_and_axes_can_be_exchanged() {
+    fn arc_plane_and_direction() {
         let turned = |p: Point| [Point::new(-p.x, p.y, p.z), Point::new(p.y, p.z, p.x), Point::new(p.z, p.x, p.y)];
         let expected = [(Plane::ZX, true), (Plane::YZ, false), (Plane::XY, false)];
         for (k, (plane, clockwise)) in expected.into_iter().enumerate() {
@@ -569,7 +569,7 @@ mod tests {
     }
 
     #[test]
-    fn straight_runs_short_runs_and_points_that_stand_still_stay_lines() {
+    fn arcs_leave_lines_and_still_points() {
         let straight = |t: f64| Point::new(80.0 * t, 1.0, 0.2 - 3.0 * t);
         let still = |_: f64| Point::new(1.0, 1.0, 0.0);
         // A track of one step, and jumps to and fro.
@@ -588,7 +588,7 @@ mod tests {
     }
 
     #[test]
-    fn no_arc_joins_feeds_that_differ_nor_two_curves() {
+    fn arc_ends_at_feed_or_curve_change() {
         let slower = |k: usize| if k > 120 { 300.0 } else { 600.0 };
         let arcs = arcs_of(&ArcBlocks::new(fed(quarter(0.0), 300, slower), &OPTIONS).collect::<Vec<_>>());
         assert_eq!(arcs.iter().map(|a| a.feed_mm_min).collect::<Vec<_>>(), [600.0, 300.0]);
@@ -620,7 +620,7 @@ mod tests {
     }
 
     #[test]
-    fn the_whole_of_every_arc_is_as_near_to_the_path_as_is_told() {
+    fn arc_deviation_bounds_path_error() {
         let spiral = PathOptions { pattern: TrackPattern::Spiral, ..ball(8.0) };
         let below = PathOptions { from_below: true, ..ball(8.0) };
         for (options, per_mm) in [(ball(8.0), 1e6), (ball(8.0), 1e4), (spiral, 1e6), (below, 1e6)] {
@@ -664,7 +664,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_in_arcs_is_much_shorter_and_its_summary_counts_it() {
+    fn arc_summary_counts_fewer_blocks() {
         for pattern in [TrackPattern::Raster, TrackPattern::Spiral] {
             // On a surface that is rotationally symmetric about its middle a spiral rises evenly.
             let path = path(quadric(0.01, 0.01), PathOptions { pattern, ..ball(8.0) }).unwrap();

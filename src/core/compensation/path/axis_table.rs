@@ -84,7 +84,7 @@ mod tests {
     use crate::geometry::{Grid, Vector};
 
     #[test]
-    fn a_slope_raises_the_offset_by_one_over_the_cosine() {
+    fn axis_offset_grows_by_inverse_cosine() {
         let on = Grid { columns: 41, rows: 41, first_mm: [-20.0, -20.0], spacing_mm: [1.0, 1.0] };
         let heights: Vec<f64> = (0..41 * 41).map(|k| 0.5 * (f64::from(k % 41) - 20.0)).collect();
         let slope = HeightField::hermite(on, &heights, &vec![[0.5, 0.0]; 41 * 41]);
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn where_the_wheel_cannot_touch_the_nearest_offset_holds() {
+    fn axis_offset_where_wheel_cannot_touch() {
         // A flat plane joins a slope whose normal is parallel to the spindle of a cup. The rim can touch the plane,
         // not the slope.
         let spindle = Vector::new(-0.5, 0.0, 0.75f64.sqrt());

@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bicubic_with_exact_slopes_is_kept_to_rounding() {
+    fn hermite_field_reproduces_bicubic() {
         // The x slope is at most quadratic in y, and the y slope at most quadratic in x: the twist by differences is
         // exact.
         let z = |x: f64, y: f64| {
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spline_goes_through_its_values_and_is_smooth_to_the_second_derivative() {
+    fn spline_field_is_c2_and_interpolates() {
         let wave = |[x, y]: [f64; 2]| 5e-3 * (0.6 * x).sin() * (0.5 * y).cos();
         let values: Vec<f64> = places(GRID).into_iter().map(wave).collect();
         let field = HeightField::spline(GRID, &values);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_continue_their_neighbours_without_touching_them() {
+    fn hermite_field_extrapolates_holes() {
         let z = |[x, y]: [f64; 2]| 0.02 * x * x - 0.01 * (y - 6.5) * (y - 6.5) + 0.1 * x;
         let slope = |[x, y]: [f64; 2]| [0.04 * x + 0.1, -0.02 * (y - 6.5)];
         let inside = |[x, y]: [f64; 2]| x.hypot(y - 6.5) < 3.5;
@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn two_nodes_each_way_are_enough() {
+    fn spline_field_on_two_nodes() {
         let on = Grid { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [10.0, 20.0] };
         let field = HeightField::spline(on, &[1.0, 1.0, 1.0, 1.0]);
         assert_eq!(field.at([3.0, 40.0]), Jet { value: 1.0, ..Jet::default() });

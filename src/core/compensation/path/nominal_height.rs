@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_with_normals_is_taken_as_it_is_and_holes_are_continued() {
+    fn nominal_height_from_grid_fills_holes() {
         let (columns, rows) = (41, 31);
         let place = |k: usize| [(k % columns) as f64 * 0.5 - 10.0, (k / columns) as f64 * 0.5 - 7.5];
         let hole = |[x, y]: [f64; 2]| x.hypot(y) > 7.6;
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn scattered_points_are_sampled() {
+    fn nominal_height_from_scattered_points() {
         let points: Vec<Point> = (0..3000)
             .map(|k| [(f64::from(k) * 0.618_034).fract() * 20.0 - 10.0, (f64::from(k) + 0.5) / 200.0 - 7.5])
             .map(|[x, y]| Point::new(x, y, z(x, y).0))
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_is_refused() {
+    fn nominal_height_refuses_wall() {
         let points = (0..25).map(|k| Point::new(f64::from(k % 5), f64::from(k / 5), 20.0 * f64::from(k % 5))).collect();
         let nominal = Nominal::from_points(points, PlaneProjection::Xy).unwrap();
         assert!(matches!(nominal_height_field(&nominal), Err(PathError::NotAHeight { .. })));

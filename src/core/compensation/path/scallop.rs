@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn by_hand() {
+    fn scallop_height_by_hand() {
         let of = |b: f64| scallops_on(&quadric(0.0, b), Wheel::Sphere { radius_mm: 12.5 }, 0.5);
         // 0.25 / (8 * 12.5) on a plane. On a hollow or a dome with a radius of 50 mm it is a quarter less or more.
         let flat = of(0.0);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn the_distance_for_a_height_and_an_rms_leaves_just_these() {
+    fn scallop_track_for_height_and_rms() {
         let unit = scallops_on(&quadric(0.004, -0.006), Wheel::Sphere { radius_mm: 12.5 }, 1.0);
         let by_rms = unit.with_track_mm(unit.max_track_mm(1.0, 2e-4));
         assert!((by_rms.rms_mm - 2e-4).abs() < 1e-15, "{by_rms:?}");
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn wheels_that_are_straight_across_the_tracks_or_do_not_fit_leave_none() {
+    fn scallops_of_flat_disc_and_cup_wheels() {
         let straight = Wheel::Torus { ring_mm: 40.0, tube_mm: f64::INFINITY, spindle: Vector::y() };
         for (wanted, wheel) in [
             (quadric(0.0, 0.0), Wheel::Sphere { radius_mm: f64::INFINITY }),
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_slope_tracks_are_farther_apart_than_over_x_and_y() {
+    fn scallops_on_slope_use_true_spacing() {
         // A plane that rises along x and y: tracks run along (1, 0, p), and the offset to the next one is (0, t, q t).
         let [p, q] = [0.4, 0.3];
         let slope = super::super::wheel_fit::tests::surface(|[x, y]| (p * x + q * y, [p, q]));
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_tells_its_own() {
+    fn tool_path_reports_scallops() {
         let laid = path(quadric(0.0, 0.0), ball(12.5)).unwrap();
         assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 100.0).abs() < 1e-12);
         let spiral = path(quadric(0.0, 0.0), PathOptions { pattern: TrackPattern::Spiral, ..ball(12.5) }).unwrap();

@@ -371,7 +371,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_machine_must_be_able_to_follow() {
+    fn summary_checks_machine_limits() {
         let path = path(quadric(0.01, 0.01), ball(10.0)).unwrap();
         let summary = path.summary().unwrap();
         // 10 mm/s.
@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn jerk_is_that_of_the_curve() {
+    fn summary_jerk_of_sine_path() {
         // z = h sin(k x) along the tracks. The path of a very small ball is nearly the surface itself: its third
         // derivative is h k^3.
         let (h, k) = (0.02, 0.4);
@@ -421,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_up_takes_what_acceleration_and_jerk_leave() {
+    fn run_up_from_acceleration_and_jerk() {
         let limits = |a: Option<f64>, j: Option<f64>| MachineLimits {
             acceleration_mm_s2: a,
             jerk_mm_s3: j,
@@ -444,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn every_point_is_told_and_the_chords_keep_to_the_path() {
+    fn tool_path_chords_within_tolerance() {
         let path = path(quadric(0.01, -0.005), ball(10.0)).unwrap();
         let summary = path.summary().unwrap();
         assert_eq!(path.moves().count() as u64, summary.moves);

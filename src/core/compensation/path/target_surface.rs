@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sphere_with_a_level_alone_is_a_smaller_sphere() {
+    fn target_surface_offsets_sphere() {
         let wanted = TargetSurface::new(bowl(40.0), &correction(|_, _| 0.0), 5.0).unwrap();
         for place in [[0.1, 0.2], [7.3, -5.5], [-9.9, 3.0]] {
             let Contact { point, normal } = wanted.at(place);
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn normals_are_those_of_the_surface_itself() {
+    fn target_surface_normals_by_differences() {
         let e = |x: f64, y: f64| 0.01 * (0.5 * x).sin() + 0.003 * y;
         let wanted = TargetSurface::new(bowl(40.0), &correction(e), 5.0).unwrap();
         for [x, y] in [[1.3, 2.2], [-6.7, 0.4], [7.9, 9.1], [9.4, -2.0]] {
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_correction_levels_off_beyond_its_net_and_nowhere_jumps() {
+    fn correction_levels_off_beyond_grid() {
         let field = correction_spline(&correction(|x, _| 0.002 * x), 3.0);
         assert!((field.at([2.2, 0.0]).value - 0.0044).abs() < 1e-7);
         let far = field.at([11.0, 0.0]);
@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_refused() {
+    fn target_surface_refuses_nan_correction() {
         let broken = correction(|x, _| if x == 3.0 { f64::NAN } else { 0.0 });
         assert!(matches!(TargetSurface::new(bowl(40.0), &broken, 5.0), Err(PathError::Correction { x_mm: 3.0, .. })));
     }

@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_tilted_by_thirty_degrees_on_a_plane_by_hand() {
+    fn tilted_ball_pivot_by_hand() {
         let tilted = |about| {
             let lean = TiltMode::Constant { angle_rad: 30f64.to_radians() };
             path(quadric(0.0, 0.0), tilted_options(head(about), lean, Wheel::Sphere { radius_mm: 10.0 })).unwrap()
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tilt_of_nothing_is_the_upright_path() {
+    fn zero_tilt_is_upright_path() {
         for wheel in [
             Wheel::Sphere { radius_mm: 10.0 },
             Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() },
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wheel_that_follows_keeps_its_lead() {
+    fn following_tilt_lead_is_constant() {
         // Along x the normal rotates by -atan(2 a x), and B follows it. Seen along y there is no other rotation.
         let (a, lead) = (0.02f64, 0.5);
         let follows = tilted_options(
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn between_its_points_the_wheel_touches_too_when_slides_and_head_move_in_proportion() {
+    fn tilted_path_touches_between_points() {
         let part = || quadric(0.02, -0.01);
         for (about, wheel) in [
             (RotationAxis::Y, Wheel::Sphere { radius_mm: 8.0 }),
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_head_cannot_do_is_refused_with_what_would_do() {
+    fn rotary_limits_refused_with_remedy() {
         let follows = TiltMode::Following { lead_rad: 0.5 };
         let wheel = Wheel::Sphere { radius_mm: 8.0 };
         let of = |rotary| path(quadric(0.02, 0.0), tilted_options(rotary, follows, wheel)).unwrap().summary().unwrap();
@@ -445,7 +445,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wheel_that_cannot_reach_upright_is_told_by_how_much_to_tilt() {
+    fn unreachable_flank_suggests_tilt() {
         // A flank of 74°: the spindle of an upright wheel is in the way.
         let flank = || surface(|[x, y]| (3.5 * y + 0.01 * x * x, [0.02 * x, 3.5]));
         let upright = PathOptions { rotary: Some(head(RotationAxis::X)), ..ball(5.0) };
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn scallops_are_those_of_the_wheel_as_it_stands() {
+    fn scallops_of_tilted_disc() {
         // A disc that rolls along the track, tilted across it by 0.5 rad: the curvature of its ring changes, that of
         // its rim does not.
         let disc = Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::y() };

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mirrored_world_has_the_mirrored_path() {
+    fn path_from_below_is_mirrored() {
         let cup = Wheel::tilted_cup(6.0, 1.0, 0.5);
         for (wheel, pattern) in [
             (Wheel::Sphere { radius_mm: 10.0 }, TrackPattern::Raster),
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn from_below_a_ball_stands_under_the_surface_itself() {
+    fn path_from_below_touches_surface() {
         // The surface is in the model frame; the wheel is under it.
         let options =
             PathOptions { from_below: true, ..PathOptions::new(Wheel::Sphere { radius_mm: 10.0 }, 1.5, 600.0) };

@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_raster_covers_a_rectangle_from_edge_to_edge_and_alternates() {
+    fn raster_alternates_edge_to_edge() {
         let part = Aperture::Rectangle { centre_mm: [1.0, 2.0], width_mm: 10.0, height_mm: 6.0 };
         let tracks = Tracks::lay(&part, &options(), 0.5).unwrap();
         assert_eq!((tracks.spans.len(), tracks.track_mm), (13, 0.5));
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ring_is_left_and_met_again() {
+    fn raster_skips_annulus_hole() {
         let part = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 5.0, outer_radius_mm: 12.0 };
         let tracks = raster(&part, 1.0, 0.5, false);
         let middle: Vec<_> = tracks.spans.iter().filter(|s| s.place(0.0)[1].abs() < 1e-9).collect();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spiral_on_a_disc_is_one_piece_from_the_rim_to_the_middle() {
+    fn spiral_on_disc_is_one_span() {
         let part = Aperture::Circle { centre_mm: [3.0, 0.0], radius_mm: 8.0 };
         let tracks = spiral(&part, 2.0, 0.5);
         assert_eq!(tracks.spans.len(), 1);

@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn every_wheel_touches_the_place_and_enters_nothing_beside_it() {
+    fn wheel_touches_without_penetration() {
         for wheel in wheels() {
             for normal in [Vector::z(), Vector::new(0.2, -0.1, 1.0), Vector::new(-0.3, 0.3, 1.0)] {
                 let contact = contact(normal);
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn curvatures_are_how_the_wheel_leaves_its_tangent_plane() {
+    fn wheel_curvatures_match_tangent_gap() {
         for wheel in wheels() {
             let contact = contact(Vector::new(0.2, -0.1, 1.0));
             let from = contact.point - wheel.centre(&contact).unwrap();
@@ -206,13 +206,13 @@ mod tests {
     }
 
     #[test]
-    fn a_rim_cannot_touch_a_place_that_faces_its_spindle() {
+    fn wheel_cannot_touch_along_spindle() {
         let wheel = Wheel::Torus { ring_mm: 48.0, tube_mm: 2.0, spindle: Vector::y() };
         assert_eq!(wheel.centre(&contact(Vector::new(0.0, 1.0, 0.01))), None);
     }
 
     #[test]
-    fn a_cup_on_a_hollow_sphere_touches_with_all_of_its_ring_at_the_angle_of_the_formula() {
+    fn cup_touches_hollow_sphere_with_ring() {
         // sin a = D / (2 (rho - r)): the angle between normal and spindle is a. Every point of the ring is then at the
         // same distance from the centre of the sphere.
         let (ring, tube, rho): (f64, f64, f64) = (20.0, 2.0, 100.0);

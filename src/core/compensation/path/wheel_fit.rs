@@ -201,7 +201,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_wheel_must_be_smaller_than_every_hollow_in_every_direction() {
+    fn wheel_fit_refuses_tight_hollow() {
         // Hollow across the tracks with a radius of 20 mm; a dome along them.
         let hollow = || quadric(-0.01, 0.025);
         assert!(path(hollow(), ball(18.0)).is_ok());
@@ -220,7 +220,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn slopes_rims_and_bodies_are_held_against_the_part() {
+    fn wheel_fit_refuses_steep_slopes_and_rims() {
         assert!(matches!(path(quadric(0.2, 0.0), ball(1.0)), Err(PathError::Steep { .. })));
         // Along x the normal approaches the direction of the spindle.
         let along = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.5, spindle: Vector::new(0.6, 0.0, 0.8) };
@@ -235,7 +235,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_far_side_of_a_wheel_must_not_reach_the_part() {
+    fn wheel_body_collision_is_refused() {
         // A disc tilted by 37° reaches up over the part towards -x. There it meets a wall of 50°, although its rim
         // still fits at the bottom of the wall.
         let wall = |steepest: f64| {
@@ -257,7 +257,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn options_that_make_no_path_are_named() {
+    fn path_options_refused_by_key() {
         for (options, key) in [
             (PathOptions { chord_error_mm: 0.0, ..ball(5.0) }, "chord error (mm)"),
             (PathOptions { feed_mm_min: f64::NAN, ..ball(5.0) }, "feed (mm/min)"),
@@ -269,7 +269,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_scallop_height_sets_the_distance_of_tracks() {
+    fn track_spacing_from_scallop_height() {
         let spacing = TrackSpacing::Scallop { max_height_mm: 1e-4, max_track_mm: 5.0 };
         let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
         // h = s^2 / (8 R). Tracks are equally spaced between the borders, so they are a little closer.

@@ -50,7 +50,7 @@ fn within(between: &BetweenSessionVariance, [known, unseen]: &[Sessions; 2]) -> 
 }
 
 #[test]
-fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
+fn between_session_variance_recovered() {
     const PARTS: u32 = 12;
     let (mut strength, mut scatter, mut covered) = (0.0, 0.0, 0.0);
     for seed in 0..PARTS {
@@ -67,7 +67,7 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
 }
 
 #[test]
-fn sessions_that_differ_by_nothing_are_told_so() {
+fn between_session_variance_near_zero() {
     let sessions = planted(1e-12, 5, 1, 3);
     let between = sessions[0].between_session_variance(&Prior::for_size(102.0)).unwrap();
     let own = between.predict(&sessions[0], &sessions[1]).unwrap();
@@ -78,7 +78,7 @@ fn sessions_that_differ_by_nothing_are_told_so() {
 }
 
 #[test]
-fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
+fn session_prediction_by_hand() {
     // By hand: common variance 4, session variance 1, noise variance 0.25, and two sessions with a point each at one
     // place. So K = 4 + 1.25 I, mean = 4 (d1 + d2) / 9.25.
     let one = |deviations: Vec<f64>, of: Vec<u32>| {
@@ -106,7 +106,7 @@ fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
 }
 
 #[test]
-fn the_quantiles_of_student_are_those_of_the_tables() {
+fn student_quantiles_match_tables() {
     for (degrees, t, share) in [(2.0, 4.3027, 0.02), (3.0, 3.1824, 5e-3), (5.0, 2.5706, 1e-3), (30.0, 2.0423, 1e-4)] {
         assert!((student_t_quantile(degrees) / t - 1.0).abs() < share, "{degrees}: {}", student_t_quantile(degrees));
     }
@@ -114,7 +114,7 @@ fn the_quantiles_of_student_are_those_of_the_tables() {
 }
 
 #[test]
-fn what_are_no_sessions_is_refused_in_words() {
+fn sessions_refuse_mismatch() {
     let points = || Observations::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
     let odd = Sessions::new(points(), vec![1]).err().unwrap().to_string();
     assert_eq!(odd, "2 points and 1 numbers of their sessions do not match");

@@ -185,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sphere_and_a_paraboloid_by_hand() {
+    fn conic_sag_by_hand() {
         // 3-4-5: at h = 3 a sphere of radius 5 has risen by 1, at slope 3/4; dz/dq = slope / 2h.
         for (radius_mm, conic, q, sag, slope) in
             [(5.0, 0.0, 9.0, 1.0, 0.125), (-5.0, 0.0, 9.0, -1.0, -0.125), (150.0, -1.0, 900.0, 3.0, 1.0 / 300.0)]
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn the_edge_of_a_conic_is_outside_and_so_is_nan() {
+    fn conic_ends_at_its_edge() {
         let sphere = Conic::new(5.0, 0.0).unwrap();
         assert!(sphere.sag_and_derivative(24.99).is_some());
         assert!([25.0, 26.0, f64::NAN].iter().all(|&q| sphere.sag_and_derivative(q).is_none()));
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn powers_even_and_odd_by_hand() {
+    fn asphere_powers_by_hand() {
         let asphere = Asphere::new(Conic::PLANE, &[(4, 1e-3), (3, 1e-2)]).unwrap();
         // At h = 2: 0.016 + 0.08, slope 0.032 + 0.12 over 2h = 4.
         let (sag, slope) = asphere.sag_and_derivative(4.0).unwrap();
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_values_are_refused_by_name() {
+    fn conic_refuses_degenerate_values() {
         for bad in [0.0, -0.0, f64::NAN, 1e-9] {
             let error = Conic::new(bad, 0.0).unwrap_err();
             assert!(matches!(&error, DefinitionError::OutOfRange { key, .. } if key == "radius_mm"), "{error}");

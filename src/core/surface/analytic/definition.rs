@@ -446,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_is_read_alike_by_both_readers() {
+    fn definition_readers_agree() {
         let texts = every_kind();
         assert_eq!(texts.len(), KINDS.len());
         for (text, kind) in texts.iter().zip(KINDS) {
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn the_example_above_is_what_it_says() {
+    fn definition_doc_example() {
         let text: String = include_str!("definition.rs")
             .lines()
             .skip_while(|line| !line.starts_with("//! ```toml"))
@@ -477,7 +477,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_the_text_keep_line_and_column() {
+    fn toml_errors_give_line_and_column() {
         for (from, to, expected, word) in [
             ("radius_mm = 100.0", "radius = 100.0", (3, 1), "radius"),
             ("radius_mm = 100.0", "radius_mm = '100'", (3, 13), "string"),
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_value_name_key_value_limit_and_place() {
+    fn value_errors_name_key_and_place() {
         for (from, to, expected, words) in [
             ("radius_mm = 100.0", "radius_mm = 0", (3, 13), ["surface.radius_mm", "is 0;"]),
             ("radius_mm = 100.0", "radius_mm = nan", (3, 13), ["surface.radius_mm", "NaN"]),
@@ -520,7 +520,7 @@ mod tests {
     }
 
     #[test]
-    fn terms_and_nested_tables_are_found_in_the_text() {
+    fn nested_errors_give_line_and_column() {
         let read = |surface: &str| DefinedSurface::from_toml(&format!("{CIRCLE}[surface]\n{surface}")).unwrap_err();
         let error = read("kind = 'asphere'\nradius_mm = 100\n[surface.coefficients]\nA4 = 1\nA1 = 1\n");
         assert_eq!(place(&error), (9, 6), "{error}");
@@ -540,7 +540,7 @@ mod tests {
     }
 
     #[test]
-    fn an_aperture_must_fit_the_formula() {
+    fn aperture_must_fit_formula() {
         let read = |aperture: &str, surface: &str| {
             DefinedSurface::from_toml(&format!("[aperture]\n{aperture}\n[surface]\n{surface}\n"))
         };

@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_polynomials_are_the_tabulated_ones() {
+    fn forbes_polynomials_match_tables() {
         for i in 0..=20 {
             let x = f64::from(i) / 20.0;
             for (m, expected) in [
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slopes_of_qbfs_are_orthonormal() {
+    fn qbfs_slopes_are_orthonormal() {
         // With u = sin(t) the weight 1 / sqrt(1 - u^2) is that of equidistant t; the integrand is a polynomial in cos(2t).
         let count = 200;
         for m in 0..20 {
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn one_term_of_each_by_hand() {
+    fn forbes_terms_by_hand() {
         let con = QconDefinition {
             radius_mm: f64::INFINITY,
             conic: 0.0,
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn without_coefficients_they_are_their_base_and_at_the_rim_qbfs_is_too() {
+    fn forbes_without_terms_is_base_conic() {
         let con =
             QconDefinition { radius_mm: 50.0, conic: -2.0, normalisation_radius_mm: 30.0, coefficients_mm: vec![] };
         assert_eq!(
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_those_of_the_sag() {
+    fn forbes_derivatives_match_sag() {
         let coefficients_mm: Vec<f64> = (0..8).map(|m| 0.02 / f64::from(m + 1)).collect();
         let con = Qcon::try_from(&QconDefinition {
             radius_mm: -60.0,
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_values_are_refused_by_name() {
+    fn forbes_refuses_degenerate_values() {
         let good = QbfsDefinition { radius_mm: 10.0, normalisation_radius_mm: 8.0, coefficients_mm: vec![0.01] };
         for (bad, name) in [
             (QbfsDefinition { radius_mm: 0.0, ..good.clone() }, "radius_mm"),

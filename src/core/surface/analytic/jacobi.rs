@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn legendre_and_a_few_others_by_hand() {
+    fn jacobi_series_by_hand() {
         for t in [-1.0, -0.3, 0.0, 0.7, 1.0] {
             let [(p, dp)] = series(&[[0.0], [0.0], [0.0], [1.0]], 0, t);
             assert!((p - 0.5 * (5.0 * t * t * t - 3.0 * t)).abs() < 1e-15);

@@ -166,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_normal_of_a_sphere_points_from_or_to_its_centre_and_up() {
+    fn sphere_normal_points_up() {
         for radius_mm in [5.0, -5.0] {
             let sphere = AnalyticSurface::Conic(Conic::new(radius_mm, 0.0).unwrap());
             let normal = sphere.normal(3.0, 0.0).unwrap();
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_of_a_surface_of_revolution_is_that_of_its_sag() {
+    fn asphere_gradient_matches_sag() {
         let asphere = Asphere::new(Conic::new(-120.0, -0.6).unwrap(), &[(3, 1e-6), (4, 1e-8), (10, 1e-18)]).unwrap();
         for surface in [AnalyticSurface::Asphere(asphere), AnalyticSurface::Conic(Conic::new(80.0, 0.0).unwrap())] {
             assert!(test_support::gradient_error(&|x, y| surface.sag_and_gradient(x, y), 60.0) < 1e-9);
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn an_overflow_is_no_value() {
+    fn sag_overflow_is_none() {
         let steep = AnalyticSurface::Asphere(Asphere::new(Conic::PLANE, &[(60, 1e300)]).unwrap());
         assert!(steep.sag(1.0, 0.0).is_some());
         assert_eq!(steep.sag(10.0, 0.0), None);

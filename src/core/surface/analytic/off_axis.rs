@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_section_at_no_distance_is_the_parent_in_every_frame() {
+    fn section_at_zero_distance_is_parent() {
         for frame in [SectionFrame::Parent, SectionFrame::Shifted, SectionFrame::Tilted] {
             let cut = section(asphere(), 0.0, 30.0, frame);
             for [x, y] in disc(80.0) {
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tilted_section_of_a_sphere_is_the_sphere() {
+    fn tilted_section_of_sphere_is_sphere() {
         // Out to 99 of 100 mm, where the tangent plane at the centre has long left the parent's disc.
         for (radius_mm, azimuth_deg) in [(100.0, 0.0), (-100.0, 200.0)] {
             let cut = section(sphere(radius_mm), 60.0, azimuth_deg, SectionFrame::Tilted);
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn every_tilted_place_lies_on_the_parent_and_the_origin_is_flat() {
+    fn tilted_section_lies_on_parent() {
         for azimuth_deg in [0.0, 77.0, 180.0, 300.0] {
             let cut = section(asphere(), 120.0, azimuth_deg, SectionFrame::Tilted);
             let (z, gradient) = cut.sag_and_gradient(0.0, 0.0).unwrap();
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_paraboloid_shifted_by_hand() {
+    fn shifted_paraboloid_by_hand() {
         let parabola = AnalyticSurface::Conic(Conic::new(100.0, -1.0).unwrap());
         let cut = section(parabola, 30.0, 90.0, SectionFrame::Shifted);
         // (x^2 + (y + 30)^2 - 900) / 200 at (10, 10).
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_those_of_the_sag() {
+    fn off_axis_gradient_matches_sag() {
         for frame in [SectionFrame::Shifted, SectionFrame::Tilted] {
             let cut = section(asphere(), 90.0, 40.0, frame);
             assert!(gradient_error(&|x, y| cut.sag_and_gradient(x, y), 45.0) < 1e-11);
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_sections_are_refused_by_name() {
+    fn off_axis_refuses_bad_sections() {
         let cut = |distance, azimuth| OffAxis::new(sphere(50.0), distance, azimuth, SectionFrame::Tilted);
         assert_eq!(cut(-1.0, 0.0).unwrap_err().key().as_deref(), Some("distance_mm"));
         assert_eq!(cut(f64::NAN, 0.0).unwrap_err().key().as_deref(), Some("distance_mm"));

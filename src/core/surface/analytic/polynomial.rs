@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn two_terms_by_hand() {
+    fn polynomial_terms_by_hand() {
         // u = 2, v = -1: 0.5 u^2 v + 3 v^3 = -2 - 3; slopes (u v, 0.5 u^2 + 9 v^2) / 10.
         let (z, [gx, gy]) =
             polynomial(&[(2, 1, 0.5), (0, 3, 3.0)], None).unwrap().sag_and_gradient(20.0, -10.0).unwrap();
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn without_terms_it_is_the_base() {
+    fn polynomial_without_terms_is_base() {
         let base = ConicDefinition { radius_mm: -70.0, conic: 0.5 };
         let conic = Conic::try_from(&base).unwrap();
         for [x, y] in disc(50.0) {
@@ -125,14 +125,14 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_that_of_the_sag() {
+    fn polynomial_gradient_matches_sag() {
         let terms = [(0, 0, 1.0), (1, 0, 0.2), (0, 1, -0.1), (3, 2, 0.01), (0, 6, -0.004), (5, 5, 1e-4)];
         let surface = polynomial(&terms, Some(ConicDefinition { radius_mm: 200.0, conic: -1.2 })).unwrap();
         assert!(gradient_error(&|x, y| surface.sag_and_gradient(x, y), 15.0) < 1e-11);
     }
 
     #[test]
-    fn degenerate_values_are_refused_by_name() {
+    fn polynomial_refuses_degenerate_values() {
         assert!(matches!(polynomial(&[(61, 0, 1.0)], None), Err(DefinitionError::Term { .. })));
         assert!(matches!(polynomial(&[(1, 2, 1.0), (1, 2, 1.0)], None), Err(DefinitionError::RepeatedTerm { .. })));
         let bad = polynomial(&[(1, 2, f64::NAN)], None).unwrap_err();

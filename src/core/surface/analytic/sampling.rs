@@ -213,7 +213,7 @@ mod tests {
     const L_SHAPE: &str = "kind = 'polygon'\ncorners_mm = [[0, 0], [40, 0], [40, 20], [20, 20], [20, 40], [0, 40]]";
 
     #[test]
-    fn a_small_grid_by_hand() {
+    fn sampled_grid_by_hand() {
         let flat = defined("kind = 'plane'", "kind = 'rectangle'\nwidth_mm = 4\nheight_mm = 2");
         let sampled = flat.sample(1.1).unwrap();
         // 4 mm in 4 cells and 2 mm in 2, and a ring.
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn every_place_of_the_aperture_lies_in_a_complete_cell() {
+    fn sampled_cells_cover_aperture() {
         for aperture in [
             L_SHAPE,
             "kind = 'circle'\nradius_mm = 25\ncentre_mm = [3, -2]",
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cubic_triangle_is_exact_for_quadratics_and_on_the_edges_for_cubics() {
+    fn curved_triangle_exact_for_quadratics() {
         let places = [[0.0, 0.0], [2.0, 0.5], [-0.5, 1.5]];
         let quadratic = |[x, y]: [f64; 2]| {
             (1.0 + x - 2.0 * y + x * x - 3.0 * x * y + 0.5 * y * y, [1.0 + 2.0 * x - 3.0 * y, -2.0 - 3.0 * x + y])
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn the_spacing_found_is_exact_enough_and_not_much_too_fine() {
+    fn spacing_meets_accuracy() {
         let qbfs = "kind = 'qbfs'\nradius_mm = 80\nnormalisation_radius_mm = 30\ncoefficients_mm = [0.1, 0.02, -0.01]";
         let toroid = "kind = 'toroid'\nradius_x_mm = 120\nradius_y_mm = -90";
         let section = "kind = 'off-axis'\ndistance_mm = 60\nframe = 'tilted'\n\
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quadric_surface_needs_no_fine_grid_and_the_spacing_asked_for_is_kept() {
+    fn spacing_of_quadric_and_as_defined() {
         let paraboloid = defined("kind = 'conic'\nradius_mm = 100\nconic = -1", "kind = 'circle'\nradius_mm = 20");
         assert_eq!(paraboloid.spacing_for_accuracy(1e-9).unwrap(), 5.0);
         assert_eq!(paraboloid.spacing_mm().unwrap(), 5.0);
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn excess_is_refused_before_it_begins() {
+    fn sampling_refuses_excess() {
         let disc = defined(ASPHERE, "kind = 'circle'\nradius_mm = 20");
         assert!(matches!(disc.sample(0.001), Err(DefinitionError::TooManyNodes { .. })));
         assert!(matches!(disc.sample(1e-300), Err(DefinitionError::TooManyNodes { .. })));
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ring_is_left_out_where_the_formula_ends() {
+    fn sampled_ring_ends_with_formula() {
         let dome = defined("kind = 'sphere'\nradius_mm = -20", "kind = 'circle'\nradius_mm = 19.9");
         let sampled = dome.sample(0.5).unwrap();
         assert!(sampled.points.iter().all(|p| p.z.is_nan() || p.x.hypot(p.y) < 20.0));

@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_toroid_by_hand() {
+    fn toroid_by_hand() {
         // At y = 3 the curve of radius 5 has risen by 1, so 13 - 1 = 12 is left to the line at 13; at x = 7.2 the circle of
         // radius 12 (3-4-5) stands 9.6 below the line.
         let (z, [gx, gy]) = toroid(13.0, 5.0).sag_and_gradient(7.2, 3.0).unwrap();
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_radii_make_the_sphere_and_an_infinite_one_a_cylinder() {
+    fn toroid_limits_sphere_and_cylinder() {
         let sphere = Conic::new(-80.0, 0.0).unwrap();
         for [x, y] in disc(70.0) {
             let (sag, slope) = sphere.sag_and_derivative(x * x + y * y).unwrap();
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_biconic_with_equal_radii_is_the_conic() {
+    fn biconic_with_equal_radii_is_conic() {
         let conic = Conic::new(60.0, -0.7).unwrap();
         let written = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: 60.0, conic_x: -0.7, conic_y: -0.7 };
         let biconic = Biconic::try_from(&written).unwrap();
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_biconic_by_hand() {
+    fn biconic_by_hand() {
         let written = BiconicDefinition { radius_x_mm: 5.0, radius_y_mm: f64::INFINITY, conic_x: 0.0, conic_y: 3.0 };
         let biconic = Biconic::try_from(&written).unwrap();
         let (z, [gx, gy]) = biconic.sag_and_gradient(3.0, 1e5).unwrap();
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_those_of_the_sag() {
+    fn toroid_gradients_match_sag() {
         let curve = Asphere::new(Conic::new(-90.0, -2.0).unwrap(), &[(4, 2e-7), (6, 1e-10)]).unwrap();
         let toroid = Toroid::new(150.0, curve).unwrap();
         assert!(gradient_error(&|x, y| toroid.sag_and_gradient(x, y), 40.0) < 1e-11);
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_values_are_refused_by_name() {
+    fn toroid_refuses_degenerate_values() {
         let good = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: -95.0, conic_x: 1.5, conic_y: -3.0 };
         for (bad, name) in [
             (BiconicDefinition { radius_x_mm: 0.0, ..good }, "radius_x_mm"),

@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_fifteen_indices_are_those_of_the_published_tables() {
+    fn zernike_indices_match_tables() {
         // Numbering and first index, then the degrees and the azimuthal orders.
         let tables = [
             (
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn indices_without_a_term_are_none() {
+    fn zernike_indices_without_term() {
         assert_eq!(ZernikeNumbering::Noll.degree_and_order(0), None);
         assert_eq!(ZernikeNumbering::Fringe.degree_and_order(0), None);
         assert_eq!(ZernikeNumbering::Fringe.degree_and_order(38), None);
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn terms_by_hand() {
+    fn zernike_terms_by_hand() {
         // At (12, 16) on a radius of 20: rho = 1, cos = 0.6, sin = 0.8; at (6, 8) rho = 1/2.
         let at = |numbering, index, x, y| surface(numbering, &[(index, 1.0)]).sag_and_gradient(x, y).unwrap().0;
         use ZernikeNumbering::{Ansi, Fringe, Noll};
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_those_of_the_sag_and_terms_of_degree_100_stay_stable() {
+    fn zernike_gradients_match_sag() {
         for (numbering, first) in
             [(ZernikeNumbering::Noll, 1), (ZernikeNumbering::Ansi, 0), (ZernikeNumbering::Fringe, 1)]
         {
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn it_ends_well_beyond_the_normalisation_radius() {
+    fn zernike_ends_beyond_radius() {
         let tilt = surface(ZernikeNumbering::Noll, &[(2, 1.0)]);
         assert!(tilt.sag_and_gradient(29.9, 0.0).is_some());
         assert_eq!(tilt.sag_and_gradient(30.1, 0.0), None);
@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_indices_are_refused_by_name() {
+    fn zernike_refuses_bad_indices() {
         for (numbering, key) in [
             (ZernikeNumbering::Noll, "0"),
             (ZernikeNumbering::Fringe, "Z38"),

@@ -65,19 +65,19 @@ fn assert_agrees(points: Vec<Point>) {
 }
 
 #[test]
-fn a_grid_is_predicted_within_a_factor_of_two() {
+fn accuracy_of_grid_within_factor_two() {
     for (columns, rows) in [(128, 156), (181, 101), (451, 251)] {
         assert_agrees(free_form(columns, rows));
     }
 }
 
 #[test]
-fn scattered_points_are_predicted_within_a_factor_of_two() {
+fn accuracy_of_scattered_points() {
     assert_agrees(scattered(300, 180));
 }
 
 #[test]
-fn rounding_is_told_from_coarseness() {
+fn accuracy_detects_rounding() {
     let mut points = free_form(451, 251);
     points.iter_mut().for_each(|p| p.z = (p.z * 1e5).round() / 1e5);
     let found = predicted(&points);
@@ -91,7 +91,7 @@ fn rounding_is_told_from_coarseness() {
 }
 
 #[test]
-fn a_spacing_for_a_wanted_figure_gives_it() {
+fn accuracy_spacing_for_target() {
     let found = predicted(&free_form(181, 101));
     for (estimate, distance) in [(&found.flat, DistanceModel::Triangle), (&found.curved, DistanceModel::Curved)] {
         let wanted_mm = estimate.inside.pv_mm / 10.0;
@@ -103,7 +103,7 @@ fn a_spacing_for_a_wanted_figure_gives_it() {
 }
 
 #[test]
-fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
+fn accuracy_of_plane_is_exact() {
     let points: Vec<Point> = free_form(61, 41).iter().map(|p| Point::new(p.x, p.y, 0.1 * p.x)).collect();
     let found = predicted(&points);
     for estimate in [&found.flat, &found.curved] {
@@ -114,7 +114,7 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
 }
 
 #[test]
-fn what_makes_no_surface_is_refused() {
+fn accuracy_refuses_degenerate_points() {
     let of = |points: &[Point]| {
         estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap_err()
     };

@@ -76,7 +76,7 @@ fn counts_whole(name: &str, height_mm: f64, planted: &dyn Fn(f64, f64) -> f64) {
 }
 
 #[test]
-fn what_two_neighbouring_touches_found_is_in_the_figures_at_any_height() {
+fn figures_include_two_point_defects() {
     for height_mm in [-0.003, -0.01, -0.05, -0.5, 0.003, 0.01, 0.05, 0.5] {
         // Neighbours are 1.7 mm apart along x and 2.1 mm along y.
         counts_whole("chip", height_mm, &within([49.0, 3.0], [3.0, 2.1], height_mm));
@@ -90,14 +90,14 @@ fn what_two_neighbouring_touches_found_is_in_the_figures_at_any_height() {
 
 /// With a measurement that has no noise, six times the scatter is nothing: the flanks of a bump are beyond it too.
 #[test]
-fn a_clean_map_keeps_its_only_bump() {
+fn bump_on_clean_map_is_inlier() {
     let found = registered(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
     assert!(left_out(&found).is_empty(), "{:?}", left_out(&found));
     assert!(found.quality.pv_mm > 0.9e-3, "{}", found.quality.pv_mm);
 }
 
 #[test]
-fn a_touch_that_found_what_no_neighbour_did_is_left_out_at_any_height() {
+fn lone_deviation_is_outlier() {
     for height_mm in [-0.5, -0.01, 0.003, 0.01, 0.05, 5.0] {
         for at in [[0, 0], [30, 0], [59, 29], [17, 11]] {
             let k = at[1] * COUNTS[0] + at[0];
@@ -110,7 +110,7 @@ fn a_touch_that_found_what_no_neighbour_did_is_left_out_at_any_height() {
 
 /// A touch that was made twice at one place repeats its mistake.
 #[test]
-fn a_touch_and_its_repeat_are_no_two_neighbours() {
+fn repeated_point_is_no_neighbour() {
     let mut measured = touched(COUNTS, NOISE_MM, within([0.847, 1.034], [0.5, 0.5], 0.05));
     let twice = registered(&measured);
     let [k] = left_out(&twice)[..] else { panic!("{:?}", left_out(&twice)) };
@@ -119,7 +119,7 @@ fn a_touch_and_its_repeat_are_no_two_neighbours() {
 }
 
 #[test]
-fn neighbours_on_either_side_of_the_surface_do_not_agree() {
+fn opposite_neighbours_are_outliers() {
     let (a, b) = (within([-0.847, 1.034], [0.5, 0.5], 0.05), within([0.847, 1.034], [0.5, 0.5], -0.05));
     let found = registered(&touched(COUNTS, NOISE_MM, move |x, y| a(x, y) + b(x, y)));
     assert_eq!(left_out(&found).len(), 2);
@@ -127,7 +127,7 @@ fn neighbours_on_either_side_of_the_surface_do_not_agree() {
 
 /// The form has what was touched: no defect that the deviations show is smoothed away as scatter.
 #[test]
-fn the_form_is_as_high_as_what_was_touched() {
+fn form_height_matches_deviations() {
     // Neighbours are 2.9 mm apart along x and 3.5 mm along y: two touches, six, and a dozen.
     for (name, planted) in [
         ("chip", Box::new(within([48.6, 1.8], [3.2, 1.0], -0.02)) as Box<dyn Fn(f64, f64) -> f64>),
@@ -169,7 +169,7 @@ fn true_figures_mm(counts: [usize; 2], planted_mm: impl Fn(f64, f64) -> f64) -> 
 }
 
 #[test]
-fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_true() {
+fn figures_of_strong_corner_form() {
     const FEW: [usize; 2] = [25, 16];
     // High at the corners alone, by the fourth power of the distance from the middle.
     let planted = |x: f64, y: f64| 0.03 * ((x.powi(4) + y.powi(4) - 6.0 * x * x * y * y) / 3400f64.powi(2));
@@ -188,7 +188,7 @@ fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_tr
 }
 
 #[test]
-fn waves_across_the_path_are_form_and_no_drift() {
+fn waves_across_path_are_form() {
     const FEW: [usize; 2] = [25, 16];
     for degrees in [60.0f64, 80.0, 90.0, 100.0] {
         // Five touches a wave, and so nearly the same height from one touch of a row to the next.

@@ -48,7 +48,7 @@ fn free() -> Options {
 }
 
 #[test]
-fn a_scan_line_is_no_part() {
+fn scan_line_is_degenerate() {
     for (degrees, half_mm) in [(0.0, 45.0), (90.0, 26.0), (35.0, 40.0)] {
         for (count, form_mm, seed) in [(30, 0.0, 1), (60, 0.0, 2), (60, 5e-3, 3), (400, 5e-3, 4)] {
             let cloud = measured(&line(count, [2.0, -3.0], degrees, half_mm), form_mm, seed);
@@ -64,7 +64,7 @@ fn a_scan_line_is_no_part() {
 }
 
 #[test]
-fn next_to_a_line_is_a_line_and_a_strip_is_not() {
+fn degenerate_line_and_valid_strip() {
     // 20 points 4.5 mm apart in each row, the rows `apart` of each other.
     let rows = |count: u32, apart_mm: f64| -> Vec<[f64; 2]> {
         (0..count).flat_map(|row| line(20, [0.0, apart_mm * f64::from(row)], 0.0, 43.0)).collect()
@@ -90,7 +90,7 @@ fn next_to_a_line_is_a_line_and_a_strip_is_not() {
 }
 
 #[test]
-fn a_line_may_tell_what_it_can_where_the_rest_is_held() {
+fn line_registers_with_locked_directions() {
     let cloud = measured(&line(60, [2.0, -3.0], 0.0, 45.0), 0.0, 8);
     let start = Start::Pose(pose(&placement()));
     let hold = |held: &[Coordinate]| Options { start, locked: Coordinate::locked_flags(held), ..free() };
@@ -102,7 +102,7 @@ fn a_line_may_tell_what_it_can_where_the_rest_is_held() {
 }
 
 #[test]
-fn a_line_covers_its_own_strip() {
+fn coverage_of_line_is_its_strip() {
     let cover = |places: &[[f64; 2]]| {
         let start = Start::Pose(pose(&placement()));
         let held = Coordinate::locked_flags(&[Coordinate::Y, Coordinate::Rx]);
@@ -124,7 +124,7 @@ fn a_line_covers_its_own_strip() {
 
 /// A cap that any turn about z leaves as it is, sampled on a grid: what the grid adds turns with nothing.
 #[test]
-fn a_turn_that_only_the_sampling_sees_is_held() {
+fn rotation_from_sampling_is_locked() {
     for (columns, rows, seed) in [(41, 25, 1), (103, 63, 2), (205, 125, 3), (409, 249, 4)] {
         let r4 = [(4, 0, 1.5), (2, 2, 3.0), (0, 4, 1.5)];
         let shape = XyPolynomial {
@@ -151,7 +151,7 @@ fn a_turn_that_only_the_sampling_sees_is_held() {
 }
 
 #[test]
-fn as_many_points_are_needed_as_directions_are_free_and_one() {
+fn points_required_by_free_directions() {
     let places = [[-30.0, -20.0], [30.0, -18.0], [2.0, 25.0], [-10.0, 5.0], [20.0, 10.0], [-25.0, 15.0], [10.0, -10.0]];
     let cloud = measured(&places, 0.0, 10);
     let start = Start::Pose(pose(&placement()));

@@ -31,7 +31,7 @@ fn errors_nm(nominal: &Nominal, distance: DistanceModel, step: [f64; 2]) -> [f64
 // The bounds are peak to valley in nanometres, inside and within two steps of the border.
 
 #[test]
-fn on_the_grid_of_the_paper_flat_errs_by_tens_of_nanometres_and_curved_by_hundredths_of_one() {
+fn distance_error_on_paper_grid() {
     let (nominal, step) = (free_form(1021, 1241), [0.1, 0.05]);
     let flat = errors_nm(&nominal, DistanceModel::Triangle, step);
     let curved = errors_nm(&nominal, DistanceModel::Curved, step);
@@ -41,7 +41,7 @@ fn on_the_grid_of_the_paper_flat_errs_by_tens_of_nanometres_and_curved_by_hundre
 }
 
 #[test]
-fn on_a_grid_eight_times_coarser_the_curved_distance_errs_by_nanometres() {
+fn distance_error_on_coarse_grid() {
     let (nominal, step) = (free_form(128, 156), [102.0 / 127.0, 62.0 / 155.0]);
     let flat = errors_nm(&nominal, DistanceModel::Triangle, step);
     let curved = errors_nm(&nominal, DistanceModel::Curved, step);

@@ -88,7 +88,7 @@ fn realistic() -> (Placement, FormError, Vec<Point>) {
 }
 
 #[test]
-fn a_realistic_part_agrees_with_exact_least_squares_on_every_kind_of_nominal() {
+fn register_matches_exact_least_squares() {
     let shape = FreeForm::default();
     let (placement, _, measured) = realistic();
     let keep = vec![true; measured.len()];
@@ -124,7 +124,7 @@ fn a_realistic_part_agrees_with_exact_least_squares_on_every_kind_of_nominal() {
 }
 
 #[test]
-fn noise_gross_outliers_and_a_missing_corner() {
+fn register_with_noise_and_gross_outliers() {
     let shape = FreeForm::default();
     let nominal = free_form(451, 251);
     let (placement, form, _) = realistic();
@@ -171,7 +171,7 @@ fn noise_gross_outliers_and_a_missing_corner() {
 
 /// Over many draws of the noise the covariance that is stated is the scatter that is seen.
 #[test]
-fn the_stated_covariance_is_the_observed_scatter() {
+fn pose_covariance_matches_observed() {
     let nominal = free_form(451, 251);
     let placement = Placement::new([3.0, -2.0, 1.0], [2.0, 1.0, -3.0]);
     let truth = pose(&placement);
@@ -202,7 +202,7 @@ fn the_stated_covariance_is_the_observed_scatter() {
 }
 
 #[test]
-fn from_far_away_a_few_points_go_the_long_way_ahead_of_the_others() {
+fn register_starts_far_with_few_points() {
     let placement = Placement::new([20.0, 10.0, 20.0], [20.0, 20.0, 10.0]);
     let shape = FreeForm::default();
     let form = FormError::with_rms(&mut regrind_sim::rng(5), 30.0, 1e-3);

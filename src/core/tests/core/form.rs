@@ -60,7 +60,7 @@ fn is_about(found: f64, expected: f64, within: f64) -> bool {
 }
 
 #[test]
-fn planted_zernike_terms_come_back_on_disc_and_ring() {
+fn zernike_fit_on_disc_and_ring() {
     for aperture in [circle(), ring()] {
         let samples = sampled(&aperture, 1.0, planted);
         let fitted = fit_polynomials(&PolynomialBasis::for_aperture(&aperture), 36, &samples).unwrap();
@@ -86,7 +86,7 @@ fn planted_zernike_terms_come_back_on_disc_and_ring() {
 }
 
 #[test]
-fn planted_legendre_terms_come_back_on_the_rectangle() {
+fn legendre_fit_on_rectangle() {
     let rectangle = rectangle();
     let p2 = |t: f64| 5f64.sqrt() * 0.5 * (3.0 * t * t - 1.0);
     let p3 = |t: f64| 7f64.sqrt() * 0.5 * (5.0 * t.powi(3) - 3.0 * t);
@@ -103,7 +103,7 @@ fn planted_legendre_terms_come_back_on_the_rectangle() {
 }
 
 #[test]
-fn orthogonal_terms_share_out_the_mean_square_and_do_not_change_with_their_number() {
+fn orthogonal_terms_sum_to_mean_square() {
     let rough = |x: f64, y: f64| 1e-4 * ((0.7 * x).sin() + (0.4 * x * y).cos()) + planted(x, y);
     for aperture in [circle(), ring(), rectangle()] {
         let samples = sampled(&aperture, 1.0, rough);
@@ -124,7 +124,7 @@ fn figures_over(samples: &[DeviationSample], aperture: Aperture) -> DeviationFig
 }
 
 #[test]
-fn one_spike_makes_the_pv_and_not_the_pvr() {
+fn pvr_ignores_single_spike() {
     for (aperture, basis) in [(circle(), "Zernike (Fringe)"), (rectangle(), "Legendre")] {
         let smooth = sampled(&aperture, 0.5, |x, y| 1e-3 * (x / 30.0).sin() + 5e-4 * (y / 20.0).cos());
         let clean = figures_over(&smooth, aperture.clone());
@@ -151,7 +151,7 @@ fn one_spike_makes_the_pv_and_not_the_pvr() {
 }
 
 #[test]
-fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
+fn figures_scale_with_deviations() {
     let zero = figures_over(&sampled(&circle(), 1.0, |_, _| 0.0), circle());
     assert_eq!([zero.pv_mm, zero.pvr.value_mm, zero.pv_998_mm, zero.rms_mm, zero.mean_mm], [0.0; 5]);
     assert_eq!(zero.iso_10110.notation, "3/0(0/0) RMSt<0; RMSi<0; RMSa<0; lambda=632.8");
@@ -176,7 +176,7 @@ fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
 }
 
 #[test]
-fn what_is_removed_is_gone_and_recorded() {
+fn removed_terms_are_recorded() {
     let form = |x: f64, y: f64| 1.0 + 0.2 * x - 0.1 * y + 1e-2 * (x * x + y * y) + 1e-3 * x * y;
     let samples = sampled(&rectangle(), 1.0, form);
     let of = |removed: Vec<RemovedForm>| {
@@ -203,7 +203,7 @@ fn what_is_removed_is_gone_and_recorded() {
 }
 
 #[test]
-fn iso_10110_takes_known_forms_apart() {
+fn iso_10110_separates_known_forms() {
     let of = |f: &dyn Fn(f64, f64) -> f64| iso_10110(&sampled(&circle(), 0.5, f), &circle(), 546.1).unwrap();
     let tilted = |x: f64, y: f64| 1e-2 + 3e-4 * x - 2e-4 * y;
     // Power alone: 100 nm at the rim.
@@ -231,7 +231,7 @@ fn iso_10110_takes_known_forms_apart() {
 }
 
 #[test]
-fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
+fn few_points_reduce_terms() {
     let samples = sampled(&circle(), 1.0, planted);
     let basis = PolynomialBasis::for_aperture(&circle());
     for (points, terms) in [(4, 1), (15, 1), (16, 4), (100, 25), (143, 25), (144, 36)] {
@@ -259,7 +259,7 @@ fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
 }
 
 #[test]
-fn what_has_no_area_or_no_number_is_refused() {
+fn figures_refuse_no_area_or_nan() {
     let line: Vec<DeviationSample> =
         (0..50).map(|k| DeviationSample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
     assert_eq!(compute_figures(&line, &FormOptions::default()), Err(FormError::NoArea));
@@ -278,7 +278,7 @@ fn what_has_no_area_or_no_number_is_refused() {
 }
 
 #[test]
-fn coverage_is_the_share_of_the_aperture_with_points() {
+fn coverage_of_aperture_by_points() {
     let full = figures_over(&sampled(&circle(), 0.5, planted), circle());
     assert!(full.coverage.share > 0.99, "{:?}", full.coverage);
     let half: Vec<DeviationSample> =

@@ -28,7 +28,7 @@ fn rms(values: &[f64]) -> f64 {
 }
 
 #[test]
-fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
+fn learning_error_falls_as_sqrt_passes() {
     // k passes leave N / sqrt(k) of an error that stands far above N; and N itself is told.
     for rule in [GainRule::Wavelength, GainRule::Adaptive] {
         let (mut left, mut told) = ([0.0; 6], 0.0);

@@ -50,7 +50,7 @@ fn part_of_the_free_form(to_x_mm: f64) -> Nominal {
 }
 
 #[test]
-fn points_beyond_the_edge_move_nothing_whatever_their_share() {
+fn points_beyond_edge_have_no_effect() {
     let measured = cloud(WHOLE, [80, 40]);
     let truth = pose(&placement());
     for to_x_mm in [36.0, 22.0, 12.0, 4.0] {
@@ -108,7 +108,7 @@ fn scattered(step_mm: impl Fn(f64) -> f64, noise_mm: f64) -> Vec<Point> {
 }
 
 #[test]
-fn where_a_nominal_changes_from_dense_to_sparse_there_is_no_edge() {
+fn sparse_nominal_has_no_false_edge() {
     for ratio in [4.0, 10.0] {
         let nominal =
             Nominal::from_points(scattered(|x| if x < 0.0 { 0.25 } else { 0.25 * ratio }, 0.0), PlaneProjection::Xy)
@@ -120,7 +120,7 @@ fn where_a_nominal_changes_from_dense_to_sparse_there_is_no_edge() {
 }
 
 #[test]
-fn a_gap_of_the_nominal_is_called_one() {
+fn gap_of_nominal_is_reported() {
     let holed = scattered(|_| 0.5, 0.0).into_iter().filter(|p| p.x.hypot(p.y) > 8.0).collect();
     let nominal = Nominal::from_points(holed, PlaneProjection::Xy).unwrap();
     let found = register(&nominal, &cloud(WHOLE, [60, 30]), &Options::new(RADIUS_MM)).unwrap();
@@ -134,7 +134,7 @@ fn a_gap_of_the_nominal_is_called_one() {
 }
 
 #[test]
-fn in_a_narrow_gutter_every_foot_is_on_its_own_wall() {
+fn projection_stays_on_gutter_wall() {
     const GUTTER_MM: f64 = 4.0;
     const BALL_MM: f64 = 2.0;
     // A cylinder about y that is open upwards, to a slope of 72 degrees; a little narrower at one end, which holds it along y.
@@ -167,7 +167,7 @@ fn in_a_narrow_gutter_every_foot_is_on_its_own_wall() {
 }
 
 #[test]
-fn near_duplicates_and_points_far_off_are_called_so() {
+fn near_duplicates_and_far_off_refused() {
     for apart_mm in [1e-7, 1e-6, 1e-5] {
         let mut nominal = scattered(|_| 0.5, 0.0);
         let twin = nominal[700] + Vector::new(apart_mm, 0.0, 0.0);
@@ -188,7 +188,7 @@ fn near_duplicates_and_points_far_off_are_called_so() {
 }
 
 #[test]
-fn a_nominal_that_scatters_is_reported_and_a_smooth_one_is_not() {
+fn noisy_nominal_is_reported() {
     let measured = cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]);
     for (noise_mm, is_told) in [(0.0, false), (1e-3, true)] {
         let nominal = Nominal::from_points(scattered(|_| 0.5, noise_mm), PlaneProjection::Xy).unwrap();
@@ -203,7 +203,7 @@ fn a_nominal_that_scatters_is_reported_and_a_smooth_one_is_not() {
 }
 
 #[test]
-fn what_is_held_wrongly_is_no_mirror_image() {
+fn wrong_lock_is_not_mirror_image() {
     let nominal = free_form(205, 125);
     let measured = cloud(WHOLE, [40, 20]);
     // Held 3 mm and 2 degrees beside the truth.
@@ -220,7 +220,7 @@ fn what_is_held_wrongly_is_no_mirror_image() {
 }
 
 #[test]
-fn a_side_on_which_the_points_fit_a_hundred_times_better_is_known() {
+fn better_probe_side_is_certain() {
     let measured = cloud(WHOLE, [80, 40]);
     for to_x_mm in [51.0, 12.0] {
         let found = register(&part_of_the_free_form(to_x_mm), &measured, &Options::new(RADIUS_MM)).unwrap();
@@ -229,7 +229,7 @@ fn a_side_on_which_the_points_fit_a_hundred_times_better_is_known() {
 }
 
 #[test]
-fn what_a_surface_cannot_see_begins_at_the_frame_of_the_file() {
+fn free_directions_start_at_file_frame() {
     let flat = |k: usize| Point::new((k % 61) as f64 - 30.0, (k / 61) as f64 - 20.0, 0.0);
     let nominal = Nominal::from_points((0..61 * 41).map(flat).collect(), PlaneProjection::Xy).unwrap();
     let tilt = pose(&Placement::new([4.0, -3.0, 7.0], [1.0, -2.0, 0.0]));
@@ -262,7 +262,7 @@ fn what_a_surface_cannot_see_begins_at_the_frame_of_the_file() {
 }
 
 #[test]
-fn a_pose_that_is_held_whole_gives_the_deviations_from_it() {
+fn locked_pose_gives_deviations() {
     let nominal = free_form(205, 125);
     let truth = pose(&placement());
     let raised = truth * Pose { translation_mm: Vector::new(0.0, 0.0, 0.005), ..Pose::identity() };
@@ -290,7 +290,7 @@ fn a_pose_that_is_held_whole_gives_the_deviations_from_it() {
 }
 
 #[test]
-fn the_last_of_the_trace_is_what_is_reported() {
+fn trace_ends_with_reported_result() {
     let nominal = free_form(205, 125);
     let truth = pose(&placement());
     let clean = cloud(WHOLE, [40, 20]);
@@ -320,7 +320,7 @@ fn the_last_of_the_trace_is_what_is_reported() {
 }
 
 #[test]
-fn where_a_third_of_the_touches_contradict_the_others_nothing_is_judged() {
+fn no_verdict_when_points_contradict() {
     let nominal = free_form(205, 125);
     for (share, is_judged) in [(0.02, true), (0.3, false)] {
         let (mut rng, truth) = (StdRng::seed_from_u64(9), pose(&placement()));
@@ -338,7 +338,7 @@ fn where_a_third_of_the_touches_contradict_the_others_nothing_is_judged() {
 }
 
 #[test]
-fn the_accuracy_of_121_scattered_points_is_told() {
+fn accuracy_of_121_scattered_points() {
     let (mut rng, shape) = (StdRng::seed_from_u64(4), FreeForm::default());
     let points: Vec<Point> = (0..121)
         .map(|k| {

@@ -103,7 +103,7 @@ fn waves(order: FilterOrder) {
 }
 
 #[test]
-fn half_of_a_wave_passes_at_the_cutoff() {
+fn filter_passes_half_at_cutoff() {
     assert!((FilterOrder::Plane.transmission(1.0) - 0.5).abs() < 1e-12);
     assert!((FilterOrder::Quadric.transmission(1.0) - 0.5).abs() < 1e-9);
     waves(FilterOrder::Constant);
@@ -112,7 +112,7 @@ fn half_of_a_wave_passes_at_the_cutoff() {
 }
 
 #[test]
-fn strewn_readings_pass_half_of_a_wave_too() {
+fn scattered_filter_half_at_cutoff() {
     for (spacing, cutoff) in [(1.0, 5.0), (0.5, 5.0), (1.0, 20.0)] {
         let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (0.8 * x + 0.6 * y)).sin();
         let readings = scattered(30_000, [90.0, 70.0], 3, |x, y| wave([x, y]));
@@ -125,7 +125,7 @@ fn strewn_readings_pass_half_of_a_wave_too() {
 
 /// Spreading readings over nodes changes what the definition gives by less than a thousandth of what is filtered.
 #[test]
-fn the_sums_along_the_axes_are_those_of_the_definition() {
+fn separable_filter_matches_definition() {
     for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
         let readings = with_noise(&scattered(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
         let map = fitted_map(&readings, &plain(cutoff, spacing));
@@ -140,7 +140,7 @@ fn the_sums_along_the_axes_are_those_of_the_definition() {
 }
 
 #[test]
-fn what_the_order_lets_pass_passes_to_the_edges() {
+fn filter_reproduces_order_to_edges() {
     let hole = |r: &DeviationSample| (r.place_mm[0] - 5.0).hypot(r.place_mm[1]) > 8.0;
     let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
     let quadric = |x: f64, y: f64| plane(x, y) + 1e-5 * x * x - 3e-6 * x * y + 2e-5 * y * y;
@@ -164,7 +164,7 @@ fn what_the_order_lets_pass_passes_to_the_edges() {
 }
 
 #[test]
-fn the_filter_does_not_care_where_the_part_lies() {
+fn filter_is_shift_and_order_invariant() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
         let here =
@@ -186,7 +186,7 @@ fn the_filter_does_not_care_where_the_part_lies() {
 }
 
 #[test]
-fn good_points_are_not_taken_for_outliers() {
+fn noise_alone_gives_no_outliers() {
     let mut lost = 0;
     for seed in 0..50 {
         lost += fitted_map(&with_noise(&trial(|_, _| 0.0), 3e-4, seed), &MapOptions::new(5.0, 1.0)).outliers.len();
@@ -219,7 +219,7 @@ fn spiked(readings: &mut [DeviationSample], height_mm: f64, seed: u64) -> Vec<us
 }
 
 #[test]
-fn spikes_are_found_and_change_nothing() {
+fn spikes_are_outliers() {
     const NOISE_MM: f64 = 3e-4;
     for seed in 0..5 {
         for clean in [trial(form), scattered(6000, [102.0, 62.0], seed, form)] {
@@ -236,7 +236,7 @@ fn spikes_are_found_and_change_nothing() {
 }
 
 #[test]
-fn the_robust_form_takes_no_notice_of_spikes() {
+fn robust_filter_ignores_spikes() {
     const NOISE_MM: f64 = 3e-4;
     let clean = with_noise(&sampled(129, 79, [0.8, 0.8], form), NOISE_MM, 1);
     let mut readings = clean.clone();
@@ -254,7 +254,7 @@ fn the_robust_form_takes_no_notice_of_spikes() {
 
 /// What counts crests less that stand out of the filtered surface lets less of them pass: that is of the rule, and not of the arithmetic.
 #[test]
-fn the_robust_form_passes_less_than_half_of_a_wave_that_stands_alone() {
+fn robust_filter_attenuates_lone_wave() {
     const CUTOFF_MM: f64 = 10.0;
     let inside = |[x, y]: [f64; 2]| x.abs() < 35.0 && y.abs() < 15.0;
     for phase in [0.0, 0.7, 1.9] {
@@ -270,7 +270,7 @@ fn the_robust_form_passes_less_than_half_of_a_wave_that_stands_alone() {
 }
 
 #[test]
-fn a_feature_of_the_part_is_kept() {
+fn feature_of_part_is_inlier() {
     // A mound 8 mm wide and thirty times the noise, on a quiet surface.
     let mound = |x: f64, y: f64| 9e-3 * (-((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 8.0).exp();
     let map = fitted_map(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
@@ -279,7 +279,7 @@ fn a_feature_of_the_part_is_kept() {
 }
 
 #[test]
-fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
+fn two_agreeing_neighbours_are_inliers() {
     let quiet = with_noise(&trial(|_, _| 0.0), 3e-4, 5);
     let nearest = |[x, y]: [f64; 2], but: Option<usize>| {
         let away = |k: usize| (quiet[k].place_mm[0] - x).hypot(quiet[k].place_mm[1] - y);
@@ -305,7 +305,7 @@ fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
 }
 
 #[test]
-fn a_place_that_is_touched_again_does_not_agree_with_itself() {
+fn repeats_do_not_confirm_outlier() {
     // Targets 260 mm apart that are touched three times each, a few tenths of a millimetre beside; one is not where it should be.
     let wave = |x: f64, y: f64| 0.1 * (x / 900.0).sin() * (y / 700.0).cos();
     let beside = [[0.0, 0.0], [0.3, -0.2], [-0.1, 0.4]];
@@ -325,7 +325,7 @@ fn a_place_that_is_touched_again_does_not_agree_with_itself() {
 }
 
 #[test]
-fn the_top_of_a_low_bump_is_kept() {
+fn top_of_low_bump_is_inlier() {
     // Ten times the noise: the surface that readings are judged by leans to it.
     for seed in 0..20 {
         let bump = |x: f64, y: f64| 3e-3 * (1.0 - ((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 16.0).max(0.0).powi(2);
@@ -358,7 +358,7 @@ fn observed_over_stated_sigma(
 }
 
 #[test]
-fn the_stated_uncertainty_is_the_scatter() {
+fn map_sigma_matches_monte_carlo() {
     let quadric = MapOptions { order: FilterOrder::Quadric, ..plain(9.0, 2.0) };
     let spline = |cutoff_mm| MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
     let cases = [
@@ -382,7 +382,7 @@ fn the_stated_uncertainty_is_the_scatter() {
 }
 
 #[test]
-fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
+fn spline_passes_half_at_cutoff() {
     let cutoff = 6.0;
     for direction in [[1.0, 0.0], [0.0, 1.0], [0.5f64.sqrt(), 0.5f64.sqrt()]] {
         let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (direction[0] * x + direction[1] * y) + 0.4).cos();
@@ -405,7 +405,7 @@ fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
 }
 
 #[test]
-fn outside_what_was_measured_the_map_levels_off() {
+fn map_levels_off_outside_points() {
     // A round part whose error rises to its border.
     let mut readings = sampled(81, 81, [1.0, 1.0], |x, _| 1e-4 * x);
     readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) < 40.0);
@@ -427,7 +427,7 @@ fn outside_what_was_measured_the_map_levels_off() {
 }
 
 #[test]
-fn a_map_on_a_net_is_filtered_as_readings_are() {
+fn filter_grid_matches_readings() {
     let grid = Grid { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
     let valid: Vec<bool> = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
     let mut rng = StdRng::seed_from_u64(9);
@@ -460,7 +460,7 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
 }
 
 #[test]
-fn what_makes_no_map_is_said() {
+fn error_map_refuses_bad_input() {
     let options = MapOptions::new(5.0, 1.0);
     let some = sampled(31, 31, [1.0, 1.0], |_, _| 0.0);
     assert!(matches!(error_map(&[], &options), Err(MapError::Grid(GridError::NoPoints))));
@@ -497,7 +497,7 @@ fn what_makes_no_map_is_said() {
 }
 
 #[test]
-fn the_size_of_the_values_does_not_matter() {
+fn map_scales_with_values() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..plain(6.0, 1.0) };
         let unit = with_noise(&trial(form), 3e-4, 6);
@@ -513,7 +513,7 @@ fn the_size_of_the_values_does_not_matter() {
 }
 
 #[test]
-fn a_short_cutoff_is_advised_against() {
+fn short_cutoff_gets_advice() {
     let readings = with_noise(&trial(form), 3e-4, 6);
     assert!(fitted_map(&readings, &MapOptions::new(5.0, 1.0)).advice.is_empty());
     let short = fitted_map(&readings, &MapOptions::new(3.5, 1.0));
@@ -523,7 +523,7 @@ fn a_short_cutoff_is_advised_against() {
 }
 
 #[test]
-fn what_a_model_tells_is_laid_out_with_how_well_each_place_is_known() {
+fn model_map_carries_point_sigma() {
     let form = |x: f64, y: f64| 1e-3 * (0.05 * x).sin() + 2e-5 * y;
     let sigma = |x: f64, _: f64| 3e-4 + 4e-6 * x;
     let told: Vec<(DeviationSample, f64)> =

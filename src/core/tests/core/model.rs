@@ -95,7 +95,7 @@ fn contains(interval: Interval, value: f64) -> bool {
 }
 
 #[test]
-fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
+fn form_and_frame_intervals_cover_truth() {
     let (mut rms, mut pv, mut areas) = (0, 0, [0; 9]);
     let (mut frame, mut repeated) = (0.0, 0.0);
     for seed in 0..parts() {
@@ -136,7 +136,7 @@ fn bent(seed: u64, rms_mm: f64) -> impl Fn(f64, f64) -> f64 {
 }
 
 #[test]
-fn many_points_tell_the_corners_of_a_form_of_low_polynomials() {
+fn many_points_bound_polynomial_corners() {
     let (mut held, mut width_mm, mut all_mm) = (0, 0.0, 0.0);
     for seed in 0..parts() {
         let mut rng = StdRng::seed_from_u64(1000 + seed);
@@ -164,7 +164,7 @@ fn many_points_tell_the_corners_of_a_form_of_low_polynomials() {
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn a_probe_that_drifts_along_its_path_is_not_taken_for_form() {
+fn autocorrelated_noise_is_not_form() {
     let (mut rms, mut pv, mut seen) = (0, 0, 0);
     for seed in 100..100 + parts() {
         let part = drifting(seed, 5e-3, 0.7);
@@ -190,7 +190,7 @@ fn a_probe_that_drifts_along_its_path_is_not_taken_for_form() {
 }
 
 #[test]
-fn a_form_as_small_as_the_scatter_is_told_without_it() {
+fn form_as_small_as_noise() {
     let (mut rms, mut pv) = (0, 0);
     let mut raw = [0.0; 2];
     for seed in 0..parts() {
@@ -226,7 +226,7 @@ fn measured_by_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm:
 }
 
 #[test]
-fn what_a_machine_does_to_all_points_is_allowed_for_where_it_is_stated() {
+fn machine_uncertainty_widens_form() {
     const MACHINES: u64 = 8;
     let machine = MachineUncertainty { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..MachineUncertainty::default() };
     let radius_sigma_mm = 3e-4;
@@ -272,7 +272,7 @@ fn held_with_offset(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
 }
 
 #[test]
-fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
+fn fixture_uncertainty_widens_form() {
     let drawn = seeds(5);
     let datum = [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4];
     let given = ModelInputs { locked_sigmas: Some(datum), ..ModelInputs::default() };
@@ -334,7 +334,7 @@ fn corrected_by_machine(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
+fn corrected_part_includes_machine_error() {
     let drawn = seeds(4);
     let scaled = MachineUncertainty { scale: [5e-5; 3], ..MachineUncertainty::default() };
     for (machine, datum) in [(scaled, [0.0; 6]), (MachineUncertainty::default(), [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4])] {
@@ -363,14 +363,14 @@ fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
 }
 
 #[test]
-fn who_held_nothing_is_told_of_no_fixture() {
+fn no_fixture_entry_without_lock() {
     let part = part(3, 5e-3);
     assert!(part.model.budget.iter().all(|share| share.source != UncertaintySource::Datum));
     assert_eq!(part.model.budget.len(), UncertaintySource::ALL.len() - 1);
 }
 
 #[test]
-fn what_no_uncertainty_can_be_is_refused_in_words() {
+fn form_refuses_bad_uncertainty() {
     let part = part(3, 5e-3);
     for wrong in [-1e-3, f64::NAN, 1e9] {
         for machine in [
@@ -389,7 +389,7 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
 }
 
 #[test]
-fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
+fn radius_uncertainty_widens_form() {
     let (part, with_form) = (part(3, 1e-9), part(3, 5e-3));
     let given = ModelInputs { radius_sigma_mm: 2e-2, ..ModelInputs::default() };
     let doubted = Form::estimate(&part.registration, &given).unwrap();
@@ -404,7 +404,7 @@ fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
 }
 
 #[test]
-fn the_figures_of_a_part_without_form_are_not_the_scatter_of_its_probe() {
+fn figures_of_formless_part_exclude_noise() {
     let part = part(1, 1e-9);
     let raw = figures(&part.registration.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
     let told = part.model.figures;
@@ -444,7 +444,7 @@ fn contains_angle(of: AngleInterval, value: f64) -> bool {
 }
 
 #[test]
-fn a_part_without_form_has_slopes_and_iso_10110_with_upper_bounds_alone() {
+fn formless_part_has_upper_bounds_only() {
     let part = part(1, 1e-9);
     let (told, slope) = (part.model.iso.unwrap(), part.model.slope.unwrap());
     let (iso, slopes) = area_figures(&part);
@@ -469,7 +469,7 @@ fn a_part_without_form_has_slopes_and_iso_10110_with_upper_bounds_alone() {
 }
 
 #[test]
-fn of_too_few_points_no_figure_of_an_area_is_invented() {
+fn few_points_give_no_area_figures() {
     let mut part = part(2, 5e-3);
     for (k, deviation) in part.registration.deviations.iter_mut().enumerate() {
         if k % 43 != 0 {
@@ -488,7 +488,7 @@ fn of_too_few_points_no_figure_of_an_area_is_invented() {
 
 /// A probe that scatters less than the touches do: the rest is form, and between the touches no more than at them.
 #[test]
-fn between_the_touches_there_is_no_more_form_than_at_them() {
+fn no_extra_form_between_points() {
     let given = ModelInputs { probe_noise_mm: [0.5 * NOISE_MM, 0.1], ..ModelInputs::default() };
     for seed in 0..2 {
         let part = part(seed, 5e-3);
@@ -501,7 +501,7 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
 
 /// A reference sphere is touched some twenty times and may by chance tell of a probe that scatters a fifth less: that is no form yet.
 #[test]
-fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
+fn sphere_noise_by_chance_is_not_form() {
     let low_mm = |part: &Part, share: f64| {
         let given = ModelInputs { probe_noise_mm: [share * NOISE_MM, 0.15], ..ModelInputs::default() };
         Form::estimate(&part.registration, &given).unwrap().figures.rms.low_mm
@@ -520,7 +520,7 @@ fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
 
 /// 16 points leave 10 degrees of freedom, which tell no form from scatter: the upper end holds the form of the whole part then.
 #[test]
-fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() {
+fn few_points_upper_bound_covers_form() {
     let (mut held, parts) = (0, parts());
     for seed in 0..parts {
         let mut part = part(seed, 1e-3);
@@ -541,7 +541,7 @@ fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() 
 }
 
 #[test]
-fn figures_are_the_same_on_any_number_of_threads() {
+fn figures_independent_of_threads() {
     let form = FormError::with_rms(&mut regrind_sim::rng(7), 30.0, 1e-3);
     let placement = Placement::new([1.0, -2.0, 0.5], [0.3, -0.2, 0.5]);
     // Enough points that the sums are made of several blocks.

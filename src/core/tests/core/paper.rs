@@ -31,7 +31,7 @@ fn as_in_the_paper() -> Options {
 }
 
 #[test]
-fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
+fn register_undoes_large_displacement() {
     let nominal = nominal();
     let exact = centres(&FormError::none(), [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM]);
     let cases = [
@@ -66,7 +66,7 @@ fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
 }
 
 #[test]
-fn centres_on_the_offset_are_contacts_on_the_nominal() {
+fn offset_centres_match_contacts() {
     let nominal = nominal();
     let form = FormError::new(12, 12.0, 6.9e-3, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
     let placement = Placement::new([-0.068_855, 0.065_762, 0.195_464], [-0.4587, 0.0646, -0.0095]); // eq. (17)

@@ -58,7 +58,7 @@ fn tiny_noise() -> impl Fn() -> f64 {
 }
 
 #[test]
-fn what_is_planted_is_found_without_form() {
+fn parameters_recovered_without_form() {
     let scatter = tiny_noise();
     let contacts = contacts_on(&FreeForm::default(), |c, _| {
         // The datum leaves the height free.
@@ -89,7 +89,7 @@ fn what_is_planted_is_found_without_form() {
 }
 
 #[test]
-fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back() {
+fn wheel_radius_on_bowl_is_compensated() {
     // A bowl of 100 mm radius, where the normal leans by 30 degrees: 1/nz - 1 = 0.1547; so 0.1 mm leave 15.47 um.
     let lean = 30f64.to_radians();
     let steep = SurfacePoint {
@@ -128,7 +128,7 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
 }
 
 #[test]
-fn of_nothing_nothing_is_taken() {
+fn parameters_of_pure_form_are_zero() {
     let options = ParameterOptions {
         tolerances: [Some(0.1), None, None, None, None, None, None],
         ..ParameterOptions::new(WHEEL_MM)
@@ -146,7 +146,7 @@ fn of_nothing_nothing_is_taken() {
 }
 
 #[test]
-fn a_datum_tells_no_better_than_it_holds() {
+fn setting_limited_by_lock_uncertainty() {
     let scatter = tiny_noise();
     let contacts = contacts_on(&FreeForm::default(), |c, _| planted(c, 0.0, 0.012, 0.0) + scatter());
     let told = |datum| {
@@ -198,7 +198,7 @@ fn coverage(
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn values_are_within_what_is_stated_of_them() {
+fn parameter_sigmas_cover_truth() {
     use ParameterKind::{SettingX, SettingY, WheelRadius};
     for (free, world) in
         [(FREE_MOTIONS, [0.9, 18.0, 0.3]), (FREE_MOTIONS, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])]
@@ -213,7 +213,7 @@ fn values_are_within_what_is_stated_of_them() {
 }
 
 #[test]
-fn what_looks_alike_is_said() {
+fn parameters_report_confounding() {
     let noise = std::cell::RefCell::new(StdRng::seed_from_u64(1));
     let scatter = |_: &SurfacePoint, _: f64| 1e-4 * normal(&mut noise.borrow_mut());
     // A setting error of a round wheel is a shift of the part.
@@ -258,7 +258,7 @@ fn winding(contact: &SurfacePoint) -> f64 {
 }
 
 #[test]
-fn the_other_term_of_the_wheel_and_a_given_progress_are_followed() {
+fn wheel_term_along_normal_and_progress() {
     let scatter = tiny_noise();
     let contacts =
         contacts_on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
@@ -269,7 +269,7 @@ fn the_other_term_of_the_wheel_and_a_given_progress_are_followed() {
 }
 
 #[test]
-fn what_cannot_be_separated_is_refused() {
+fn parameters_refuse_bad_input() {
     let contacts = contacts_on(&FreeForm::default(), |_, _| 1e-3);
     let options = ParameterOptions::new(WHEEL_MM);
     let error = |contacts: &[SurfacePoint]| estimate_parameters(contacts, None, &options).unwrap_err();

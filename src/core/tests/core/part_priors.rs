@@ -124,7 +124,7 @@ fn simulated(hyperparameters: &Hyperparameters, seed: u64) -> Observations {
 }
 
 #[test]
-fn by_what_six_parts_taught_the_parameters_of_few_points_are_nearer() {
+fn part_priors_improve_few_points() {
     for planted in [hyperparameters(30.0, 0.1), hyperparameters(20.0, 0.3)] {
         let every = Prior::for_size(102.0 / 3.0);
         let mut taught = PartPriors::default();
@@ -152,7 +152,7 @@ fn by_what_six_parts_taught_the_parameters_of_few_points_are_nearer() {
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn what_parts_taught_is_believed_as_far_as_it_is_true() {
+fn part_priors_preserve_coverage() {
     // Four parts of a recipe teach; those that follow are like them.
     let mut taught = PartPriors::default();
     for seed in 0..4 {
@@ -172,7 +172,7 @@ fn what_parts_taught_is_believed_as_far_as_it_is_true() {
 
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
-fn a_part_that_is_like_none_before_is_told_by_its_own_points() {
+fn unlike_part_overrides_priors() {
     // Twenty parts have taught that a form is narrow and next to the scatter; this one is wide and strong, and the other way round.
     let many = |range_mm: f64, ratio: f64| {
         (0..20).fold(None, |lesson, _| Some(PartFit::updated(lesson, &hyperparameters(range_mm, ratio))))

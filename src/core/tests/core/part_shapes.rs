@@ -45,7 +45,7 @@ fn weak_direction_words(found: &Registration) -> String {
 }
 
 #[test]
-fn a_steep_off_axis_asphere() {
+fn register_off_axis_asphere() {
     let shape = OffAxisAsphere { radius_mm: 120.0, conic: -1.2, fourth: 3e-8, shift_mm: 70.0 };
     let nominal = gridded(&shape, [80.0, 60.0], [401, 301]);
     let placement = Placement::new([30.0, -80.0, 12.0], [15.0, -100.0, 60.0]);
@@ -60,7 +60,7 @@ fn a_steep_off_axis_asphere() {
 }
 
 #[test]
-fn a_biconic_fits_in_two_poses_and_says_so() {
+fn biconic_reports_alternative_pose() {
     let shape = Biconic { radius_mm: [90.0, -140.0], conic: [-0.7, 1.2] };
     let nominal = gridded(&shape, [60.0, 60.0], [301, 301]);
     let placement = Placement::new([-5.0, 8.0, 100.0], [3.0, 170.0, 40.0]);
@@ -79,7 +79,7 @@ fn a_biconic_fits_in_two_poses_and_says_so() {
 }
 
 #[test]
-fn a_shallow_wave_is_registered_in_height_and_its_weak_directions_are_named() {
+fn shallow_wave_reports_weak_directions() {
     let shape = Wave { height_mm: 0.01 };
     let nominal = gridded(&shape, [100.0, 80.0], [401, 321]);
     let placement = Placement::new([0.4, -0.3, 0.8], [0.02, -0.03, 0.2]);
@@ -98,7 +98,7 @@ fn a_shallow_wave_is_registered_in_height_and_its_weak_directions_are_named() {
 }
 
 #[test]
-fn a_sphere_cap_holds_its_three_rotations() {
+fn sphere_cap_locks_rotations() {
     let shape = Sphere { radius_mm: -60.0 };
     let nominal = gridded(&shape, [50.0, 50.0], [201, 201]);
     let placement = Placement::new([1.0, 2.0, -1.5], [0.0, 0.0, 0.0]);
@@ -115,7 +115,7 @@ fn a_sphere_cap_holds_its_three_rotations() {
 }
 
 #[test]
-fn a_scattered_sphere_holds_its_three_rotations_too() {
+fn scattered_sphere_locks_rotations() {
     let nominal = Nominal::from_points(polar_cap(60.0, 6000, 25.0, 0.0), PlaneProjection::Auto).unwrap();
     assert_eq!(nominal.kind(), NominalKind::Scattered { projection: PlaneProjection::Xy });
     let centres: Vec<Point> = polar_cap(61.5, 900, 22.0, 0.3);
@@ -125,7 +125,7 @@ fn a_scattered_sphere_holds_its_three_rotations_too() {
 }
 
 #[test]
-fn a_plane_and_a_cylinder_hold_what_they_cannot_see() {
+fn plane_and_cylinder_lock_free_motions() {
     let plane: Vec<Point> = (0..900).map(|k| Point::new(f64::from(k % 30), f64::from(k / 30), 0.0)).collect();
     let nominal = Nominal::from_points(plane, PlaneProjection::Auto).unwrap();
     let tilted = Placement::new([0.0, 0.0, 0.3], [1.0, -2.0, 0.0]);
@@ -179,7 +179,7 @@ fn bumpy(direction: &Vector) -> (Point, Vector) {
 }
 
 #[test]
-fn a_hyper_hemisphere_to_a_polar_angle_of_120_degrees() {
+fn register_hyper_hemisphere() {
     let nominal: Vec<Point> = polar_cap(1.0, 40_000, 120.0, 0.0).iter().map(|u| bumpy(&u.coords).0).collect();
     let nominal = Nominal::from_points(nominal, PlaneProjection::Auto).unwrap();
     assert_eq!(nominal.kind(), NominalKind::Scattered { projection: PlaneProjection::Spherical });
@@ -225,7 +225,7 @@ fn several_patches_are_one_surface() {
 }
 
 #[test]
-fn an_offset_that_folds_is_refused_with_place_and_radius() {
+fn folding_offset_refused_with_radius() {
     let bowl = Sphere { radius_mm: 1.2 };
     let nominal = gridded(&bowl, [1.2, 1.2], [61, 61]);
     let cloud = measured(&Sphere { radius_mm: 40.0 }, [0.5, 0.5], [10, 10], &Placement::IDENTITY, 0.0);
@@ -255,7 +255,7 @@ fn cloud_of(shape: &dyn Shape, size: [f64; 2]) -> Vec<Point> {
 }
 
 #[test]
-fn the_same_surface_as_a_formula_and_as_points() {
+fn formula_and_points_agree() {
     let text = r#"
         [surface]
         kind = "off-axis"
@@ -298,7 +298,7 @@ fn the_same_surface_as_a_formula_and_as_points() {
 }
 
 #[test]
-fn robust_losses_from_a_given_pose() {
+fn robust_losses_from_start_pose() {
     let shape = regrind_sim::shape::FreeForm::default();
     let nominal = crate::common::free_form(301, 181);
     let placement = Placement::new([0.3, -0.2, 0.25], [0.2, 0.1, -0.3]);
@@ -313,7 +313,7 @@ fn robust_losses_from_a_given_pose() {
 }
 
 #[test]
-fn the_radius_subtracted_is_wrong_by_micrometres() {
+fn subtracted_radius_errs_by_micrometres() {
     let shape = regrind_sim::shape::FreeForm::default();
     let nominal = crate::common::free_form(451, 251);
     let placement = Placement::new([0.1, -0.2, 0.15], [0.1, 0.05, -0.1]);

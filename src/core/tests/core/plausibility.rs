@@ -49,7 +49,7 @@ fn warnings(found: &Registration) -> String {
 }
 
 #[test]
-fn of_a_ground_part_nothing_is_said() {
+fn plausibility_silent_on_ground_part() {
     for seed in 1..=4 {
         let found = with_radius(RADIUS_MM, &whole(seed));
         assert!(found.quality.rms_mm > 1e-3, "{}", found.quality.rms_mm);
@@ -58,7 +58,7 @@ fn of_a_ground_part_nothing_is_said() {
 }
 
 #[test]
-fn a_diameter_and_half_a_radius_are_told() {
+fn plausibility_reports_wrong_radius() {
     for seed in 1..=4 {
         for factor in [0.5, 2.0] {
             let given_mm = factor * RADIUS_MM;
@@ -80,7 +80,7 @@ fn a_diameter_and_half_a_radius_are_told() {
 }
 
 #[test]
-fn contact_points_that_were_taken_for_centres_are_told() {
+fn plausibility_reports_contact_points() {
     for seed in 1..=4 {
         let right = with_radius(RADIUS_MM, &whole(seed));
         let contacts: Vec<Point> =
@@ -93,7 +93,7 @@ fn contact_points_that_were_taken_for_centres_are_told() {
 }
 
 #[test]
-fn a_fit_that_is_refused_for_its_radius_says_so() {
+fn refused_fit_reports_radius() {
     let options = Options { rms_limit_mm: Some(0.01), ..Options::new(2.0 * RADIUS_MM) };
     let told = register(nominal(), &whole(1), &options).unwrap_err();
     assert!(matches!(told, RegistrationError::DoesNotFit { .. }), "{told}");
@@ -103,7 +103,7 @@ fn a_fit_that_is_refused_for_its_radius_says_so() {
 }
 
 #[test]
-fn few_points_of_the_part_are_told() {
+fn plausibility_reports_low_coverage() {
     let words = warnings(&with_radius(RADIUS_MM, &measured(1, [25.0, 15.0])));
     assert!(words.contains("1800 points used cover only 2") && words.contains("cut short"), "{words}");
     // The first rows of a file that was cut.
@@ -112,7 +112,7 @@ fn few_points_of_the_part_are_told() {
 }
 
 #[test]
-fn many_outliers_are_told() {
+fn plausibility_reports_many_outliers() {
     // No two of them are neighbours in the pattern of 60 columns.
     let spoiled = |every: usize| {
         let mut cloud = whole(1);
@@ -132,7 +132,7 @@ fn many_outliers_are_told() {
 }
 
 #[test]
-fn a_mirror_image_is_told_however_it_fails() {
+fn register_refuses_mirror_image() {
     let as_it_is = whole(1);
     for axis in 0..3 {
         let mirrored: Vec<Point> = as_it_is

@@ -34,13 +34,13 @@ fn missed_poses(
 // The limits are five times the scatter that 0.3 um of noise leaves at the worst corner.
 
 #[test]
-fn any_pose_of_the_whole_part() {
+fn search_finds_whole_part() {
     let astray = missed_poses([[-50.5, -30.5], [50.5, 30.5]], [57, 35], 0..100, 5e-4);
     assert!(astray.is_empty(), "{astray:?}");
 }
 
 #[test]
-fn any_pose_of_a_third_of_the_part() {
+fn search_finds_third_of_part() {
     let astray = missed_poses([[-15.0, -30.5], [18.5, 30.5]], [33, 60], 100..200, 4e-3);
     assert!(astray.is_empty(), "{astray:?}");
 }

@@ -112,7 +112,7 @@ fn contains(interval: Interval, value: f64) -> bool {
 }
 
 #[test]
-fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
+fn form_between_points_covers_truth() {
     let parts = seeds(5);
     let touches = std::env::var("REGRIND_TOUCHES").map_or(70, |touches| touches.parse().unwrap());
     let (mut rms, mut pv, mut width) = (0, 0, [0.0; 2]);
@@ -136,7 +136,7 @@ fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
 }
 
 #[test]
-fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
+fn figures_include_fine_ridges() {
     // Ridges of 0.5 um that no touch can tell from the scatter of a probe, and a probe that scatters by as much by itself.
     let rough = Part::new(3, 1e-9, |x, y| 5e-4 * (f64::sin(9.1 * x) * f64::cos(7.7 * y)).signum());
     let (first, last) = two_far_batches(&rough, 120);
@@ -163,7 +163,7 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
 }
 
 #[test]
-fn it_ends_where_enough_is_known_and_goes_on_where_not() {
+fn stopping_gives_each_reason() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = two_far_batches(&part, 30);
     let few = part.decide(&first, &last, &LOOSE);
@@ -182,7 +182,7 @@ fn it_ends_where_enough_is_known_and_goes_on_where_not() {
 }
 
 #[test]
-fn what_is_beyond_for_certain_is_not_touched_for_a_correction_that_no_pass_is_left_for() {
+fn stopping_beyond_without_pass_left() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = two_far_batches(&part, 60);
     let over = part.decide(&first, &last, &StoppingCriteria { correction_sigma_mm: 1e-7, may_grind: false, ..STRICT });
@@ -190,7 +190,7 @@ fn what_is_beyond_for_certain_is_not_touched_for_a_correction_that_no_pass_is_le
 }
 
 #[test]
-fn touching_is_not_given_up_where_one_look_would_accept_and_the_risk_of_many_does_not_allow_it() {
+fn stopping_risk_of_repeated_tests() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = two_far_batches(&part, 150);
     let rms = part.decide(&first, &last, &LOOSE).form.figures.rms;
@@ -202,7 +202,7 @@ fn touching_is_not_given_up_where_one_look_would_accept_and_the_risk_of_many_doe
 }
 
 #[test]
-fn another_pass_mends_more_than_touches_beyond_a_sixth_of_the_pattern() {
+fn stopping_prefers_pass_after_a_sixth() {
     let part = Part::smooth(5, 5e-3);
     let never = StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT };
     let why = |count, purpose: &StoppingCriteria| {
@@ -215,7 +215,7 @@ fn another_pass_mends_more_than_touches_beyond_a_sixth_of_the_pattern() {
 }
 
 #[test]
-fn batches_have_an_end() {
+fn stopping_after_max_batches() {
     let part = Part::smooth(6, 5e-3);
     let touched = farthest_points(&part.targets, 60);
     let looked = |last: u32| {
@@ -238,7 +238,7 @@ fn batches_have_an_end() {
 }
 
 #[test]
-fn the_next_touches_are_new_where_least_is_known_and_say_more_than_as_many_anywhere() {
+fn next_batch_lowers_variance() {
     let part = Part::smooth(6, 5e-3);
     // All touches in one half.
     let half: Vec<usize> = (0..part.targets.len()).filter(|k| part.targets[*k].0.x < 0.0).collect();
@@ -259,7 +259,7 @@ fn the_next_touches_are_new_where_least_is_known_and_say_more_than_as_many_anywh
 }
 
 #[test]
-fn dust_has_its_neighbours_touched_and_is_left_out_then() {
+fn dust_is_outlier_after_neighbours() {
     let at = Part::smooth(7, 1e-3).targets[300].0;
     let part = Part::new(7, 1e-3, move |x, y| if (x - at.x).hypot(y - at.y) < 1.0 { 0.03 } else { 0.0 });
     let (mut first, last) = two_far_batches(&part, 80);
@@ -274,7 +274,7 @@ fn dust_has_its_neighbours_touched_and_is_left_out_then() {
 }
 
 #[test]
-fn a_chip_at_the_edge_is_no_dust() {
+fn chip_at_edge_is_not_dust() {
     let corner = Part::smooth(8, 1e-3).targets[0].0;
     let part = Part::new(8, 1e-3, move |x, y| if (x - corner.x).hypot(y - corner.y) < 6.0 { -0.05 } else { 0.0 });
     // The corner is among those that lie farthest apart; its neighbours come next.
@@ -294,7 +294,7 @@ fn a_chip_at_the_edge_is_no_dust() {
 }
 
 #[test]
-fn a_batch_that_was_not_expected_is_followed_by_another() {
+fn surprising_batch_adds_another() {
     // Smooth where the first touches are, and a wave of 4 um where the last are.
     let part = Part::new(9, 1e-3, |x, y| if x > 10.0 { 4e-3 * (0.9 * x).sin() * (0.8 * y).cos() } else { 0.0 });
     let [left, right]: [Vec<usize>; 2] = [false, true]
@@ -310,7 +310,7 @@ fn a_batch_that_was_not_expected_is_followed_by_another() {
 }
 
 #[test]
-fn the_first_touches_lie_far_apart_and_the_way_is_short() {
+fn first_batch_is_spread_with_short_tour() {
     let part = Part::smooth(1, 1e-3);
     let chosen = farthest_points(&part.targets, FIRST_BATCH);
     let least = |of: &[usize]| {

@@ -55,7 +55,7 @@ macro_rules! on_a_controller {
 }
 
 on_a_controller! {
-    a_program_runs_to_its_end_and_no_further(_controller) {
+    program_completes_and_starts_once(_controller) {
         let bench = bench(&to_and_fro(40));
         let (mut grinder, armed) = bench.started().await;
         let status = until(&mut grinder, State::Complete).await;
@@ -72,7 +72,7 @@ on_a_controller! {
         assert_eq!(bench.wrote("begin"), 1);
     }
 
-    spark_out_is_run_within_the_one_start(_controller) {
+    spark_out_within_one_start(_controller) {
         let bench = bench(&to_and_fro(10));
         let sparing = regrind_device::Pass { spark_out_passes: 2, ..pass() };
         let mut grinder = bench.grinder();
@@ -99,7 +99,7 @@ on_a_controller! {
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 1));
     }
 
-    a_hold_stands_and_a_resume_goes_on(_controller) {
+    hold_stops_motion_resume_continues(_controller) {
         let bench = bench(&to_and_fro(60));
         let (mut grinder, _) = bench.started().await;
         grinder.hold().await.unwrap();
@@ -117,7 +117,7 @@ on_a_controller! {
         assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
     }
 
-    an_abort_ends_it_and_a_clear_makes_it_free(_controller) {
+    abort_then_clear_gives_idle(_controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         grinder.abort().await.unwrap();
@@ -127,7 +127,7 @@ on_a_controller! {
         assert_eq!(grinder.clear().await.unwrap().state, State::Idle);
     }
 
-    a_stop_of_what_holds_ends_it(_controller) {
+    stop_while_held(_controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         grinder.hold().await.unwrap();
@@ -136,7 +136,7 @@ on_a_controller! {
         assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Stopped);
     }
 
-    a_folder_that_is_not_the_same_is_found_before_anything_runs(controller) {
+    wrong_program_folder_fails_load(controller) {
         let mut bench = bench(&to_and_fro(10));
         let mut operator = controller.operator().await;
         // What was opened before stays open, though the order for the new one is acknowledged.
@@ -157,7 +157,7 @@ on_a_controller! {
         assert_eq!(operator.ask("get program_status").await, "PROGRAM_STATUS IDLE");
     }
 
-    a_program_that_cannot_be_read_to_its_end_is_a_fault(_controller) {
+    unparsable_program_faults(_controller) {
         let bench = bench(&program("F600\nG1 X1\nG1 X(\n"));
         let (mut grinder, _) = bench.started().await;
         let status = until(&mut grinder, State::Faulted).await;
@@ -166,7 +166,7 @@ on_a_controller! {
         assert_eq!(grinder.clear().await.unwrap().state, State::Idle);
     }
 
-    a_limit_of_travel_is_a_fault_of_travel(_controller) {
+    travel_limit_faults(_controller) {
         let bench = bench(&program("F6000\nG1 X1\nG1 X500\n"));
         let (mut grinder, _) = bench.started().await;
         let status = until(&mut grinder, State::Faulted).await;
@@ -174,7 +174,7 @@ on_a_controller! {
         assert!(grinder.notes().iter().any(|note| note.contains("X's positive limit")), "{:?}", grinder.notes());
     }
 
-    a_stop_circuit_that_opens_is_a_fault_that_only_a_person_takes_away(controller) {
+    operator_estop_needs_operator_reset(controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         let mut operator = controller.operator().await;
@@ -192,7 +192,7 @@ on_a_controller! {
         refuses!(grinder.status().await, DeviceError::ControlTaken { .. });
     }
 
-    a_stop_circuit_that_opens_by_itself_is_a_fault(controller) {
+    open_stop_circuit_faults(controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         controller.open_the_stop_circuit();
@@ -202,7 +202,7 @@ on_a_controller! {
         refuses!(grinder.hold().await, DeviceError::Refused { .. });
     }
 
-    who_is_another_client_is_noticed_and_an_abort_goes_past_him(controller) {
+    abort_passes_other_client(controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         let mut operator = controller.operator().await;
@@ -213,7 +213,7 @@ on_a_controller! {
         assert_eq!(until(&mut grinder, State::Aborted).await.outcome, Outcome::Aborted);
     }
 
-    a_program_that_begins_anew_finds_what_runs_and_goes_on_with_it(_controller) {
+    new_driver_adopts_active_program(_controller) {
         let bench = bench(&to_and_fro(120));
         let (grinder, armed) = bench.started().await;
         drop(grinder);
@@ -228,7 +228,7 @@ on_a_controller! {
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 1));
     }
 
-    what_ended_while_nobody_looked_is_known(_controller) {
+    reconcile_finished_while_offline(_controller) {
         let bench = bench(&to_and_fro(10));
         let (grinder, armed) = bench.started().await;
         drop(grinder);
@@ -241,7 +241,7 @@ on_a_controller! {
         assert_eq!((status.state, status.outcome, status.done), (State::Complete, Outcome::Complete, armed.start_sequence));
     }
 
-    what_was_not_started_is_known(_controller) {
+    reconcile_not_started(_controller) {
         let bench = bench(&to_and_fro(10));
         let (grinder, armed) = bench.prepared().await;
         drop(grinder);
@@ -253,7 +253,7 @@ on_a_controller! {
         assert_eq!(bench.wrote("begin"), 0);
     }
 
-    a_server_that_is_killed_is_met_again_in_the_middle_of_the_program(controller) {
+    killed_server_reconnects_mid_program(controller) {
         let mut server = controller.second_server(PORT + 1);
         drop(Operator::connect(PORT + 1).await);
         let mut bench = bench(&to_and_fro(300));
@@ -277,7 +277,7 @@ on_a_controller! {
         again.wait().unwrap();
     }
 
-    a_controller_that_is_killed_has_not_ended_the_pass(controller) {
+    killed_controller_aborts_pass(controller) {
         let mut controller = controller;
         let bench = bench(&to_and_fro(600));
         let (mut grinder, armed) = bench.started().await;
@@ -292,7 +292,7 @@ on_a_controller! {
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 0));
     }
 
-    a_task_that_has_died_answers_no_order(_controller) {
+    dead_task_times_out_abort(_controller) {
         let mut bench = bench(&to_and_fro(600));
         bench.settings.answer_timeout = Duration::from_secs(1);
         let (mut grinder, _) = bench.started().await;
@@ -304,7 +304,7 @@ on_a_controller! {
         assert!(matches!(error, DeviceError::TimedOut { .. }), "{error:?}");
     }
 
-    the_path_that_is_run_is_that_of_the_program(controller) {
+    executed_path_matches_program(controller) {
         let (text, ends) = raster(12, 24);
         let bench = bench(&text);
         let (mut grinder, armed) = bench.prepared().await;
@@ -335,7 +335,7 @@ on_a_controller! {
         assert!(largest < 0.5e-3 && rms < 0.1e-3, "{largest} mm, {rms} mm rms");
     }
 
-    who_is_not_ready_is_not_made_ready(controller) {
+    unready_controller_stays_unready(controller) {
         let bench = bench(&to_and_fro(10));
         let mut grinder = bench.loaded().await;
         let mut operator = controller.operator().await;

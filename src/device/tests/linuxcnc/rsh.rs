@@ -28,7 +28,7 @@ fn hasty(mut bench: Bench) -> Bench {
 }
 
 #[tokio::test]
-async fn a_pass_is_loaded_prepared_started_and_ended_by_these_lines_alone() {
+async fn whole_pass_protocol_transcript() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.started().await;
     assert_eq!(grinder.status().await.unwrap().state, State::Execute);
@@ -64,7 +64,7 @@ async fn a_pass_is_loaded_prepared_started_and_ended_by_these_lines_alone() {
 }
 
 #[tokio::test]
-async fn what_is_no_linuxcnc_hears_a_greeting_and_nothing_more() {
+async fn non_linuxcnc_gets_only_greeting() {
     let (fake, mut bench) = bench().await;
     bench.settings.answer_timeout = Duration::from_millis(100);
     fake.controller().faults.push(("hello", Fault::Instead("220 mail.example.com ESMTP\r\n")));
@@ -76,7 +76,7 @@ async fn what_is_no_linuxcnc_hears_a_greeting_and_nothing_more() {
 }
 
 #[tokio::test]
-async fn another_machine_and_a_wrong_password_are_told_apart() {
+async fn wrong_name_and_wrong_password_errors() {
     let (fake, mut bench) = bench().await;
     bench.settings.expected_name = Some("/etc/mill/mill.ini".into());
     refuses!(bench.grinder().connect().await, DeviceError::WrongName { found, .. } if found == "/etc/grinder/grinder.ini");
@@ -95,7 +95,7 @@ async fn another_machine_and_a_wrong_password_are_told_apart() {
 }
 
 #[tokio::test]
-async fn lines_that_answer_nothing_are_left_aside() {
+async fn unmatched_lines_ignored() {
     let (fake, bench) = bench().await;
     let garbage = "\u{1}\u{fffd}\r\nSET RUN ACK EXTRA\n\r\n\rPROGRAM_LINES 7\r\nERROR: what\r\n";
     let lines =
@@ -108,7 +108,7 @@ async fn lines_that_answer_nothing_are_left_aside() {
 }
 
 #[tokio::test]
-async fn an_open_that_is_acknowledged_and_not_done_is_no_load() {
+async fn ignored_open_fails_load() {
     let (fake, bench) = bench().await;
     let bench = hasty(bench);
     fake.controller().program = Some("/old.ngc".into());
@@ -122,7 +122,7 @@ async fn an_open_that_is_acknowledged_and_not_done_is_no_load() {
 }
 
 #[tokio::test]
-async fn a_program_that_is_changed_behind_our_back_is_not_started() {
+async fn start_refuses_replaced_program() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     fake.controller().program = Some("/old.ngc".into());
@@ -137,7 +137,7 @@ async fn a_program_that_is_changed_behind_our_back_is_not_started() {
 }
 
 #[tokio::test]
-async fn only_the_program_of_the_map_and_of_the_cycle_is_taken() {
+async fn load_refuses_other_map_or_cycle() {
     let (fake, bench) = bench().await;
     let mut grinder = bench.loaded().await;
     let later = regrind_device::Job { cycle: 3, ..job() };
@@ -155,7 +155,7 @@ async fn only_the_program_of_the_map_and_of_the_cycle_is_taken() {
 }
 
 #[tokio::test]
-async fn a_machine_that_is_not_ready_is_not_prepared() {
+async fn prepare_refuses_unready_machine() {
     let (fake, bench) = bench().await;
     let mut grinder = bench.loaded().await;
     fake.controller().not_homed = true;
@@ -171,7 +171,7 @@ async fn a_machine_that_is_not_ready_is_not_prepared() {
 }
 
 #[tokio::test]
-async fn a_start_that_is_refused_has_not_begun_unless_it_shows() {
+async fn start_nak_resolved_by_status() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     fake.controller().faults.push(("set run", Fault::Nak));
@@ -185,7 +185,7 @@ async fn a_start_that_is_refused_has_not_begun_unless_it_shows() {
 }
 
 #[tokio::test]
-async fn a_start_that_is_acknowledged_and_does_not_show_is_unknown_until_it_is_known() {
+async fn ignored_start_unknown_until_reconcile() {
     let (fake, bench) = bench().await;
     let bench = hasty(bench);
     let (mut grinder, armed) = bench.prepared().await;
@@ -203,7 +203,7 @@ async fn a_start_that_is_acknowledged_and_does_not_show_is_unknown_until_it_is_k
 }
 
 #[tokio::test]
-async fn a_program_that_has_begun_is_not_prepared_again() {
+async fn prepare_refuses_begun_program() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     fake.controller().end();
@@ -215,7 +215,7 @@ async fn a_program_that_has_begun_is_not_prepared_again() {
 }
 
 #[tokio::test]
-async fn an_abort_is_on_the_wire_while_an_answer_is_awaited() {
+async fn abort_sent_during_pending_reply() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     let late = Arc::new(Notify::new());
@@ -240,7 +240,7 @@ async fn an_abort_is_on_the_wire_while_an_answer_is_awaited() {
 }
 
 #[tokio::test]
-async fn an_abort_connects_by_itself() {
+async fn abort_reconnects() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     // Before anything was known of it, and after.
@@ -254,7 +254,7 @@ async fn an_abort_connects_by_itself() {
 }
 
 #[tokio::test]
-async fn a_pause_that_comes_when_the_program_has_ended_is_taken_back() {
+async fn pause_after_program_end_is_undone() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     grinder.status().await.unwrap();
@@ -267,7 +267,7 @@ async fn a_pause_that_comes_when_the_program_has_ended_is_taken_back() {
 }
 
 #[tokio::test]
-async fn errors_are_told_and_break_the_pass_off() {
+async fn controller_error_faults_pass() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     fake.controller().fail("joint 1 following error");
@@ -278,7 +278,7 @@ async fn errors_are_told_and_break_the_pass_off() {
 }
 
 #[tokio::test]
-async fn who_takes_control_is_noticed_and_not_outbid() {
+async fn stolen_control_is_not_reclaimed() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     fake.steal();
@@ -290,7 +290,7 @@ async fn who_takes_control_is_noticed_and_not_outbid() {
 }
 
 #[tokio::test]
-async fn control_that_is_taken_at_the_last_moment_leaves_the_start_unknown() {
+async fn stolen_control_makes_start_unknown() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     let late = Arc::new(Notify::new());
@@ -309,7 +309,7 @@ async fn control_that_is_taken_at_the_last_moment_leaves_the_start_unknown() {
 }
 
 #[tokio::test]
-async fn what_nobody_wrote_down_a_person_has_to_tell() {
+async fn missing_record_needs_confirmation() {
     for (word, outcome) in [
         (OperatorConfirmation::Done { map_identity: None, file: None }, Outcome::Complete),
         (OperatorConfirmation::Still, Outcome::Stopped),
@@ -334,7 +334,7 @@ async fn what_nobody_wrote_down_a_person_has_to_tell() {
 }
 
 #[tokio::test]
-async fn a_record_that_is_gone_leaves_the_start_unknown() {
+async fn deleted_record_makes_start_unknown() {
     let (fake, bench) = bench().await;
     let (grinder, armed) = bench.prepared().await;
     drop(grinder);
@@ -404,7 +404,7 @@ async fn run_pass(bench: &Bench, fake: &FakeServer) -> Outcome {
 }
 
 #[tokio::test]
-async fn a_wire_that_is_lost_at_any_line_begins_nothing_twice() {
+async fn disconnect_at_any_line_starts_once() {
     let (fake, bench) = bench().await;
     assert_eq!(run_pass(&bench, &fake).await, Outcome::Complete);
     let lines = fake.controller().heard.len();
@@ -432,7 +432,7 @@ async fn a_wire_that_is_lost_at_any_line_begins_nothing_twice() {
 }
 
 #[tokio::test]
-async fn a_driver_that_begins_anew_at_a_server_that_runs_goes_on() {
+async fn new_driver_continues_active_pass() {
     let (fake, bench) = bench().await;
     let (grinder, armed) = bench.started().await;
     drop(grinder);

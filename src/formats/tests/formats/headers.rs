@@ -193,7 +193,7 @@ fn drawn(seed: u64) -> GeneratedTable {
 }
 
 #[test]
-fn two_thousand_drawn_headers_are_read_rightly_or_refused() {
+fn random_headers_read_or_refused() {
     let (mut read, mut plain, mut plain_read) = (0, 0, 0);
     for seed in 0..2000 {
         let drawn = drawn(seed);

@@ -69,7 +69,7 @@ fn map(parsed: Result<X3pFile, FormatError>) -> HeightMap {
 }
 
 #[test]
-fn heights_of_every_type_are_read_and_what_is_no_number_was_not_measured() {
+fn x3p_data_types_and_nan() {
     let heights = [500.0, 501.0, 502.0, 503.0, 504.0, 505.0];
     let steps: [i16; 6] = [0, 1, 2, 3, 4, 5];
     let shorts: Vec<u8> = steps.iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -96,7 +96,7 @@ fn heights_of_every_type_are_read_and_what_is_no_number_was_not_measured() {
 }
 
 #[test]
-fn entries_may_stand_in_a_folder_and_sums_in_either_case() {
+fn x3p_subfolder_and_checksums() {
     let data = vec![0u8; 48];
     let sealed = format!("<MD5ChecksumPointData>{}</MD5ChecksumPointData>", sum(&data).to_uppercase());
     let xml = main_xml("D", 1.0, &sealed);
@@ -126,7 +126,7 @@ fn entries_may_stand_in_a_folder_and_sums_in_either_case() {
 }
 
 #[test]
-fn what_may_be_another_surface_than_it_seems_is_refused() {
+fn x3p_refuses_unsupported_content() {
     let xml = main_xml("D", 1.0, "");
     let turned = "<Rotation><r11>0</r11><r12>-1</r12></Rotation></Axes>";
     for (from, to, expected) in [
@@ -166,7 +166,7 @@ fn what_may_be_another_surface_than_it_seems_is_refused() {
 }
 
 #[test]
-fn a_container_that_swells_is_refused_before_it_does() {
+fn x3p_refuses_zip_bomb() {
     // 65 MiB of zeros in 66 kB.
     let zeros = vec![0u8; 65 << 20];
     let xml = main_xml("D", 1.0, "");
@@ -186,7 +186,7 @@ fn error_map() -> ErrorMap {
 }
 
 #[test]
-fn a_written_map_reads_back_and_is_the_same_each_time() {
+fn x3p_write_round_trip() {
     let home = tempfile::tempdir().unwrap();
     let (path, again) = (home.path().join("error_map.x3p"), home.path().join("again.x3p"));
     let written = error_map();
@@ -213,7 +213,7 @@ fn a_written_map_reads_back_and_is_the_same_each_time() {
 }
 
 #[test]
-fn whatever_the_words_the_document_is_well_formed() {
+fn x3p_write_escapes_text() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("m.x3p");
     let map = HeightMap::new(
@@ -235,7 +235,7 @@ const SDF: &str = "aISO-1.0\r\nManufacID = x\r\nCreateDate = 010120260000\r\nNum
                    1 2.5 BAD\r\n-4 5 6e1\r\n*\r\n<trailer>\r\n";
 
 #[test]
-fn sdf_text_is_read_and_its_faults_are_named() {
+fn sdf_text_read_and_errors() {
     let read = parse_sdf(Path::new("s"), SDF.as_bytes()).unwrap();
     assert_eq!((read.grid.columns, read.grid.rows, read.grid.spacing_mm), (3, 2, [1.0, 2.0]));
     assert_eq!((read.valid[2], read.measured_count()), (false, 5));
@@ -263,7 +263,7 @@ fn sdf_text_is_read_and_its_faults_are_named() {
 
 /// A binary SDF of 3 by 2 samples.
 #[test]
-fn sdf_of_other_versions_is_refused_by_name() {
+fn sdf_refuses_other_versions() {
     for version in ["aBCR-1.0", "bBCR-1.0", "ABCR-1.0", "BBCR-0.0", "aISO-2.0", "bISO-2.0"] {
         let refused = parse_sdf(Path::new("m.sdf"), format!("{version}\nNumPoints = 6\n").as_bytes());
         assert!(matches!(refused, Err(FormatError::WrongKind { .. })), "{version} {refused:?}");
@@ -280,7 +280,7 @@ fn binary_sdf(kind: u8, heights: &[u8], extra: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn sdf_binary_is_read_in_every_type() {
+fn sdf_binary_data_types() {
     fn bytes<T, const N: usize>(values: [T; 6], le: impl Fn(T) -> [u8; N]) -> Vec<u8> {
         values.into_iter().flat_map(le).collect()
     }
@@ -325,7 +325,7 @@ fn metropro() -> Vec<u8> {
 }
 
 #[test]
-fn metropro_is_read_from_the_top_and_its_faults_are_named() {
+fn metropro_read_and_errors() {
     let good = metropro();
     let read = parse_metropro(Path::new("z"), &good).unwrap();
     assert_eq!((read.valid.clone(), read.grid.first_mm), (vec![true, true, true, false], [0.0; 2]));
@@ -360,7 +360,7 @@ fn metropro_is_read_from_the_top_and_its_faults_are_named() {
 proptest! {
     /// Whatever a few bytes are changed to, the answer is a map or an error.
     #[test]
-    fn no_damage_makes_a_panic(changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6), cut in any::<prop::sample::Index>()) {
+    fn damaged_map_files_never_panic(changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6), cut in any::<prop::sample::Index>()) {
         let xml = main_xml("D", 1.0, "");
         let x3p = container(&[("main.xml", xml.as_bytes()), ("bindata/data.bin", &[0; 48])]);
         let sdf = binary_sdf(7, &[0; 48], &[]);

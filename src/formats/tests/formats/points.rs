@@ -38,7 +38,7 @@ fn two_points() -> Vec<Point> {
 }
 
 #[test]
-fn every_separator_and_header_is_understood() {
+fn separators_and_headers() {
     let forms: &[&str] = &[
         "1.5,-2.25,3\n4,5.5,-1200.125\n",
         "1.5;-2.25;3\n4;5.5;-1200.125\n",
@@ -69,7 +69,7 @@ fn every_separator_and_header_is_understood() {
 }
 
 #[test]
-fn what_a_spreadsheet_leaves_around_a_table_is_no_data() {
+fn spreadsheet_padding_is_ignored() {
     let forms: &[&str] = &[
         "sep=;\nX;Y;Z\n1,5;-2,25;3\n4;5,5;-1200,125\n",
         "x,y,z\r\n1.5,-2.25,3\r\n4,5.5,-1200.125\r\n,,\r\n,,\r\n",
@@ -91,7 +91,7 @@ fn what_a_spreadsheet_leaves_around_a_table_is_no_data() {
 }
 
 #[test]
-fn a_unit_in_any_words_is_not_read_over() {
+fn stated_unit_other_than_mm_refused() {
     let stated = [
         "# all dimensions in inches\nx,y,z\n1,2,3\n",
         "// UNITS/INCH\n1,2,3\n",
@@ -117,7 +117,7 @@ fn a_unit_in_any_words_is_not_read_over() {
 }
 
 #[test]
-fn a_file_of_another_program_is_called_by_its_name() {
+fn foreign_file_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let step = folder.path().join("surface.csv");
     fs::write(&step, "ISO-10303-21;\nHEADER;\n").unwrap();
@@ -127,7 +127,7 @@ fn a_file_of_another_program_is_called_by_its_name() {
 }
 
 #[test]
-fn a_fault_is_named_with_place_finding_and_remedy() {
+fn errors_name_place_and_remedy() {
     let cases: &[(&str, &str)] = &[
         ("", "measured.csv: the file is empty, expected points; export it again"),
         ("\n# nothing\n\n", "measured.csv: the file is empty"),
@@ -200,7 +200,7 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
 
 /// A line far down, past several batches and shares, is still named by its number.
 #[test]
-fn a_bad_line_far_down_has_its_number() {
+fn error_line_number_in_large_file() {
     let mut content = String::from("x,y,z\n");
     for line in 0..400_000 {
         content += if line % 7 == 0 { "1.5,2.5,3.5\n# note\n" } else { "1.23456789,2.3456789,3.456789\n" };
@@ -215,7 +215,7 @@ fn a_bad_line_far_down_has_its_number() {
 }
 
 #[test]
-fn order_is_kept_across_batches() {
+fn order_preserved_across_batches() {
     let content: String = (0..300_000).map(|i| format!("{i},{}.5,-0.000{i}\n", i / 3)).collect();
     let points = text(content).unwrap();
     assert_eq!(points.len(), 300_000);
@@ -241,7 +241,7 @@ impl Read for Endless<'_> {
 }
 
 #[test]
-fn endless_rubbish_is_given_up_early() {
+fn endless_garbage_fails_early() {
     let rubbish: [&[u8]; 6] = [b"\0", b"9", b" ", b"no end of words ", b"\x7f\xf0\xd3", b"1,2,3\nfoo\n"];
     for piece in rubbish {
         let taken = AtomicU64::new(0);
@@ -252,7 +252,7 @@ fn endless_rubbish_is_given_up_early() {
 }
 
 #[test]
-fn sparse_files_of_a_gigabyte_are_refused_at_once() {
+fn sparse_gigabyte_files_refused() {
     let folder = tempfile::tempdir().unwrap();
     let begin: [(&str, &[u8]); 4] = [
         ("zeros.csv", b""),
@@ -328,7 +328,7 @@ fn ply_is_read_in_all_encodings() {
 }
 
 #[test]
-fn faults_of_ply_are_named() {
+fn ply_errors_name_their_line() {
     let good = String::from_utf8(ply_ascii()).unwrap();
     let cases = [
         ("ply\n", "plywood\n", "line 1: expected `ply` in a line of its own, found `plywood`"),
@@ -402,7 +402,7 @@ const TWO_FACETS: [[f32; 3]; 6] =
     [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [1.0, -0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.5]];
 
 #[test]
-fn stl_is_welded_and_its_faults_are_named() {
+fn stl_welding_and_errors() {
     let path = Path::new("part.stl");
     for (bytes, degenerate) in [(stl_ascii(), 1), (stl_binary(&TWO_FACETS), 0)] {
         let mesh = parse_stl(path, &bytes).unwrap();
@@ -437,7 +437,7 @@ fn stl_is_welded_and_its_faults_are_named() {
 }
 
 #[test]
-fn a_cut_at_any_byte_is_an_error_or_a_whole_prefix() {
+fn cut_file_is_error_or_whole_prefix() {
     let cloud = b"x_mm,y_mm,z_mm\n1.5,-2.25,3.125\n4.5,5.5,-6.5\n7,8,9\n";
     for end in 0..cloud.len() {
         match text(&cloud[..end]) {
@@ -494,7 +494,7 @@ fn random_bytes_never_panic() {
 
 /// A generous list of the same lines in quick and careful form gives the same numbers.
 #[test]
-fn the_quick_way_and_the_careful_way_agree() {
+fn quick_and_careful_parsers_agree() {
     let mut random = Lcg(3);
     let value = |random: &mut Lcg| (random.next() as f64 - 1e9) / 10f64.powi((random.next() % 12) as i32);
     let rows: Vec<[f64; 3]> = (0..5000).map(|_| [(); 3].map(|()| value(&mut random) / 1e3)).collect();
@@ -508,7 +508,7 @@ fn the_quick_way_and_the_careful_way_agree() {
 }
 
 #[test]
-fn content_comes_before_the_extension() {
+fn content_overrides_extension() {
     let folder = tempfile::tempdir().unwrap();
     let put = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
@@ -537,7 +537,7 @@ fn content_comes_before_the_extension() {
 }
 
 #[test]
-fn results_are_written_whole_or_not_at_all() {
+fn results_written_atomically() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("deviations.csv");
     let row = |i: usize| DeviationRow {
@@ -580,7 +580,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn points_survive_text_and_ply(rows in coordinates(LIMIT_MM)) {
+    fn points_round_trip_text_and_ply(rows in coordinates(LIMIT_MM)) {
         let points: Vec<Point> = rows.iter().map(|&row| Point::from(row)).collect();
         let folder = tempfile::tempdir().unwrap();
         for header in ["", "x_mm,y_mm,z_mm"] {
@@ -608,7 +608,7 @@ proptest! {
     }
 
     #[test]
-    fn corners_survive_stl(rows in coordinates(1e3)) {
+    fn stl_corners_round_trip(rows in coordinates(1e3)) {
         let corners: Vec<[f32; 3]> = rows.iter().map(|row| row.map(|v| v as f32)).collect();
         let corners = &corners[..corners.len() / 3 * 3];
         prop_assume!(!corners.is_empty());
@@ -631,7 +631,7 @@ fn notes(content: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_last_line_without_an_end_is_noted_and_a_number_that_lacks_digits_more_so() {
+fn note_on_missing_line_end() {
     let lines = "1.125,2.250,3.375\n4.125,5.250,6.375\n-7.125,8.250,9.375\n";
     assert_eq!(notes(&format!("{lines}1.500,2.500,3.500\n")), [""; 0]);
     for whole in ["1.500,2.500,3.500 ", "# end", "   "] {
@@ -656,7 +656,7 @@ fn a_last_line_without_an_end_is_noted_and_a_number_that_lacks_digits_more_so() 
 }
 
 #[test]
-fn the_line_of_a_note_is_right_in_a_large_file() {
+fn note_line_number_in_large_file() {
     let mut content = "1.12345678;2.12345678;3.12345678\n".repeat(200_000);
     content += "1.12345678;2.12345678;3.1234";
     let told = notes(&content);
@@ -664,7 +664,7 @@ fn the_line_of_a_note_is_right_in_a_large_file() {
 }
 
 #[test]
-fn one_number_with_a_mark_between_its_thousands_is_noted() {
+fn note_on_lone_thousands_mark() {
     let rows = "1,5;2,5;3,5\n".repeat(40_000);
     assert_eq!(notes(&rows), [""; 0]);
     let told = notes(&format!("{rows}1,5;1.234,5;3,5\n{rows}"));
@@ -679,7 +679,7 @@ fn one_number_with_a_mark_between_its_thousands_is_noted() {
 }
 
 #[test]
-fn a_person_says_which_columns_are_read_and_in_which_unit() {
+fn stated_columns_and_unit_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("table.csv");
     let read = |content: &str, columns: Option<&str>, unit: Option<Unit>| {
@@ -725,7 +725,7 @@ fn a_person_says_which_columns_are_read_and_in_which_unit() {
 }
 
 #[test]
-fn heights_have_a_unit_of_their_own_where_a_person_says_so() {
+fn stated_height_unit_is_used() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("table.csv");
     let read = |content: &[u8], unit: Option<Unit>, height_unit: Option<Unit>| {

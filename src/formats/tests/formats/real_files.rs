@@ -29,7 +29,7 @@ const KNOWN: [Known; 8] = [
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn every_valid_x3p_map_is_read() {
+fn real_x3p_maps_are_read() {
     let folder = data("x3p-sdf-samples");
     for (file, size, spacing_mm, samples, (column, row, height), range_mm) in KNOWN {
         let X3pFile::Map(map) = read_x3p(folder.join(file)).unwrap() else { panic!("{file} is a map") };
@@ -47,7 +47,7 @@ fn every_valid_x3p_map_is_read() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn lists_and_irregular_grids_are_points() {
+fn real_x3p_lists_and_irregular_grids() {
     let folder = data("x3p-sdf-samples/openfmc");
     for (file, count, first, last) in [
         ("ISO5436-sample2.x3p", 16, [100.0, 2000.0, 2486.219120804151], [100.003, 2000.003, 1784.303361535097]),
@@ -64,7 +64,7 @@ fn lists_and_irregular_grids_are_points() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn a_defective_x3p_is_refused_with_its_reason() {
+fn real_x3p_with_bad_checksum() {
     let folder = data("x3p-sdf-samples/x3ptools");
     // Its main.xml was changed after it was sealed.
     let told = read_x3p(folder.join("csafe-logo.x3p")).unwrap_err();
@@ -74,7 +74,7 @@ fn a_defective_x3p_is_refused_with_its_reason() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn both_zygo_maps_have_the_figures_that_others_found() {
+fn real_zygo_maps_match_published() {
     let folder = data("zygo-metropro-dat");
     for (file, size, measured, pitch_mm, pv_nm, rms_nm) in [
         ("prysm_valid_zygo_dat_file.dat", [425, 432], 136_359, 0.11792420264100656, 330.700, 44.591),
@@ -96,7 +96,7 @@ fn both_zygo_maps_have_the_figures_that_others_found() {
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
-fn the_softgauge_is_read_from_text() {
+fn real_sdf_softgauge_is_read() {
     let folder = data("x3p-sdf-samples");
     for file in ["surfacetopography/sdf-1.sdf", "surfalize/test_ascii.sdf"] {
         let map = read_sdf(folder.join(file)).unwrap();

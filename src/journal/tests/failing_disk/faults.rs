@@ -44,7 +44,7 @@ fn places(key: &AuditKey, drawn: &mut SeededNumbers) -> Vec<Place> {
 }
 
 #[test]
-fn wherever_the_disk_fails_once_or_for_a_while_what_is_acknowledged_stands_once() {
+fn disk_faults_lose_no_record() {
     let (mut drawn, key) = (SeededNumbers::new(21), AuditKey::new());
     let places = places(&key, &mut drawn);
     let (mut struck, mut refused, mut unbegun) = (0, 0, 0);
@@ -73,7 +73,7 @@ fn wherever_the_disk_fails_once_or_for_a_while_what_is_acknowledged_stands_once(
 }
 
 #[test]
-fn a_run_that_is_begun_on_a_disk_that_fails_is_written_through_its_log() {
+fn create_on_failing_disk_uses_wal() {
     // Without one a commit would be taken back by a power cut, for the file that does so is only deleted then.
     let (home, mut drawn) = (Home::new(), SeededNumbers::new(22));
     for operation in Operation::ALL {

@@ -60,7 +60,7 @@ fn is_survived(
 }
 
 #[test]
-fn whenever_the_power_goes_what_was_acknowledged_is_there_and_the_run_is_gone_on_with() {
+fn power_cut_loses_no_record() {
     let mut drawn = SeededNumbers::new(11);
     // Of a long life, whose cuts are alike, the share that is tried is smaller.
     for (key, steps, share) in
@@ -88,7 +88,7 @@ fn whenever_the_power_goes_what_was_acknowledged_is_there_and_the_run_is_gone_on
 }
 
 #[test]
-fn the_power_may_go_again_while_a_run_is_taken_up() {
+fn power_cut_during_recovery() {
     let (mut drawn, key) = (SeededNumbers::new(12), AuditKey::new());
     let home = Home::new();
     let folder = home.folder("run");
@@ -128,7 +128,7 @@ fn the_power_may_go_again_while_a_run_is_taken_up() {
 }
 
 #[test]
-fn the_power_may_go_on_a_disk_that_has_failed_before() {
+fn power_cut_after_disk_fault() {
     let (mut drawn, key) = (SeededNumbers::new(13), AuditKey::new());
     let (mut cut, mut tried) = (0, 0);
     for number in 0..draws().map_or(8, |draws| 100 * draws) {
@@ -162,7 +162,7 @@ fn the_power_may_go_on_a_disk_that_has_failed_before() {
 }
 
 #[test]
-fn what_only_the_system_shows_after_a_sync_that_failed_is_written_anew_before_a_run_is_gone_on_with() {
+fn failed_sync_rewritten_before_resume() {
     let home = Home::new();
     let mut refused = 0;
     // What a program leaves that was killed: its records stand in the log only.
@@ -198,7 +198,7 @@ fn what_only_the_system_shows_after_a_sync_that_failed_is_written_anew_before_a_
 }
 
 #[test]
-fn a_record_that_was_never_committed_is_not_read_where_it_cannot_be_taken_back() {
+fn uncommitted_record_is_not_read() {
     // As a program would leave it that was stopped while it wrote to a database without a log: the journal beside it takes back
     // what stands in the file. A reader that may not write cannot do that.
     let home = Home::new();

@@ -69,7 +69,7 @@ fn is_all_or_an_error(folder: &Path, truth: &[Record], at: &str) {
 }
 
 #[test]
-fn a_disk_that_fails_under_a_reader_is_told_and_never_taken_for_a_sound_or_a_broken_record() {
+fn read_fault_is_reported_as_error() {
     let home = Home::new();
     for folder in folders(&home) {
         let (truth, all) = (verify(&folder).unwrap(), records(&folder));
@@ -80,7 +80,7 @@ fn a_disk_that_fails_under_a_reader_is_told_and_never_taken_for_a_sound_or_a_bro
 }
 
 #[test]
-fn what_a_disk_reads_wrong_and_calls_right_is_found_or_changes_nothing_that_is_read() {
+fn silent_read_corruption_is_found() {
     let home = Home::new();
     let folder = &folders(&home)[0];
     let (truth, mut drawn) = (verify(folder).unwrap(), SeededNumbers::new(31));

@@ -23,7 +23,7 @@ fn is_read(folder: &Path, records: RangeInclusive<usize>) {
 }
 
 #[test]
-fn while_a_sync_stands_still_the_writer_waits_and_readers_do_not() {
+fn stalled_sync_blocks_writer_only() {
     // The next sync is that of the record in the log. With a log of one page it is brought into the database by those that follow.
     for (pages, after) in [(1000, 0), (1, 0), (1, 1), (1, 2), (1, 3)] {
         let home = Home::new();
@@ -55,7 +55,7 @@ fn while_a_sync_stands_still_the_writer_waits_and_readers_do_not() {
 }
 
 #[test]
-fn a_reader_of_a_run_that_is_only_being_made_is_told_so() {
+fn verify_refuses_run_being_created() {
     let home = Home::new();
     for after in 0..3 {
         let folder = home.folder(&after.to_string());

@@ -62,7 +62,7 @@ fn assert_same(folder: &Path, told: &Value) {
 
 #[test]
 #[ignore = "needs Python with cryptography: see REGRIND_PYTHON"]
-fn both_verifiers_say_the_same_of_sound_journals_and_of_their_exports() {
+fn verifiers_agree_on_sound_journals() {
     let home = home();
     let (_closed, plain, _) = closed();
     let (_long, long) = long_and_whole(2_000);
@@ -106,7 +106,7 @@ fn both_verifiers_say_the_same_of_sound_journals_and_of_their_exports() {
 
 #[test]
 #[ignore = "needs Python with cryptography: see REGRIND_PYTHON"]
-fn both_verifiers_find_a_seeded_tampering_at_the_same_record() {
+fn verifiers_agree_on_seeded_tampering() {
     let records = if tries(0) > 0 { 10_000 } else { 1_000 };
     let (home, whole) = long_and_whole(records);
     let mut drawn = SeededNumbers::new(1);
@@ -133,7 +133,7 @@ fn both_verifiers_find_a_seeded_tampering_at_the_same_record() {
 
 #[test]
 #[ignore = "needs Python with cryptography: see REGRIND_PYTHON"]
-fn both_verifiers_find_files_anchors_and_forgeries() {
+fn verifiers_agree_on_files_and_forgeries() {
     let mut runs = Vec::new();
     let mut homes = Vec::new();
     let mut broken = |change: &dyn Fn(&Path)| {
@@ -182,7 +182,7 @@ fn both_verifiers_find_files_anchors_and_forgeries() {
 
 #[test]
 #[ignore = "needs Python with cryptography: see REGRIND_PYTHON"]
-fn the_other_verifier_finds_every_single_bit_of_a_hundred_records() {
+fn other_verifier_finds_every_bit_flip() {
     let (_home, folder) = long_and_whole(100);
     let script_of_bits = script("src/journal/tests/journal/every_bit.py");
     let done = Command::new(python()).arg(script_of_bits).arg(script("docs")).arg(&folder).output().unwrap();

@@ -67,7 +67,7 @@ fn signed() -> (Home, PathBuf, AuditKey) {
 }
 
 #[test]
-fn the_head_is_sealed_at_the_beginning_every_so_many_records_and_at_the_end_and_the_anchor_goes_along() {
+fn seal_and_anchor_schedule() {
     let (home, key) = (home(), AuditKey::new());
     let folder = home.path().join("run");
     let mut journal = Journal::create_with(&folder, header(), Some(key.clone())).unwrap();
@@ -87,7 +87,7 @@ fn the_head_is_sealed_at_the_beginning_every_so_many_records_and_at_the_end_and_
 }
 
 #[test]
-fn an_anchor_goes_along_where_nothing_is_signed() {
+fn anchor_without_signing_key() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
@@ -100,7 +100,7 @@ fn an_anchor_goes_along_where_nothing_is_signed() {
 }
 
 #[test]
-fn a_key_that_was_kept_elsewhere_tells_a_run_that_another_key_or_none_has_signed() {
+fn verify_refuses_other_or_no_key() {
     let (_home, folder, key) = signed();
     with_key(&folder, key.public()).unwrap();
     let other = AuditKey::new().public();
@@ -143,7 +143,7 @@ fn forged(folder: &Path, from: u64, change: impl Fn(&mut Value)) {
 }
 
 #[test]
-fn a_chain_that_somebody_without_the_key_has_computed_anew_is_found_at_the_next_seal() {
+fn forged_chain_found_at_next_seal() {
     let (home, folder, _) = signed();
     let marks = seals(&folder);
     assert_eq!(marks, [2, 259, 516, 606]);
@@ -160,7 +160,7 @@ fn a_chain_that_somebody_without_the_key_has_computed_anew_is_found_at_the_next_
 }
 
 #[test]
-fn an_end_whose_seal_was_taken_away_is_told_and_another_seal_behind_it_is_found() {
+fn last_seal_removed_or_added() {
     let (_home, folder, _) = signed();
     tamper(&folder, "DELETE FROM record WHERE seq = 606");
     let verified = verify(&folder).unwrap();
@@ -186,7 +186,7 @@ fn an_end_whose_seal_was_taken_away_is_told_and_another_seal_behind_it_is_found(
 }
 
 #[test]
-fn a_run_that_is_gone_on_with_is_sealed_with_the_key_that_it_names_then() {
+fn reopened_run_sealed_with_new_key() {
     let (home, first, second) = (home(), AuditKey::new(), AuditKey::new());
     let folder = home.path().join("run");
     drop(Journal::create_with(&folder, header(), Some(first.clone())).unwrap());
@@ -218,7 +218,7 @@ fn a_run_that_is_gone_on_with_is_sealed_with_the_key_that_it_names_then() {
 }
 
 #[test]
-fn what_was_changed_before_a_run_is_opened_again_is_not_sealed() {
+fn open_refuses_changed_records() {
     for sql in [
         "UPDATE record SET reason = 'x' WHERE seq = 4",
         "UPDATE record SET reason = 'x', hash = 'y' WHERE seq = 5",
@@ -248,7 +248,7 @@ fn refuse(folder: &Path, kind: &str, when: &str) -> Connection {
 }
 
 #[test]
-fn a_seal_that_cannot_be_written_follows_later_and_is_written_once() {
+fn failed_seal_written_once_later() {
     // One that was not written, and one that was although the answer says that it was not.
     for (when, due) in [("BEFORE", SEALED_EVERY + 6), ("AFTER", SEALED_EVERY + 3)] {
         let (home, key) = (home(), AuditKey::new());
@@ -280,7 +280,7 @@ fn a_seal_that_cannot_be_written_follows_later_and_is_written_once() {
 }
 
 #[test]
-fn a_record_whose_write_failed_is_written_once_beside_its_seal() {
+fn failed_record_written_once() {
     for when in ["BEFORE", "AFTER"] {
         let home = home();
         let folder = home.path().join("run");
@@ -300,7 +300,7 @@ fn a_record_whose_write_failed_is_written_once_beside_its_seal() {
 }
 
 #[test]
-fn an_anchor_that_cannot_be_written_keeps_no_record_and_follows_later() {
+fn failed_anchor_follows_later() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create_with(&folder, header(), Some(AuditKey::new())).unwrap();
@@ -316,7 +316,7 @@ fn an_anchor_that_cannot_be_written_keeps_no_record_and_follows_later() {
 }
 
 #[test]
-fn an_anchor_of_another_run_or_with_another_signature_is_refused() {
+fn foreign_anchor_is_refused() {
     let (_home, folder, _) = signed();
     let (_other_home, other, _) = signed();
     let against = |anchor| verify_against(&folder, &ExternalEvidence { anchor: Some(anchor), keys: Vec::new() });
@@ -331,7 +331,7 @@ fn an_anchor_of_another_run_or_with_another_signature_is_refused() {
 }
 
 #[test]
-fn journals_from_before_there_were_seals_are_read_proven_and_gone_on_with() {
+fn journal_without_seals_is_upgraded() {
     let (_home, folder, _) = closed();
     tamper(&folder, "PRAGMA user_version = 1; DELETE FROM record WHERE seq > 10");
     let first = &records(&folder)[0].hash;
@@ -348,7 +348,7 @@ fn journals_from_before_there_were_seals_are_read_proven_and_gone_on_with() {
 // ---- the file of a key ----------------------------------------------------------------------------------------------------------------
 
 #[test]
-fn a_key_is_made_once_for_its_owner_alone() {
+fn audit_key_is_created_once() {
     let home = home();
     let path = home.path().join("settings/regrind/audit.key");
     let key = AuditKey::make(&path).unwrap();
@@ -372,7 +372,7 @@ fn a_key_is_made_once_for_its_owner_alone() {
 }
 
 #[test]
-fn a_key_that_is_broken_or_open_to_others_is_refused_in_words() {
+fn audit_key_refuses_broken_or_open() {
     let home = home();
     let path = home.path().join("audit.key");
     AuditKey::make(&path).unwrap();
@@ -401,7 +401,7 @@ fn a_key_that_is_broken_or_open_to_others_is_refused_in_words() {
 }
 
 #[test]
-fn a_public_key_is_read_from_what_was_kept_of_it() {
+fn public_key_text_forms() {
     let key = AuditKey::new().public();
     for text in [
         format!("{key}"),

@@ -107,7 +107,7 @@ pub fn long_and_whole(records: u64) -> (Home, PathBuf) {
 }
 
 #[test]
-fn a_long_journal_by_the_documentation_is_sound() {
+fn journal_by_documentation_verifies() {
     let (_home, folder) = long(1_000);
     let verified = verify(&folder).unwrap();
     assert_eq!((verified.records, verified.signed, verified.anchored), (1_000, 999, 999));
@@ -121,7 +121,7 @@ pub fn tries(few: u64) -> u64 {
 }
 
 #[test]
-fn seeded_changes_deletions_insertions_reorderings_and_cuts_are_found_where_they_are() {
+fn random_tampering_is_located() {
     const RECORDS: u64 = 10_000;
     let (home, whole) = long_and_whole(RECORDS);
     let mut drawn = SeededNumbers::new(1);
@@ -138,7 +138,7 @@ fn seeded_changes_deletions_insertions_reorderings_and_cuts_are_found_where_they
 }
 
 #[test]
-fn single_bits_of_the_recorded_fields_are_found_where_they_are_in_the_file() {
+fn bit_flip_in_database_is_located() {
     let (home, whole) = long_and_whole(100);
     let columns = ["seq", "mono_ns", "cycle", "command_id"].into_iter().chain(TEXTS);
     let mut drawn = SeededNumbers::new(2);
@@ -172,7 +172,7 @@ fn single_bits_of_the_recorded_fields_are_found_where_they_are_in_the_file() {
 }
 
 #[test]
-fn a_row_in_front_of_the_first_record_is_found() {
+fn row_before_first_record_is_found() {
     for number in [0, -1, i64::MIN] {
         let (_home, folder, _) = closed();
         let others = "utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash";
@@ -183,7 +183,7 @@ fn a_row_in_front_of_the_first_record_is_found() {
 }
 
 #[test]
-fn a_database_with_anything_but_the_table_of_a_record_is_none() {
+fn foreign_schema_is_refused() {
     let view = "ALTER TABLE record RENAME TO kept; CREATE VIEW record AS SELECT * FROM kept";
     let endless = "ALTER TABLE record RENAME TO kept; CREATE VIEW record AS WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) \
                    SELECT k AS seq, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, hash FROM n, kept";
@@ -200,7 +200,7 @@ fn a_database_with_anything_but_the_table_of_a_record_is_none() {
 
 #[cfg(unix)]
 #[test]
-fn what_is_no_file_is_not_waited_for() {
+fn verify_never_blocks_on_pipes() {
     let pipe = |path: &Path| {
         let _ = fs::remove_file(path);
         assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
@@ -221,7 +221,7 @@ fn what_is_no_file_is_not_waited_for() {
 }
 
 #[test]
-fn a_flipped_byte_of_the_file_is_found_or_changes_nothing_that_is_read() {
+fn flipped_file_byte_is_found() {
     let (home, whole) = long_and_whole(60);
     let before = verify(&whole).unwrap();
     let bytes = fs::read(whole.join("journal.sqlite")).unwrap();
@@ -249,7 +249,7 @@ fn a_flipped_byte_of_the_file_is_found_or_changes_nothing_that_is_read() {
 }
 
 #[test]
-fn a_flipped_bit_of_the_anchor_is_found_or_changes_nothing_that_is_read() {
+fn flipped_anchor_bit_is_found() {
     let (_home, folder) = long_and_whole(60);
     let before = verify(&folder).unwrap();
     let bytes = fs::read(folder.join("journal.anchor")).unwrap();
@@ -271,7 +271,7 @@ fn a_flipped_bit_of_the_anchor_is_found_or_changes_nothing_that_is_read() {
 }
 
 #[test]
-fn every_change_of_a_short_journal_is_found() {
+fn changed_column_is_located() {
     let fields = [
         "utc = 'x'",
         "boot_id = 'x'",

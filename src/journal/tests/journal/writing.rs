@@ -11,7 +11,7 @@ use serde_json::json;
 use crate::written::{closed, header, home, long, tamper};
 
 #[test]
-fn what_was_written_is_read_and_verified() {
+fn journal_write_read_verify() {
     let (_home, folder, anchor) = closed();
     let verified = verify(&folder).unwrap();
     assert_eq!((verified.records, verified.artefacts, verified.closed, verified.anchored), (11, 3, true, 11));
@@ -23,7 +23,7 @@ fn what_was_written_is_read_and_verified() {
 }
 
 #[test]
-fn a_cut_tail_is_found_by_an_anchor_kept_elsewhere_and_a_changed_file_by_its_hash() {
+fn cut_tail_and_changed_file_found() {
     let (_home, folder, anchor) = closed();
     std::fs::remove_file(folder.join("journal.anchor")).unwrap();
     tamper(&folder, "DELETE FROM record WHERE seq > 8");
@@ -38,7 +38,7 @@ fn a_cut_tail_is_found_by_an_anchor_kept_elsewhere_and_a_changed_file_by_its_has
 }
 
 #[test]
-fn triggers_stand_in_the_way_of_changes() {
+fn triggers_refuse_changes() {
     let (_home, folder, _) = closed();
     let database = Connection::open(folder.join("journal.sqlite")).unwrap();
     for sql in ["UPDATE record SET cycle = 1", "DELETE FROM record"] {
@@ -47,7 +47,7 @@ fn triggers_stand_in_the_way_of_changes() {
 }
 
 #[test]
-fn a_writer_that_was_cut_off_keeps_every_acknowledged_record_and_reuses_no_number() {
+fn reopen_after_cut_reuses_no_number() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
@@ -66,7 +66,7 @@ fn a_writer_that_was_cut_off_keeps_every_acknowledged_record_and_reuses_no_numbe
 }
 
 #[test]
-fn what_is_not_answered_is_read_from_the_records_and_not_from_an_index() {
+fn open_intents_without_index() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
@@ -87,7 +87,7 @@ fn what_is_not_answered_is_read_from_the_records_and_not_from_an_index() {
 }
 
 #[test]
-fn folders_in_use_and_foreign_files_are_refused() {
+fn journal_refuses_foreign_folders() {
     let (home, folder, _) = closed();
     assert!(matches!(Journal::create(&folder, header()).map(|_| ()), Err(JournalError::Exists { .. })));
     assert!(matches!(verify(home.path()), Err(JournalError::Absent { .. })));
@@ -106,7 +106,7 @@ fn folders_in_use_and_foreign_files_are_refused() {
 }
 
 #[test]
-fn names_do_not_lead_out_of_the_folder_and_nothing_on_record_is_written_over() {
+fn store_refuses_escape_and_overwrite() {
     let home = home();
     let mut journal = Journal::create(home.path().join("run"), header()).unwrap();
     for name in ["", "../x", "/x", "a/../b", "a/", "journal.sqlite", "journal.sqlite-wal", ".lock"] {
@@ -122,7 +122,7 @@ const PLAY: &str = "REGRIND_JOURNAL_PLAY";
 
 /// This test program again, playing one of its parts in a folder.
 #[test]
-fn an_anchor_that_was_cut_off_as_it_was_written_is_no_file_of_the_run() {
+fn partial_anchor_is_ignored() {
     let (_home, folder, _) = closed();
     std::fs::write(folder.join(".journal.anchor.tmp"), b"{\"records\":").unwrap();
     std::fs::write(folder.join("notes.txt"), b"").unwrap();
@@ -153,7 +153,7 @@ fn part_of_a_writer() {
 }
 
 #[test]
-fn a_killed_writer_leaves_every_acknowledged_record_and_a_whole_chain() {
+fn killed_writer_loses_no_record() {
     for least in [1, 40, 300] {
         let home = home();
         let folder = home.path().join("run");
@@ -222,7 +222,7 @@ fn is_named(file: &std::io::Result<std::fs::DirEntry>, part: &str) -> bool {
 /// A disk of half a mebibyte, in a namespace of its own.
 #[test]
 #[ignore = "needs a system that gives users a mount namespace"]
-fn a_full_disk_stops_the_run_loses_nothing_and_is_recovered_from() {
+fn full_disk_stops_and_recovers() {
     let home = home();
     let mount = "mount -t tmpfs -o size=512k none \"$0\" || exit 77; exec \"$@\"";
     let player = child("part_of_a_writer_on_a_small_disk", home.path());
@@ -240,7 +240,7 @@ fn a_full_disk_stops_the_run_loses_nothing_and_is_recovered_from() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn a_full_disk_is_named_by_files_too() {
+fn full_disk_reported_by_store() {
     // A device on which every write fails for want of room, under the name that a file has before it is whole.
     let home = home();
     let folder = home.path().join("run");
@@ -271,7 +271,7 @@ fn make_read_only(folder: &Path, read_only: bool) {
 #[cfg(unix)]
 #[test]
 #[ignore = "needs a user who may not write everywhere: not root"]
-fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
+fn read_only_folder_refuses_writer() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
@@ -289,7 +289,7 @@ fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
 }
 
 #[test]
-fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() {
+fn multi_page_journal_verifies() {
     const RECORDS: u64 = 2_100;
     let (_home, folder) = long(RECORDS);
     assert_eq!(verify(&folder).unwrap().records, RECORDS);
@@ -314,7 +314,7 @@ fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() 
 }
 
 #[test]
-fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
+fn reader_finds_appended_records() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();

@@ -6,7 +6,7 @@ use regrind::formats::{CellRun, Learned};
 use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;
 
-use super::told_apart::normal;
+use super::identifiability::normal;
 use super::{After, Bench, Line, Way};
 
 /// How the second machine differs from the first.
