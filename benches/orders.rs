@@ -32,9 +32,9 @@ fn main() {
 }
 
 /// Plant processes that run in parallel with the runs below a folder. They end when this value is dropped.
-struct Beside(Vec<Child>);
+struct PlantProcesses(Vec<Child>);
 
-impl Beside {
+impl PlantProcesses {
     fn begin(plant: &str, runs: &Path) -> Self {
         let file = std::fs::read_to_string(plant).expect("a plant file");
         let tells = ["[sparkplug]", "[opcua]"].iter().any(|table| file.lines().any(|line| line == *table));
@@ -48,7 +48,7 @@ impl Beside {
     }
 }
 
-impl Drop for Beside {
+impl Drop for PlantProcesses {
     fn drop(&mut self) {
         for child in &mut self.0 {
             // The process has possibly ended already.
@@ -69,7 +69,7 @@ async fn measure(tries: usize, plant: Option<&str>) {
         let round = k / MOMENTS.len();
         let ships = plant.filter(|_| !round.is_multiple_of(2));
         if k % MOMENTS.len() == 0 {
-            beside = ships.map(|plant| Beside::begin(plant, rig.home.path()));
+            beside = ships.map(|plant| PlantProcesses::begin(plant, rig.home.path()));
         }
         // The same with and without a plant.
         let holds = if plant.is_some() { round / 2 } else { round }.is_multiple_of(2);

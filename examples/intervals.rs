@@ -115,7 +115,7 @@ fn main() {
     println!("{parts} parts a line, {points} points: held and below the truth of 100, median width over median truth");
     println!("{:18}{:>6}{:>27}{:>27}{:>27}{:>14}", "", "ratio", "RMS", "PV touched", "PV 99.8 % aperture", "accepted");
     for line in lines().into_iter().filter(|line| line.name.contains(&word)) {
-        let of = |seed: usize| told(&nominal, line, points, seed as u64);
+        let of = |seed: usize| figures_and_intervals(&nominal, line, points, seed as u64);
         let all: Vec<[(f64, Interval); 3]> = (0..parts).into_par_iter().filter_map(of).collect();
         print!("{:18}{:6}", line.name, line.ratio);
         for k in 0..3 {
@@ -149,7 +149,7 @@ fn nominal() -> Nominal {
 }
 
 /// Returns the true figures of a part and the intervals that were estimated for them.
-fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64, Interval); 3]> {
+fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64, Interval); 3]> {
     let mut rng = regrind_sim::rng(1_000_000 + seed);
     let shape = FreeForm::default();
     let places = places(line.pattern, points, &mut rng);

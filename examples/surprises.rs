@@ -75,7 +75,7 @@ const KINDS: [(&str, Planted); 4] = [
 ];
 
 /// Result of the measurement of one part.
-struct Seen {
+struct PartResult {
     touches: usize,
     /// Targets of the pattern that the defect covers, and touches of them.
     covered: usize,
@@ -100,10 +100,10 @@ fn main() {
     println!("|---|---|---|---|---|---|---|---|");
     for (name, planted) in KINDS {
         let of = |seed| measured(&shape, &nominal, planted, limits, seed);
-        let all: Vec<Seen> = (first..first + worlds).into_par_iter().map(of).collect();
+        let all: Vec<PartResult> = (first..first + worlds).into_par_iter().map(of).collect();
         let share =
-            |of: &dyn Fn(&Seen) -> bool| all.iter().filter(|seen| of(seen)).count() as f64 * 100.0 / worlds as f64;
-        let mean = |of: &dyn Fn(&Seen) -> usize| all.iter().map(|seen| of(seen) as f64).sum::<f64>() / worlds as f64;
+            |of: &dyn Fn(&PartResult) -> bool| all.iter().filter(|seen| of(seen)).count() as f64 * 100.0 / worlds as f64;
+        let mean = |of: &dyn Fn(&PartResult) -> usize| all.iter().map(|seen| of(seen) as f64).sum::<f64>() / worlds as f64;
         let (hit, found) = (share(&|seen| seen.hit > 0), share(&|seen| seen.found));
         let both = share(&|seen| seen.found && seen.hit > 0);
         println!(
@@ -129,7 +129,7 @@ fn targets(shape: &FreeForm) -> Vec<(Point, Vector)> {
 }
 
 /// Plants a defect, and measures batch by batch until the stopping rule ends the measurement.
-fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, seed: u64) -> Seen {
+fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, seed: u64) -> PartResult {
     let mut rng = regrind_sim::rng(seed);
     let form = FormError::with_rms(&mut rng, FORM_MM[1], FORM_MM[0]);
     let surprise = planted(std::array::from_fn(|_| uniform(&mut rng)));
@@ -184,7 +184,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
             let (rms_mm, pv_mm) = figures_mm(&whole);
             let conforms = rms_mm <= adaptive.tolerance.rms_mm && pv_mm <= adaptive.tolerance.pv_mm;
             let is_accepted = decision.reason == Reason::WithinLimits;
-            return Seen {
+            return PartResult {
                 touches: touched.len(),
                 covered: all.len(),
                 hit,

@@ -54,7 +54,7 @@ impl CellMonitor {
                 }
                 Err(_) => self.does_not_answer(run),
             },
-            None => self.by_the_records(),
+            None => self.update_from_records(),
         }
         &self.status
     }
@@ -92,7 +92,7 @@ impl CellMonitor {
 
     /// Determines the status from the records. No run listens: a run is starting or ending, was interrupted, or is
     /// over.
-    fn by_the_records(&mut self) {
+    fn update_from_records(&mut self) {
         let folders: Vec<PathBuf> = control::folders(&self.runs).collect();
         self.known.retain(|run, _| folders.contains(run));
         if folders.is_empty() {

@@ -152,7 +152,7 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
 fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     match send_request(folder, request) {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
-            door_beside_lock(folder).map_or(Err(error), |door| send_request_at(&door, request))
+            socket_beside_lock(folder).map_or(Err(error), |door| send_request_at(&door, request))
         }
         asked => asked,
     }
@@ -160,16 +160,16 @@ fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
 
 /// Returns true if a program drives the run of a folder: it listens in the folder or next to the lock of its machines.
 pub(super) fn is_driven(folder: &Path) -> bool {
-    is_live(folder) || door_beside_lock(folder).is_some()
+    is_live(folder) || socket_beside_lock(folder).is_some()
 }
 
-fn door_beside_lock(folder: &Path) -> Option<PathBuf> {
+fn socket_beside_lock(folder: &Path) -> Option<PathBuf> {
     let run = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    beside_locks().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
+    runs_holding_machines().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
 }
 
 /// Returns the runs that hold machines on this computer and whose cells listen next to the machine locks.
-fn beside_locks() -> impl Iterator<Item = (PathBuf, PathBuf)> {
+fn runs_holding_machines() -> impl Iterator<Item = (PathBuf, PathBuf)> {
     MachineLock::control_sockets().into_iter().filter(|(_, door)| is_live_at(door))
 }
 
@@ -243,7 +243,7 @@ pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> R
         // The cell can still run after its folder was removed.
         let absolute = std::path::absolute(runs).unwrap_or_else(|_| runs.to_owned());
         let of_these = |run: &PathBuf| run.parent().is_some_and(|above| is_same(above, &absolute));
-        live = beside_locks().map(|(run, _)| run).filter(of_these).collect();
+        live = runs_holding_machines().map(|(run, _)| run).filter(of_these).collect();
         live.dedup();
     }
     match live.len() {

@@ -120,7 +120,7 @@ async fn publish(
     let mut telling = begin(config, cell, turn, &told, &notes)?;
     // Only the publishers keep the senders and receivers of events.
     drop((told, notes));
-    let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
+    let mut hearing = tokio::spawn(print_events(news, arguments.runs.clone(), arguments.json));
     let over = tokio::select! {
         Some(over) = telling.join_next() => Some(over),
         never = follow(look, &arguments.runs, &to) => match never {},
@@ -200,7 +200,7 @@ fn publish_status(now: &CellStatus, to: &watch::Sender<CellStatus>) {
 // ---- returned events ----------------------------------------------------------------------------------------------
 
 /// Prints the events of the publishers, and records refused requests while a run is active.
-async fn hear(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: bool) {
+async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: bool) {
     let mut some = Vec::new();
     let mut quota = Quota::new(Instant::now());
     loop {
@@ -222,7 +222,7 @@ async fn hear(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: boo
                     refuse(&runs, json, &by, &what).await
                 }
                 PublisherEvent::Refused { .. } => quota.unreported += 1,
-                PublisherEvent::RefusedMore { times } => quota.unreported += u64::from(times),
+                PublisherEvent::MoreRefused { times } => quota.unreported += u64::from(times),
             }
         }
         let over = matches!(heard, Ok(0));

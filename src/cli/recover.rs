@@ -16,7 +16,7 @@ use serde_json::json;
 use super::failure::Failure;
 use super::live::{lock_machine, owner};
 use super::run::{epoch, free_folder, operator};
-use super::succession::Place;
+use super::succession::RunPlace;
 use super::{Outcome, check, control, key};
 
 /// Bring machines of a cell to idle that hold a job which no run knows
@@ -55,7 +55,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let settings = |link| setup::modbus_settings(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
     let mut content = json!({ "recover": true, "cell": cell.path() });
-    let (place, turn) = Place::next(&arguments.runs)?;
+    let (place, turn) = RunPlace::next(&arguments.runs)?;
     place.in_record(&mut content);
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),

@@ -55,7 +55,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = plant::read(&arguments.plant)?;
     // Other programs of this computer have priority.
     outside::give_way();
-    let mut shipping = Shipping {
+    let mut shipping = Replication {
         shipper: Replicator::new(arguments.runs.clone(), config.artefacts.clone()),
         config,
         link: None,
@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-struct Shipping<'a> {
+struct Replication<'a> {
     config: PlantConfig,
     shipper: Replicator,
     link: Option<Link>,
@@ -88,7 +88,7 @@ struct Shipping<'a> {
     waits: bool,
 }
 
-impl Shipping<'_> {
+impl Replication<'_> {
     async fn once(&mut self) -> Result<Outcome, Failure> {
         self.round().await?;
         self.ended()
@@ -96,7 +96,7 @@ impl Shipping<'_> {
 
     /// Returns the outcome of the command: whether any copy differs.
     fn ended(&self) -> Result<Outcome, Failure> {
-        Ok(if self.shipper.left_alone().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
+        Ok(if self.shipper.skipped().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
     }
 
     /// Runs rounds. If requested, ends shortly after standard input is closed.

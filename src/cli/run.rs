@@ -18,7 +18,7 @@ use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
-use super::succession::Place;
+use super::succession::RunPlace;
 use super::{Outcome, check, key, outside, plan, serve, simulated};
 
 /// Name of the file in the run folder with the knowledge of an earlier run from which the run began.
@@ -99,7 +99,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         task.setting.push_str(&format!(", seed {seed}"));
     }
     let earlier = match recipe.compensation.learn {
-        true => Some(Earlier::begun_with(&mut task, arguments)?),
+        true => Some(EarlierKnowledge::apply_newest(&mut task, arguments)?),
         false => None,
     };
     // An unusable key is an error and does not lead to an unsigned record.
@@ -139,7 +139,7 @@ async fn carry_out(
     cell: &CellConfig,
     task: Task,
     plan: CellPlan,
-    earlier: Option<Earlier>,
+    earlier: Option<EarlierKnowledge>,
     key: Option<AuditKey>,
 ) -> Result<Ending, Failure> {
     let actor = operator(arguments.operator.as_deref());
@@ -152,13 +152,13 @@ async fn carry_out(
     if free < needed {
         return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
     }
-    let page = arguments.serve.map(|at| serve::PageProcess::begin(&arguments.runs, at, arguments.json));
+    let page = arguments.serve.map(|at| serve::PageProcess::start(&arguments.runs, at, arguments.json));
     let _page = page.transpose()?;
     #[cfg(feature = "plant")]
     let _plant = arguments
         .plant
         .as_ref()
-        .map(|plant| super::plant::PlantProcesses::begin(&arguments.runs, plant))
+        .map(|plant| super::plant::PlantProcesses::start(&arguments.runs, plant))
         .transpose()?;
     let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
@@ -176,7 +176,7 @@ async fn carry_out(
         )?;
     }
     let mut header = header(arguments, &live, (&task, &plan), earlier.as_ref());
-    let (place, turn) = Place::next(&arguments.runs)?;
+    let (place, turn) = RunPlace::next(&arguments.runs)?;
     place.in_record(&mut header.content);
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
     drop(turn);
@@ -196,7 +196,7 @@ pub(super) fn epoch(now: SystemTime) -> u32 {
 
 /// Knowledge that earlier runs have left.
 #[derive(Default)]
-struct Earlier {
+struct EarlierKnowledge {
     /// Knowledge of the newest finished run with the same setting, and the content of its file.
     learned: Option<(Learned, Vec<u8>)>,
     /// Errors of runs that could not be read during the search.
@@ -205,9 +205,9 @@ struct Earlier {
     messages: Vec<String>,
 }
 
-impl Earlier {
+impl EarlierKnowledge {
     /// Initialises a task with the knowledge of the newest similar run, or else with that of other cells.
-    fn begun_with(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
+    fn apply_newest(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
         let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
             let run = learned.run.clone();
@@ -215,15 +215,15 @@ impl Earlier {
         }
         #[cfg(feature = "plant")]
         if let (None, Some(plant)) = (&earlier.learned, &arguments.plant) {
-            return earlier.or_with_others(task, plant);
+            return earlier.or_apply_plant(task, plant);
         }
         Ok(earlier)
     }
 
     /// Initialises a task with the usable knowledge of other cells of the plant.
     #[cfg(feature = "plant")]
-    fn or_with_others(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
-        let told = super::plant::knowledge::ask(plant, task)?;
+    fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
+        let told = super::plant::knowledge::query_knowledge(plant, task)?;
         self.messages = told.words;
         if let Some(learned) = told.learned {
             // Read back in the same way as by a program that resumes the run.
@@ -308,7 +308,7 @@ fn header(
     arguments: &Arguments,
     live: &RunContext,
     (task, plan): (&Task, &CellPlan),
-    earlier: Option<&Earlier>,
+    earlier: Option<&EarlierKnowledge>,
 ) -> Header {
     let RunContext { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();

@@ -124,7 +124,7 @@ pub(super) struct PageProcess {
 
 impl PageProcess {
     /// Starts the page for the runs in a folder as a separate process, so it can neither slow the run down nor stop it.
-    pub(super) fn begin(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
+    pub(super) fn start(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };
         let program = std::env::current_exe().map_err(failed)?;

@@ -26,7 +26,7 @@ const ASKED_EVERY: Duration = Duration::from_millis(20);
 
 /// The place of a run among those of its folder.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Place {
+pub(super) struct RunPlace {
     /// Its number, from 1 on.
     number: u64,
     /// The run before it, as it was then; none where there was none, or it was not there any more.
@@ -53,7 +53,7 @@ impl Drop for SuccessionLock {
     }
 }
 
-impl Place {
+impl RunPlace {
     /// Returns the next place in a folder of runs, and its lock. Keep the lock until the run has its first record.
     pub(super) fn next(runs: &Path) -> Result<(Self, SuccessionLock), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
@@ -113,7 +113,7 @@ fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let mut newest: BTreeSet<PathBuf> = all.iter().take(NEWEST).cloned().collect();
     all.sort_by_cached_key(|folder| Reverse(time_in(&name_of(folder)).map(str::to_owned)));
     newest.extend(all.into_iter().take(NEWEST));
-    newest.into_iter().filter_map(|folder| Some((Place::read(&folder)?.number, folder))).collect()
+    newest.into_iter().filter_map(|folder| Some((RunPlace::read(&folder)?.number, folder))).collect()
 }
 
 /// Returns the time in the name of a run, as 20260704T120000Z, or `None` if there is none.
@@ -145,12 +145,12 @@ struct Proof {
 /// successor names.
 pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
     let mut proof = Proof::default();
-    let mut all: Vec<(Option<Place>, PathBuf)> = folders(runs).map(|folder| (Place::read(&folder), folder)).collect();
+    let mut all: Vec<(Option<RunPlace>, PathBuf)> = folders(runs).map(|folder| (RunPlace::read(&folder), folder)).collect();
     all.sort_by_key(|(place, folder)| (place.as_ref().map_or(0, |place| place.number), folder.clone()));
     let mut last: Option<(u64, &Path)> = None;
     for (place, folder) in &all {
         proof.verify_run(place.as_ref(), folder, keys);
-        let Some(Place { number, before }) = place else { continue };
+        let Some(RunPlace { number, before }) = place else { continue };
         proof.follows((*number, folder), before.as_ref(), last);
         last = Some((*number, folder));
     }
@@ -171,7 +171,7 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
 
 impl Proof {
     /// Verifies a single run.
-    fn verify_run(&mut self, place: Option<&Place>, folder: &Path, keys: &[PublicKey]) {
+    fn verify_run(&mut self, place: Option<&RunPlace>, folder: &Path, keys: &[PublicKey]) {
         let name = name_of(folder);
         let number = place.map_or("-".to_owned(), |place| place.number.to_string());
         let stands = match verify_against(folder, &ExternalEvidence { anchor: None, keys: keys.to_vec() }) {

@@ -59,7 +59,7 @@ pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
 pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
     let mut document = Document::parse(path, text)?;
     document.check_schema(&SCHEMA);
-    let written: Option<Dialect> = document.as_written();
+    let written: Option<Dialect> = document.deserialize();
     for fault in written.iter().flat_map(Dialect::faults) {
         // A missing key is already reported.
         if !document.has_problem(&fault.key) {

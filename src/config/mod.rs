@@ -225,7 +225,7 @@ impl CellConfig {
         let mut document = Document::parse(path, text)?;
         let renamed = document.rename_keys(RENAMED);
         document.check_schema(&SCHEMA);
-        let checked = document.as_written().map(|written| check::check(&written, path, &mut document));
+        let checked = document.deserialize().map(|written| check::check(&written, path, &mut document));
         document.finish()?;
         let cell = checked.and_then(|checked| checked.into_cell(path, text, renamed));
         cell.ok_or_else(|| {

@@ -90,7 +90,7 @@ impl PlantConfig {
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.check_schema(&SCHEMA);
-        let written: Option<PlantFile> = document.as_written();
+        let written: Option<PlantFile> = document.deserialize();
         let at = path.parent().unwrap_or(Path::new(""));
         let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
             cell: plant.cell,

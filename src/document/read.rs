@@ -118,12 +118,12 @@ impl<'t> Document<'t> {
     pub fn rename_keys(&mut self, renamed: &[RenamedKey]) -> Vec<String> {
         let mut notes = Vec::new();
         for RenamedKey { old, new } in renamed {
-            if !self.is_there(old) {
+            if !self.contains_key(old) {
                 continue;
             }
             let (old_steps, new_steps) = (steps(old), steps(new));
             let span = span_of_name(&self.places, &old_steps);
-            if self.is_there(new) {
+            if self.contains_key(new) {
                 let found = format!("is the old name of `{new}`, and the file has both");
                 self.push(span, (*old).to_owned(), found, "", "delete the old one");
                 take_value(&mut self.values, &names(&old_steps).collect::<Vec<_>>());
@@ -150,7 +150,7 @@ impl<'t> Document<'t> {
     ///
     /// # Errors
     /// Reports, with the other problems, values that fit the schema but cannot be deserialized. Then returns `None`.
-    pub fn as_written<File: DeserializeOwned>(&mut self) -> Option<File> {
+    pub fn deserialize<File: DeserializeOwned>(&mut self) -> Option<File> {
         match self.values.clone().try_into() {
             Ok(written) => Some(written),
             Err(error) => {
@@ -169,7 +169,7 @@ impl<'t> Document<'t> {
     }
 
     /// Returns true if the text contains a key.
-    pub fn is_there(&self, key: &str) -> bool {
+    pub fn contains_key(&self, key: &str) -> bool {
         let steps = steps(key);
         let Some((Step::Key(last), before)) = steps.split_last() else { return false };
         let mut table = Some(&self.places);

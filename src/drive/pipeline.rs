@@ -828,7 +828,7 @@ pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleSt
     Some(
         Learned::new(simulation, setting, run, correction, known.clone())
             .with_fields(fields)
-            .of_kind(task.kind.clone()),
+            .with_kind(task.kind.clone()),
     )
 }
 

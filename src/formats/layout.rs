@@ -195,7 +195,7 @@ impl<'p> Preamble<'p> {
             return Ok(None);
         }
         let Some(separator) = data_separator(line) else {
-            return self.take_words(line, number).map(|()| None);
+            return self.read_words(line, number).map(|()| None);
         };
         if let Some(title) = self.title.take() {
             return Err(title);
@@ -207,7 +207,7 @@ impl<'p> Preamble<'p> {
     }
 
     /// Reads a line without a point: the header, a title, a line of units, or an error.
-    fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
+    fn read_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::new(line, likely).collect();
         let has_header = self.header.as_ref().is_some_and(|(_, header)| self.is_understood(header));

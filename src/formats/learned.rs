@@ -118,7 +118,7 @@ impl Learned {
 
     /// Returns the same knowledge with the kind that other cells must share.
     #[must_use]
-    pub fn of_kind(self, kind: String) -> Self {
+    pub fn with_kind(self, kind: String) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
@@ -158,7 +158,7 @@ impl Learned {
     ///
     /// # Errors
     /// A text that is not one of Regrind's, that is of another kind, or that has impossible numbers.
-    pub fn of_another(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
+    pub fn read_other(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
         let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
             && learned.kind.as_deref() == Some(kind)
@@ -275,8 +275,8 @@ mod tests {
         alike.add_statement(0.1);
         let of = |cell: &str| {
             let from = CellRun { cell: cell.into(), run: format!("run-{cell}") };
-            let text = serde_json::to_vec(&learned().of_kind("such parts".into())).unwrap();
-            let read = |kind: &str, simulation| Learned::of_another(Path::new("there"), &text, kind, simulation);
+            let text = serde_json::to_vec(&learned().with_kind("such parts".into())).unwrap();
+            let read = |kind: &str, simulation| Learned::read_other(Path::new("there"), &text, kind, simulation);
             assert!(read("other parts", true).is_err() && read("such parts", false).is_err());
             (from, read("such parts", true).unwrap())
         };
@@ -291,8 +291,8 @@ mod tests {
         let text = serde_json::to_vec(&begun).unwrap();
         let back = Learned::from_saved(Path::new("kept"), &text).unwrap();
         assert_eq!((&back.correction, &back.taught_by), (&begun.correction, &begun.taught_by));
-        let kind = serde_json::to_vec(&begun.of_kind("such parts".into())).unwrap();
-        assert!(Learned::of_another(Path::new("there"), &kind, "such parts", true).is_err());
+        let kind = serde_json::to_vec(&begun.with_kind("such parts".into())).unwrap();
+        assert!(Learned::read_other(Path::new("there"), &kind, "such parts", true).is_err());
         assert!(Learned::from_others(&[], &alike, (true, "mine".into()), (&fresh, none)).is_none());
     }
 

@@ -19,10 +19,10 @@ impl LockedFile {
     /// # Errors
     /// Another process holds the lock, or the file cannot be locked.
     pub fn lock(file: File) -> Result<Self, TryLockError> {
-        Self::take_waiting(file, || thread::sleep(BETWEEN_TRIES))
+        Self::lock_with_wait(file, || thread::sleep(BETWEEN_TRIES))
     }
 
-    fn take_waiting(file: File, mut wait: impl FnMut()) -> Result<Self, TryLockError> {
+    fn lock_with_wait(file: File, mut wait: impl FnMut()) -> Result<Self, TryLockError> {
         for _ in 1..TRIES {
             match file.try_lock() {
                 Ok(()) => return Ok(Self(file)),
@@ -66,9 +66,9 @@ mod tests {
         let open = || File::create(folder.path().join("lock")).unwrap();
         let looking = open();
         looking.try_lock_shared().unwrap();
-        let held = LockedFile::take_waiting(open(), || looking.unlock().unwrap()).unwrap();
+        let held = LockedFile::lock_with_wait(open(), || looking.unlock().unwrap()).unwrap();
         let mut waited = 0;
-        assert!(matches!(LockedFile::take_waiting(open(), || waited += 1), Err(TryLockError::WouldBlock)));
+        assert!(matches!(LockedFile::lock_with_wait(open(), || waited += 1), Err(TryLockError::WouldBlock)));
         assert_eq!(waited, TRIES - 1);
         drop(held);
     }

@@ -173,7 +173,7 @@ impl MachineLock {
             if file.is_spoiled {
                 self.note(&path, "it has more names or bytes than a lock can have");
             } else {
-                self.believe(&text_of(told), &path);
+                self.read_epoch(&text_of(told), &path);
             }
             self.held.push(held);
             self.holder_files.extend(file.holder_file);
@@ -183,7 +183,7 @@ impl MachineLock {
     }
 
     /// Reads the stored epoch. Rejects a value that no client of this computer can have used.
-    fn believe(&mut self, kept: &str, path: &Path) {
+    fn read_epoch(&mut self, kept: &str, path: &Path) {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
                 Ok(epoch) if epoch < (1 << EPOCH_BITS) - 1 => self.last_epoch = self.last_epoch.max(epoch),

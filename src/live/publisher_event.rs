@@ -22,7 +22,7 @@ pub enum PublisherEvent {
     /// A client requested something that it may not do here.
     Refused { by: String, what: String },
     /// This many more refusals did not fit in the queue.
-    RefusedMore { times: u32 },
+    MoreRefused { times: u32 },
 }
 
 /// Sender of events. It never blocks: events that do not fit in the queue are counted.
@@ -50,7 +50,7 @@ impl EventSender {
 
     pub(crate) fn refused(&self, by: String, what: &str) {
         let times = self.missed.swap(0, Ordering::Relaxed);
-        if times > 0 && self.to.try_send(PublisherEvent::RefusedMore { times }).is_err() {
+        if times > 0 && self.to.try_send(PublisherEvent::MoreRefused { times }).is_err() {
             self.missed.fetch_add(times, Ordering::Relaxed);
         }
         if self.to.try_send(PublisherEvent::Refused { by: in_a_line(&by), what: in_a_line(what) }).is_err() {
@@ -87,7 +87,7 @@ mod tests {
             last.push(news);
         }
         let the_last = PublisherEvent::Refused { by: "somebody".into(), what: "the last".into() };
-        assert_eq!(last.split_off(last.len() - 2), [PublisherEvent::RefusedMore { times: 3 }, the_last]);
+        assert_eq!(last.split_off(last.len() - 2), [PublisherEvent::MoreRefused { times: 3 }, the_last]);
     }
 
     #[test]

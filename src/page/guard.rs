@@ -229,7 +229,7 @@ impl Guard {
     }
 
     /// Returns true if the person at a browser still has access.
-    pub(crate) fn lets(&self, session: &Session) -> bool {
+    pub(crate) fn has_access(&self, session: &Session) -> bool {
         let person = |users| self.signed_in.person(&session.id, users);
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }

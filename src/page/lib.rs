@@ -13,7 +13,7 @@
 mod alarms;
 mod assets;
 mod chart;
-mod door;
+mod guarded_server;
 mod guard;
 mod history;
 mod live;
@@ -34,7 +34,7 @@ use axum::Router;
 use axum::routing::{get, post};
 use tokio::net::TcpListener;
 
-pub use door::Door;
+pub use guarded_server::GuardedServer;
 pub use guard::{Entrance, Session};
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
@@ -50,7 +50,7 @@ pub type PlannedPoints = dyn Fn(&Path) -> Option<Vec<[f64; 2]>> + Send + Sync;
 /// Page of a cell with its state.
 pub struct Page {
     guard: Arc<Guard>,
-    live: RunWatcher,
+    run_watcher: RunWatcher,
     history: Arc<History>,
     planned: Box<PlannedPoints>,
 }
@@ -75,7 +75,7 @@ impl Page {
         let runs = Arc::clone(&history);
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
         let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
-        Ok(Self { guard, live, history, planned })
+        Ok(Self { guard, run_watcher: live, history, planned })
     }
 
     /// Returns the address that opens the page. It contains the key if there are no users.
@@ -86,7 +86,7 @@ impl Page {
     /// Serves the page as long as the future is polled.
     pub async fn serve(self, listener: TcpListener) {
         let guard = Arc::clone(&self.guard);
-        door::serve(listener, guard, routes(Arc::new(self))).await;
+        guarded_server::serve(listener, guard, routes(Arc::new(self))).await;
     }
 }
 

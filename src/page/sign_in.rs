@@ -18,11 +18,11 @@ use tokio::task::spawn_blocking;
 
 use super::guard::{Guard, Peer, Rate, Session, foreign, foreign_origin, printable, random_word};
 use super::texts::Text;
-use super::users::{Person, Proven, UsersFile};
+use super::users::{Person, AuthenticatedUser, UsersFile};
 use super::view;
 
 /// Duration of a session: a shift and its handover.
-const LASTS: Duration = Duration::from_secs(12 * 3600);
+const SESSION_LIFETIME: Duration = Duration::from_secs(12 * 3600);
 /// Maximum number of browsers that are signed in at a time. Beyond it, the oldest session ends.
 const MAX_SESSIONS: usize = 256;
 /// Maximum number of attempts within a minute under one name from one place. Further attempts are not checked. Other
@@ -42,7 +42,7 @@ const ASKED_EVERY: Duration = Duration::from_millis(20);
 /// Sessions of signed-in users, and attempts to sign in.
 pub(crate) struct SignedIn {
     /// Sessions of the browsers, in the order in which they began.
-    sessions: Mutex<Vec<(String, Proven, Instant)>>,
+    sessions: Mutex<Vec<(String, AuthenticatedUser, Instant)>>,
     tries: Mutex<HashMap<(IpAddr, String), Rate>>,
     /// Number of waiting password checks for each place.
     waiting: Mutex<HashMap<IpAddr, usize>>,
@@ -66,12 +66,12 @@ impl SignedIn {
     /// then.
     pub(crate) fn person(&self, session: &str, users: &UsersFile) -> Option<Person> {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
-        sessions.retain(|(.., since)| since.elapsed() < LASTS);
+        sessions.retain(|(.., since)| since.elapsed() < SESSION_LIFETIME);
         let (_, proven, _) = sessions.iter().find(|(id, ..)| id == session)?;
         users.has(proven).then(|| proven.person())
     }
 
-    fn add(&self, session: &str, proven: Proven) {
+    fn add(&self, session: &str, proven: AuthenticatedUser) {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
         if sessions.len() >= MAX_SESSIONS {
             sessions.remove(0);
@@ -224,7 +224,7 @@ async fn turn(guard: &Arc<Guard>) -> Option<OwnedSemaphorePermit> {
 }
 
 /// Checks a name and a password, while holding the permit `turn`.
-async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<Proven> {
+async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<AuthenticatedUser> {
     let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {
         let _turn = turn;

@@ -26,7 +26,7 @@ struct RunEventStream {
     page: Shared,
     session: Session,
     language: Language,
-    seen: Receiver<ObservedRun>,
+    run: Receiver<ObservedRun>,
     /// Last version of each piece that was sent.
     sent: Vec<(Piece, String)>,
     is_first: bool,
@@ -39,9 +39,9 @@ pub(crate) async fn events(
     headers: HeaderMap,
 ) -> Response {
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
-    let seen = page.live.subscribe(&folder);
+    let seen = page.run_watcher.subscribe(&folder);
     let language = view::language(&headers);
-    let looking = RunEventStream { page, session, language, seen, sent: Vec::new(), is_first: true };
+    let looking = RunEventStream { page, session, language, run: seen, sent: Vec::new(), is_first: true };
     let stream = unfold(looking, |mut looking| async {
         let event = looking.next().await?;
         Some((Ok::<_, Infallible>(event), looking))
@@ -53,18 +53,18 @@ impl RunEventStream {
     /// Waits for the next update for the browser; `None` if there will be no more.
     async fn next(&mut self) -> Option<Event> {
         if !self.is_first {
-            if let Ok(Err(_)) = tokio::time::timeout(MAX_SILENCE, self.seen.changed()).await {
+            if let Ok(Err(_)) = tokio::time::timeout(MAX_SILENCE, self.run.changed()).await {
                 return None;
             }
-        } else if self.seen.borrow().summary.run.is_empty() {
+        } else if self.run.borrow().summary.run.is_empty() {
             // Nothing is known yet, because the watcher has just started.
-            let _ = tokio::time::timeout(MAX_SILENCE, self.seen.changed()).await;
+            let _ = tokio::time::timeout(MAX_SILENCE, self.run.changed()).await;
         }
         self.is_first = false;
-        if !self.page.guard.lets(&self.session) {
+        if !self.page.guard.has_access(&self.session) {
             return None;
         }
-        let seen = self.seen.borrow_and_update().clone();
+        let seen = self.run.borrow_and_update().clone();
         let has_control = self.page.guard.has_control(&self.session, false);
         let mut pieces = Map::new();
         for (piece, html) in view::pieces(&seen, has_control || !self.session.may("control"), self.language) {

@@ -208,19 +208,19 @@ impl Users {
 
     /// Returns the user with this name and password; `None` if they do not match. Takes some hundredths of a second,
     /// also for an unknown name, so that the time reveals nothing about either to an attacker.
-    fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
+    fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         let user = self.users.iter().find(|user| user.name == name);
         let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;
         let is_proven = Argon2::default().verify_password(password.as_bytes(), &proof).is_ok();
-        user.filter(|_| is_proven).map(|user| Proven(user.clone()))
+        user.filter(|_| is_proven).map(|user| AuthenticatedUser(user.clone()))
     }
 }
 
 /// Entry of the list whose person gave the correct password.
 #[derive(Clone, Debug)]
-pub(crate) struct Proven(User);
+pub(crate) struct AuthenticatedUser(User);
 
-impl Proven {
+impl AuthenticatedUser {
     pub(crate) fn person(&self) -> Person {
         Person { name: self.0.name.clone(), role: self.0.role }
     }
@@ -263,12 +263,12 @@ impl UsersFile {
     }
 
     /// Returns the user with this name and password. Blocks for some hundredths of a second.
-    pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
+    pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         self.now().signs_in(name, password)
     }
 
     /// Returns true if an entry is still on the list without changes.
-    pub(crate) fn has(&self, Proven(was): &Proven) -> bool {
+    pub(crate) fn has(&self, AuthenticatedUser(was): &AuthenticatedUser) -> bool {
         self.now().users.contains(was)
     }
 }

@@ -395,7 +395,7 @@ pub(crate) async fn run(
 ) -> Response {
     let language = language(&headers);
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
-    let mut looked = page.live.subscribe(&folder);
+    let mut looked = page.run_watcher.subscribe(&folder);
     let known = looked.borrow().summary.run.is_empty();
     if known {
         // An active run reports its status at once. For a run that has ended, the record contains it.

@@ -60,7 +60,7 @@ impl PlantRun {
     ///
     /// # Errors
     /// The journal was cut or rewritten after it was replicated, or cannot be read.
-    pub fn stands_in(&self, folder: &Path) -> Result<(), PlantError> {
+    pub fn check_local_journal(&self, folder: &Path) -> Result<(), PlantError> {
         if self.records == 0 {
             return Ok(());
         }

@@ -23,7 +23,7 @@ const MAX_BYTES: u64 = 4 << 20;
 #[derive(Default)]
 pub struct Knowledge {
     /// Results of other cells for parts of this kind.
-    pub lessons: Vec<(CellRun, Learned)>,
+    pub results: Vec<(CellRun, Learned)>,
     /// Results of pairs of cells for the same kind, whichever kind it is; true if this cell is one of the pair.
     pub pairs: Vec<([Learned; 2], bool)>,
     /// Reasons for each result that was rejected.
@@ -60,14 +60,14 @@ impl Knowledge {
         let mut knowledge = Self::default();
         let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
         let rows = link.client().query(text, &[&kind, &simulation]).await.map_err(&failed)?;
-        let of_kind = knowledge.believed(link, artefacts, (rows, simulation)).await?;
-        knowledge.lessons = of_kind.into_iter().map(|given| (given.from, given.learned)).collect();
-        if knowledge.lessons.is_empty() {
+        let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
+        knowledge.results = of_kind.into_iter().map(|given| (given.from, given.learned)).collect();
+        if knowledge.results.is_empty() {
             return Ok(knowledge);
         }
         let text = "SELECT kind, is_own, cell, run, sha256, content, place FROM lessons_in_common($1)";
         let rows = link.client().query(text, &[&simulation]).await.map_err(&failed)?;
-        let in_common = knowledge.believed(link, artefacts, (rows, simulation)).await?;
+        let in_common = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
         for (k, one) in in_common.iter().enumerate() {
             let others = in_common[k + 1..].iter().filter(|other| other.kind == one.kind);
             knowledge
@@ -78,7 +78,7 @@ impl Knowledge {
     }
 
     /// Verifies the delivered results, and reports to the plant those that cannot be believed.
-    async fn believed(
+    async fn verify_results(
         &mut self,
         link: &Link,
         artefacts: Option<&ArtefactSettings>,
@@ -119,7 +119,7 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
         return Err("it differs from the record".into());
     }
     let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
-    let learned = Learned::of_another(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
+    let learned = Learned::read_other(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
     Ok(DeliveredResult { kind, is_own, from, learned })
 }
 

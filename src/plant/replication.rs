@@ -60,7 +60,7 @@ pub struct ReplicationResult {
 }
 
 /// State of a run in the plant.
-struct There {
+struct PlantRunState {
     id: i32,
     records: i32,
     head: Vec<u8>,
@@ -73,7 +73,7 @@ impl Replicator {
     }
 
     /// Returns the runs that differ from the plant's copy, with the reason.
-    pub fn left_alone(&self) -> impl Iterator<Item = (&str, &str)> {
+    pub fn skipped(&self) -> impl Iterator<Item = (&str, &str)> {
         self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
     }
 
@@ -131,12 +131,12 @@ impl Replicator {
             if batch.is_empty() {
                 break;
             }
-            there = give(link, name, there, &batch).await?;
+            there = send_records(link, name, there, &batch).await?;
         }
         let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
         let is_over = || Ok::<_, PlantError>(matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?);
         if there.records > began_with || is_over()? {
-            report_run(link, there.id, &glance(&folder)?).await?;
+            report_run(link, there.id, &run_overview(&folder)?).await?;
         }
         if missing == 0 && is_over()? {
             self.teach(link, &folder, name, there.id, shipped).await?;
@@ -247,14 +247,14 @@ fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantEr
     Ok(write_atomic(&path, content)?)
 }
 
-async fn open_run(link: &Link, name: &str) -> Result<There, PlantError> {
+async fn open_run(link: &Link, name: &str) -> Result<PlantRunState, PlantError> {
     let row = link.client().query_one("SELECT id, records, head FROM open_run($1)", &[&name]).await;
     let row = row.map_err(refused("to open a run"))?;
-    Ok(There { id: row.get(0), records: row.get(1), head: row.get(2) })
+    Ok(PlantRunState { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
 /// Compares a journal with the plant's copy, and reports a difference to the plant.
-async fn compare_with_plant(link: &Link, folder: &Path, run: &str, there: &There) -> Result<(), PlantError> {
+async fn compare_with_plant(link: &Link, folder: &Path, run: &str, there: &PlantRunState) -> Result<(), PlantError> {
     let copy = PlantRun {
         id: there.id,
         cell: String::new(),
@@ -263,7 +263,7 @@ async fn compare_with_plant(link: &Link, folder: &Path, run: &str, there: &There
         head: digits(&there.head),
         keys: Vec::new(),
     };
-    match copy.stands_in(folder) {
+    match copy.check_local_journal(folder) {
         Err(PlantError::Differs { run, what }) => {
             complain(link, &run, "a journal that differs", &what).await?;
             Err(PlantError::Differs { run, what })
@@ -290,7 +290,7 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
 
 /// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
 /// the state.
-async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<There, PlantError> {
+async fn send_records(link: &Link, run: &str, there: PlantRunState, batch: &[Record]) -> Result<PlantRunState, PlantError> {
     let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
     let texts: Vec<String> = batch.iter().map(Record::text).collect();
     let from = there.records + 1;
@@ -299,7 +299,7 @@ async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<
     let row = row.map_err(refused("records"))?;
     match row.get::<_, Option<String>>(2) {
         Some(what) => Err(PlantError::Differs { run: run.to_owned(), what: format!("the plant refuses it: {what}") }),
-        None => Ok(There { records: row.get(0), head: row.get(1), ..there }),
+        None => Ok(PlantRunState { records: row.get(0), head: row.get(1), ..there }),
     }
 }
 
@@ -327,7 +327,7 @@ async fn report_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError
 ///
 /// # Errors
 /// The record cannot be read.
-pub fn glance(folder: &Path) -> Result<Value, PlantError> {
+pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
     let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
     // A missing limit is infinite, which JSON cannot represent.
     let limit = |mm: f64| mm.is_finite().then_some(1e3 * mm);

@@ -65,7 +65,7 @@ pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
 ///
 /// # Errors
 /// The layout is older, later or different.
-pub async fn is_known(client: &Client) -> Result<(), PlantError> {
+pub async fn check_layout(client: &Client) -> Result<(), PlantError> {
     let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
     let older = "update it as its owner: regrind plant init";
     let rows = match client.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await {

@@ -49,7 +49,7 @@ fn resolve_path(folder: &Path, path: &str) -> PathBuf {
 
 fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Option<NominalSource> {
     let from_formula = "keep `file`, or the tables [nominal.surface] and [nominal.aperture]";
-    if !document.is_there("nominal") {
+    if !document.contains_key("nominal") {
         return None;
     }
     let Some(file) = &written.file else {
@@ -277,7 +277,7 @@ fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document
     };
     // An invalid key is already reported.
     if found.is_none()
-        && document.is_there("measure")
+        && document.contains_key("measure")
         && !takes.iter().any(|key| document.has_problem(&format!("measure.{key}")))
     {
         let given: Vec<&str> =
@@ -309,7 +309,7 @@ fn registration(written: &RegistrationSettings, document: &mut Document) {
 fn acceptance(written: &Acceptance, document: &mut Document) {
     let broken = ["acceptance.pv_um", "acceptance.rms_um", "acceptance"].iter().any(|key| document.has_problem(key));
     match (written.pv_um, written.rms_um) {
-        (None, None) if !broken && document.is_there("acceptance") => {
+        (None, None) if !broken && document.contains_key("acceptance") => {
             let remedy = "add `rms_um = 1.0`, or `pv_um = 7.0`, or both";
             document.report("acceptance", "has no limit", "at least one of `pv_um` and `rms_um` is required", remedy);
         }

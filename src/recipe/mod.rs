@@ -161,7 +161,7 @@ impl Recipe {
         let mut document = Document::parse(path, text)?;
         let notes = document.rename_keys(RENAMED);
         document.check_schema(&SCHEMA);
-        let written: Option<RecipeFile> = document.as_written();
+        let written: Option<RecipeFile> = document.deserialize();
         let made = written.as_ref().map(|written| check::check(written, path, &mut document));
         document.finish()?;
         let (Some(written), Some((Some(nominal), Some(pattern)))) = (written, made) else {

@@ -11,7 +11,7 @@ use regrind_formats::write_atomic;
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};
-use super::marked::marked;
+use super::simulation_mark::mark_simulation;
 use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
@@ -338,7 +338,7 @@ impl HeatMap {
             if value.is_nan() { [0; 4] } else { [red, green, blue, 255] }
         };
         let pixels: Vec<[u8; 4]> = self.raster.values.chunks(columns).rev().flatten().map(tone).collect();
-        let picture = marked(&pixels, columns);
+        let picture = mark_simulation(&pixels, columns);
         let encoded = || {
             let mut bytes = Vec::new();
             let mut encoder = png::Encoder::new(&mut bytes, picture.width as u32, picture.height as u32);

@@ -22,7 +22,7 @@ mod equipment;
 mod form;
 mod heat_map;
 mod maps;
-mod marked;
+mod simulation_mark;
 mod plot;
 mod ply;
 mod qif;

@@ -5,7 +5,7 @@
 //! root mean square along the normal. Its surface profile is a different figure (twice the largest deviation). Units:
 //! millimetres. `combinedUncertainty` is the standard uncertainty, half of the expanded uncertainty that reports show.
 
-use super::results::{Figure, Measured, Results, Standing};
+use super::results::{Figure, Measured, Results, LimitStatus};
 use super::xml::Xml;
 
 /// Identifiers within the document. Those of figures and measurements continue from the last one.
@@ -234,10 +234,10 @@ fn figure_of(xml: &mut Xml, of: &Measured, figure: &Figure, id: u32, item: u32) 
     xml.within("UserDefinedLinearCharacteristicMeasurement", &[("id", &id.to_string())], |xml| {
         xml.within("Status", &[], |xml| {
             let status = match figure.standing {
-                Standing::Within => "PASS",
-                Standing::Beyond => "FAIL",
-                Standing::Undecided => "INDETERMINATE",
-                Standing::NotJudged => "NOT_ANALYZED",
+                LimitStatus::Within => "PASS",
+                LimitStatus::Beyond => "FAIL",
+                LimitStatus::Undecided => "INDETERMINATE",
+                LimitStatus::NotJudged => "NOT_ANALYZED",
             };
             xml.text("CharacteristicStatusEnum", status);
         });
@@ -252,9 +252,9 @@ fn figure_of(xml: &mut Xml, of: &Measured, figure: &Figure, id: u32, item: u32) 
 fn inspection_status(of: &Measured) -> &'static str {
     match of.standing {
         _ if of.figures.is_empty() => "NOT_CALCULATED",
-        Standing::Within => "PASS",
-        Standing::Beyond => "FAIL",
-        Standing::Undecided | Standing::NotJudged => "UNKNOWN",
+        LimitStatus::Within => "PASS",
+        LimitStatus::Beyond => "FAIL",
+        LimitStatus::Undecided | LimitStatus::NotJudged => "UNKNOWN",
     }
 }
 

@@ -59,13 +59,13 @@ impl RecordContent {
                 let event = value["event"].as_str().map(|event| event.replace('_', " "));
                 event.or_else(|| value["found"].as_str().map(str::to_owned)).map(Self::Answer)
             }
-            Kind::Intent | Kind::Note => Self::of_command_or_note(&value),
-            Kind::End => Self::of_end(&value["ending"]),
+            Kind::Intent | Kind::Note => Self::from_command_or_note(&value),
+            Kind::End => Self::from_end(&value["ending"]),
         };
         told.unwrap_or(Self::Unknown)
     }
 
-    fn of_command_or_note(value: &Value) -> Option<Self> {
+    fn from_command_or_note(value: &Value) -> Option<Self> {
         let device = || serde_json::from_value::<Device>(value["device"].clone()).ok();
         if value["command"].is_string() {
             let command = serde_json::from_value(value.clone()).ok()?;
@@ -88,7 +88,7 @@ impl RecordContent {
         inner("pass_record").map(Self::Pass).or_else(|| inner("transfer").map(Self::Transfer))
     }
 
-    fn of_end(value: &Value) -> Option<Self> {
+    fn from_end(value: &Value) -> Option<Self> {
         if let (Some(cmm), Some(grinder)) = (value["cmm_home"].as_bool(), value["grinder_home"].as_bool()) {
             return Some(Self::Home([cmm, grinder]));
         }

@@ -90,7 +90,7 @@ pub(super) struct Measured {
     pub(super) utc: String,
     /// Figures; empty if the measurement is not usable.
     pub(super) figures: Vec<Figure>,
-    pub(super) standing: Standing,
+    pub(super) standing: LimitStatus,
     pub(super) verdict: String,
     pub(super) reason: String,
     /// Number of points used, and number of outliers.
@@ -104,7 +104,7 @@ pub(super) struct Figure {
     pub(super) found_mm: f64,
     /// Expanded uncertainty, k = 2.
     pub(super) expanded_mm: f64,
-    pub(super) standing: Standing,
+    pub(super) standing: LimitStatus,
 }
 
 /// Kind of a figure: its name, its meaning and its limit.
@@ -117,7 +117,7 @@ pub(super) struct Kind {
 
 /// Position of a figure, or of a measurement, relative to its limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Standing {
+pub(super) enum LimitStatus {
     Within,
     Undecided,
     Beyond,
@@ -185,8 +185,8 @@ impl Measured {
         let mut figures = figures.unwrap_or_default();
         if judgement.is_some_and(|last| last.verdict == Verdict::LeftOut) {
             // The result is undecided until those places are measured again.
-            let within = figures.iter_mut().filter(|figure| figure.standing == Standing::Within);
-            within.for_each(|figure| figure.standing = Standing::Undecided);
+            let within = figures.iter_mut().filter(|figure| figure.standing == LimitStatus::Within);
+            within.for_each(|figure| figure.standing = LimitStatus::Undecided);
         }
         Self {
             cycle,
@@ -221,12 +221,12 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
         kind: Kind { name: if of_form { "PV as measured" } else { "PV" }, what: PV, limit_mm: None },
         found_mm: figures.pv_mm,
         expanded_mm: figures.pv_expanded_mm,
-        standing: Standing::NotJudged,
+        standing: LimitStatus::NotJudged,
     };
     let Some(compared) = compared else {
         let kind = Kind { name: "RMS", what: RMS, limit_mm: None };
         let (found_mm, expanded_mm) = (figures.rms_mm, figures.rms_expanded_mm);
-        return vec![all_points, Figure { kind, found_mm, expanded_mm, standing: Standing::NotJudged }];
+        return vec![all_points, Figure { kind, found_mm, expanded_mm, standing: LimitStatus::NotJudged }];
     };
     let of_all = !of_form && compared[0].name == "PV";
     let mut list: Vec<Figure> = compared
@@ -234,10 +234,10 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
         .map(|compared| {
             let limit_mm = Some(compared.limit_mm).filter(|limit| limit.is_finite());
             let standing = match compared.conformity {
-                _ if !judged || limit_mm.is_none() => Standing::NotJudged,
-                Conformity::Within => Standing::Within,
-                Conformity::Undecided => Standing::Undecided,
-                Conformity::Beyond => Standing::Beyond,
+                _ if !judged || limit_mm.is_none() => LimitStatus::NotJudged,
+                Conformity::Within => LimitStatus::Within,
+                Conformity::Undecided => LimitStatus::Undecided,
+                Conformity::Beyond => LimitStatus::Beyond,
             };
             Figure {
                 kind: Kind { name: compared.name, what: what_of(compared.name, of_form), limit_mm },
@@ -306,17 +306,17 @@ fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
             kind: Kind { name, what, limit_mm: None },
             found_mm: MM_OF_NM * median?,
             expanded_mm: MM_OF_NM * 0.5 * (high? - low?),
-            standing: Standing::NotJudged,
+            standing: LimitStatus::NotJudged,
         })
     };
     AREAS.into_iter().map(figure).collect()
 }
 
 /// Returns `Beyond` if any figure is beyond its limit, and `Within` only if each figure with a limit is within it.
-fn standing_of_all(figures: &[Figure]) -> Standing {
+fn standing_of_all(figures: &[Figure]) -> LimitStatus {
     let any = |standing| figures.iter().any(|figure| figure.standing == standing);
-    [Standing::Beyond, Standing::Undecided, Standing::Within]
+    [LimitStatus::Beyond, LimitStatus::Undecided, LimitStatus::Within]
         .into_iter()
         .find(|one| any(*one))
-        .unwrap_or(Standing::NotJudged)
+        .unwrap_or(LimitStatus::NotJudged)
 }

@@ -92,7 +92,7 @@ pub(super) struct Measurement {
 
 impl Measurement {
     /// Returns true if further touches belong to this measurement.
-    fn goes_on(&self) -> bool {
+    fn expects_more_touches(&self) -> bool {
         self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
     }
 }
@@ -190,7 +190,7 @@ impl RunHistory {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != GateResult::Passed).map(gate_words);
                 let measurements = &mut self.cycle(cycle).measurements;
-                match measurements.last_mut().filter(|last| last.goes_on()) {
+                match measurements.last_mut().filter(|last| last.expects_more_touches()) {
                     // Further touches belong to the same measurement. Its earlier result stays valid until more is
                     // known.
                     Some(last) if unusable.is_none() => last.utc = record.utc,
@@ -200,7 +200,7 @@ impl RunHistory {
             }
             Event::Registered { cycle, figures } => {
                 // A judged measurement keeps its figures.
-                if self.measurement(cycle).figures.is_some() && !self.measurement(cycle).goes_on() {
+                if self.measurement(cycle).figures.is_some() && !self.measurement(cycle).expects_more_touches() {
                     self.cycle(cycle).measurements.push(Measurement::default());
                 }
                 let measurement = self.measurement(cycle);

@@ -134,7 +134,7 @@ struct Edge {
 }
 
 /// Occupied rectangle: centre, and half of width and height.
-type Taken = ([f64; 2], [f64; 2]);
+type OccupiedRectangle = ([f64; 2], [f64; 2]);
 
 /// Draws the state machine as SVG from its table.
 pub fn state_picture(rows: &[Row]) -> String {
@@ -157,10 +157,10 @@ pub fn state_picture(rows: &[Row]) -> String {
 }
 
 /// Events that lead from one place to another, without refused events.
-type Ways = BTreeMap<(String, String), BTreeSet<String>>;
+type TransitionEvents = BTreeMap<(String, String), BTreeSet<String>>;
 
-fn ways(rows: &[Row], name: impl Fn(State) -> Option<String>) -> Ways {
-    let mut ways = Ways::new();
+fn ways(rows: &[Row], name: impl Fn(State) -> Option<String>) -> TransitionEvents {
+    let mut ways = TransitionEvents::new();
     for row in rows {
         for answer in row.answers.iter().filter(|answer| !answer.is_refusal()) {
             let (Some(from), Some(to)) = (name(row.state), name(answer.next)) else { continue };
@@ -182,7 +182,7 @@ fn legend(svg: &mut Svg) {
     }
 }
 
-fn draw_states(svg: &mut Svg, ways: &Ways) {
+fn draw_states(svg: &mut Svg, ways: &TransitionEvents) {
     let nodes = STATES.map(|(name, middle)| Node { name, middle, half: HALF_STATE });
     let mut ways = ways.clone();
     let mut taken = boxes(&nodes);
@@ -206,7 +206,7 @@ fn draw_states(svg: &mut Svg, ways: &Ways) {
     }
 }
 
-fn draw_frame(svg: &mut Svg, frame: &Frame, taken: &mut Vec<Taken>) {
+fn draw_frame(svg: &mut Svg, frame: &Frame, taken: &mut Vec<OccupiedRectangle>) {
     let Frame { corner: [left, top], size: [width, height], .. } = *frame;
     let (right, bottom) = (left + width, top + height);
     svg.polyline(&[[left, top], [right, top], [right, bottom], [left, bottom], [left, top]], "#888888", "5 4");
@@ -221,7 +221,7 @@ fn draw_frame(svg: &mut Svg, frame: &Frame, taken: &mut Vec<Taken>) {
     taken.push(([end[0] - 80.0, end[1] - 8.0], [80.0, 8.0]));
 }
 
-fn draw_phases(svg: &mut Svg, ways: &Ways) {
+fn draw_phases(svg: &mut Svg, ways: &TransitionEvents) {
     let at = |[column, row]: [f64; 2]| [70.0 + 128.0 * column, CYCLE_TOP_PX + 80.0 + 100.0 * row];
     let nodes = PHASES.map(|(name, place)| Node { name, middle: at(place), half: HALF_PHASE });
     let mut taken = boxes(&nodes);
@@ -246,12 +246,12 @@ fn draw_box(svg: &mut Svg, node: &Node, fill: &str, lines: &[&str]) {
     }
 }
 
-fn boxes(nodes: &[Node]) -> Vec<Taken> {
+fn boxes(nodes: &[Node]) -> Vec<OccupiedRectangle> {
     nodes.iter().map(|node| (node.middle, node.half)).collect()
 }
 
 /// Converts ways to arrows between the boxes that exist.
-fn edges(nodes: &[Node], ways: &Ways) -> Vec<Edge> {
+fn edges(nodes: &[Node], ways: &TransitionEvents) -> Vec<Edge> {
     let index = |name: &str| nodes.iter().position(|node| node.name == name);
     let known = ways
         .iter()
@@ -259,7 +259,7 @@ fn edges(nodes: &[Node], ways: &Ways) -> Vec<Edge> {
     known.collect()
 }
 
-fn draw(svg: &mut Svg, nodes: &[Node], edges: &[Edge], taken: &mut Vec<Taken>) {
+fn draw(svg: &mut Svg, nodes: &[Node], edges: &[Edge], taken: &mut Vec<OccupiedRectangle>) {
     let mut labels = Vec::new();
     for edge in edges {
         let both = edges.iter().any(|other| (other.from, other.to) == (edge.to, edge.from));
@@ -337,7 +337,7 @@ fn within(point: [f64; 2], middle: [f64; 2], half: [f64; 2], margin: f64) -> boo
 }
 
 /// Returns the first place along a curve, or next to it, at which a label covers nothing.
-fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[Taken]) -> [f64; 2] {
+fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[OccupiedRectangle]) -> [f64; 2] {
     let is_free = |place: &[f64; 2]| {
         !taken.iter().any(|(middle, other)| within(*place, *middle, [other[0] + half[0], other[1] + half[1]], 1.0))
     };

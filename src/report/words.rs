@@ -14,7 +14,7 @@ use regrind_journal::Record;
 /// Returns the content of a record in one line. Content that this version of the program cannot read is returned as it
 /// was written.
 pub fn words(record: &Record) -> String {
-    let told = told_words(&RecordContent::from_record(record));
+    let told = content_words(&RecordContent::from_record(record));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
     let mut line = told.unwrap_or_else(as_written);
     if !record.reason.is_empty() {
@@ -24,7 +24,7 @@ pub fn words(record: &Record) -> String {
     line.replace(|c: char| c.is_control(), " ")
 }
 
-fn told_words(told: &RecordContent) -> Option<String> {
+fn content_words(told: &RecordContent) -> Option<String> {
     match told {
         RecordContent::Begun(value) => begin_words(value),
         RecordContent::Reopened => Some("reopened".to_owned()),

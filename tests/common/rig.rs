@@ -62,7 +62,7 @@ pub fn recipe(changes: &[(&str, &str)]) -> Recipe {
 
 /// Request that arrived at a simulated machine, with its time.
 #[derive(Clone, Copy, Debug)]
-pub struct Came {
+pub struct ReceivedRequest {
     pub at: Instant,
     /// True if the request changed the heartbeat.
     pub beat: bool,
@@ -77,7 +77,7 @@ pub type Watch = Box<dyn FnMut(u16) + Send>;
 pub struct Rig {
     pub world: World,
     pub servings: [Serving; 2],
-    pub came: [Arc<Mutex<Vec<Came>>>; 2],
+    pub came: [Arc<Mutex<Vec<ReceivedRequest>>>; 2],
     pub recipe: Recipe,
     pub cell: CellConfig,
     pub home: TempDir,
@@ -136,7 +136,7 @@ impl Rig {
         let came = Arc::clone(&self.came[machine]);
         let look = move |request: &regrind_sim::wire::faults::Request| {
             let beat = request.function == 16 && request.address == 36;
-            came.lock().unwrap().push(Came { at: Instant::now(), beat, command: request.command });
+            came.lock().unwrap().push(ReceivedRequest { at: Instant::now(), beat, command: request.command });
             if let Some(command) = request.command {
                 watch(command);
             }

@@ -75,7 +75,7 @@ pub enum Move {
 }
 
 /// Random program.
-pub struct Drawn {
+pub struct RandomProgram {
     pub text: String,
     pub moves: Vec<Move>,
     /// Description of the line that must be refused, if there is one.
@@ -306,7 +306,7 @@ impl Draw {
 }
 
 /// Draws a program.
-pub fn drawn(seed: u64) -> Drawn {
+pub fn drawn(seed: u64) -> RandomProgram {
     let rng = regrind_sim::rng(seed);
     let mut draw = Draw {
         rng,
@@ -343,7 +343,7 @@ pub fn drawn(seed: u64) -> Drawn {
     }
     draw.straight();
     draw.text += "M2\n";
-    Drawn { text: draw.text, moves: draw.moves, refused }
+    RandomProgram { text: draw.text, moves: draw.moves, refused }
 }
 
 /// Reads a corrected program: absolute, with a motion word in every move.
@@ -401,7 +401,7 @@ pub fn read(text: &str) -> Vec<Move> {
 }
 
 /// Compares the corrected program with the drawn one plus the map.
-fn assert_is_corrected(drawn: &Drawn, text: &str, error: fn(f64, f64) -> f64, seed: u64) {
+fn assert_is_corrected(drawn: &RandomProgram, text: &str, error: fn(f64, f64) -> f64, seed: u64) {
     let found = read(text);
     let mut k = 0;
     for (number, wanted) in drawn.moves.iter().enumerate() {

@@ -296,13 +296,13 @@ fn report_of_aborted_run() {
 
 /// Record that this test writes as a drive writes it: events, commands with an answer as intents, and all others as
 /// notes.
-pub struct Written {
+pub struct RecordWriter {
     home: TempDir,
     journal: Journal,
     at: u64,
 }
 
-impl Written {
+impl RecordWriter {
     pub fn new(content: Value) -> Self {
         let home = tempfile::tempdir().unwrap();
         let header = Header {
@@ -365,7 +365,7 @@ pub fn aborted() -> Ending {
 
 #[test]
 fn report_lists_alarms_with_times() {
-    let mut written = Written::new(Value::Null);
+    let mut written = RecordWriter::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     written.command(raised("link_lost", "The link to a machine is lost: grinder."));
     written.command(Command::Withdraw { alarm: AlarmId::LinkLost });
@@ -394,7 +394,7 @@ fn report_lists_alarms_with_times() {
 
 #[test]
 fn report_of_failed_and_amended_cycles() {
-    let mut written = Written::new(Value::Null);
+    let mut written = RecordWriter::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     let failed = |words: &str| GateResult::Failed(GateFailure::Coverage(words.into()));
     written.event(Event::Collected { cycle: 1, targets: 100, found: 12, gate: failed("12 % found, 95 % are needed") });
@@ -426,7 +426,7 @@ pub fn figures() -> Figures {
 
 #[test]
 fn report_shows_no_raw_record() {
-    let mut written = Written::new(Value::Null);
+    let mut written = RecordWriter::new(Value::Null);
     sample_events(1).into_iter().for_each(|event| written.event(event));
     let refused = Event::Resume { actor: ada(), reason: "go".into() };
     let state = State::Execute(Phase::Load);
@@ -472,7 +472,7 @@ fn report_shows_no_raw_record() {
 fn report_without_limits_invents_none() {
     let tolerance = Tolerance { pv_mm: f64::INFINITY, ..tolerance() };
     let of = |content: Value| {
-        let mut written = Written::new(content);
+        let mut written = RecordWriter::new(content);
         written.event(Event::Registered { cycle: 1, figures: figures() });
         written.ended(&aborted())
     };

@@ -7,7 +7,7 @@ use std::process::Command;
 
 use crate::data::data;
 use crate::program::{root, run, small_recipe};
-use crate::reports::{Written, aborted, ada, arguments, figures, json_in, the_run, tolerance};
+use crate::reports::{RecordWriter, aborted, ada, arguments, figures, json_in, the_run, tolerance};
 use regrind::cell::{Command as CellCommand, Event, Figures, GateFailure, GateResult, Judgement, Verdict};
 use regrind::report::{ResultsFormat, run_results};
 use serde_json::{Value, json};
@@ -33,7 +33,7 @@ fn read_dfq(path: &Path) -> Value {
 fn hostile() -> (TempDir, std::path::PathBuf) {
     let plan = json!({ "plan": { "tolerance": tolerance() }, "part_name": "Spiegel \u{201e}\u{c4}\u{201c} <1> & \"2\" ]]>",
         "recipe": "a\u{a4}b.toml", "recipe_sha256": "00", "cell": "c.toml", "cell_sha256": "11" });
-    let mut written = Written::new(plan);
+    let mut written = RecordWriter::new(plan);
     written.event(Event::Start { actor: ada() });
     let of = |pv_mm: f64, rms_mm: f64| Figures {
         pv_robust_mm: Some(pv_mm),
@@ -100,7 +100,7 @@ fn qif_and_dfq_match_result_json() {
 
 #[test]
 fn results_refused_without_measurement() {
-    let mut written = Written::new(Value::Null);
+    let mut written = RecordWriter::new(Value::Null);
     written.event(Event::Start { actor: ada() });
     let (home, folder) = written.ended(&aborted());
     let (code, _, errors) = run(&["report", folder.to_str().unwrap(), "--qif"], home.path());

@@ -197,14 +197,14 @@ impl<B: Physics> Physics for Watched<B> {
 }
 
 /// Recorder of the state of the world at each measured cycle.
-struct Eye {
+struct WorldRecorder {
     world: World,
     folder: PathBuf,
     radius_mm: f64,
     taken: Mutex<Vec<Snapshot>>,
 }
 
-impl Eye {
+impl WorldRecorder {
     /// Records the state of the world at the newest measured cycle, once.
     fn record_state(&self) {
         let Self { world, folder, radius_mm, .. } = self;
@@ -292,7 +292,7 @@ async fn go(setup: Setup) -> Ran {
     let tolerance_mm = [plan.tolerance.pv_mm, plan.tolerance.rms_mm];
     let world = world(&setup, &recipe);
     let radius_mm = recipe.measure.probe_radius_mm;
-    let eye = Arc::new(Eye { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
+    let eye = Arc::new(WorldRecorder { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
     let (servings, [of_cmm, of_grinder]) = serve(&setup, &cell, &eye).await;
     let journal: Box<dyn JournalSink> = Box::new(Journal::create(&folder, header("test part")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();
@@ -374,7 +374,7 @@ fn world(setup: &Setup, recipe: &Recipe) -> World {
 }
 
 /// Serves both machines on their own ports, and gives the drivers of the cell the addresses.
-async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2], [ModbusSettings; 2]) {
+async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<WorldRecorder>) -> ([Serving; 2], [ModbusSettings; 2]) {
     let options = |seed| MachineOptions {
         speed: SPEED,
         seed,

@@ -16,7 +16,7 @@ use tokio::time::Instant;
 
 use crate::ledger::Recorded;
 use crate::machines::Moment;
-use crate::person::Given;
+use crate::person::GivenOrder;
 use crate::schedule::Tally;
 use crate::wire::{Sent, Traffic};
 use crate::{programs, touches};
@@ -58,7 +58,7 @@ pub struct Evidence {
     pub deeds: Vec<(Instant, MachineEvent)>,
     /// Actions of the grinder, if it is one by LinuxCNC.
     pub rsh_deeds: Vec<(Instant, ControllerEvent)>,
-    pub given: Vec<Given>,
+    pub given: Vec<GivenOrder>,
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
     pub tally: Tally,
@@ -126,7 +126,7 @@ impl Evidence {
     }
 
     /// Returns the records of an event of a machine between two moments.
-    fn told(&self, event: &str, machine: usize, from: Instant, to: Instant) -> impl Iterator<Item = &Recorded> {
+    fn events_between(&self, event: &str, machine: usize, from: Instant, to: Instant) -> impl Iterator<Item = &Recorded> {
         let of_it = move |w: &&Recorded| w.payload["event"] == event && w.payload["device"] == NAMES[machine];
         self.written.iter().filter(move |w| from <= w.at && w.at <= to).filter(of_it)
     }
@@ -430,7 +430,7 @@ fn moved_by_nothing_that_stands(evidence: &Evidence) -> Result<(), String> {
 /// Checks that the cell, if it holds, sends HOLD to a job that was out of sight and is found running.
 fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
     for (k, name) in NAMES.iter().enumerate() {
-        let found = evidence.told("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
+        let found = evidence.events_between("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
         for found in found.filter(|found| found.payload["outcome"] == "running") {
             let by = found.at + HOLDS_WITHIN;
             let holds = |shown: &Shown| shown.state == Some(StateName::Holding);
@@ -441,7 +441,7 @@ fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
                 let makes_safe = matches!(sent.command, Command::Hold | Command::Stop | Command::Abort);
                 sent.machine == k && makes_safe && found.at <= sent.at && sent.at <= by
             });
-            if still && !told && evidence.told("link_lost", k, found.at, by).next().is_none() {
+            if still && !told && evidence.events_between("link_lost", k, found.at, by).next().is_none() {
                 let at = evidence.seconds(found.at);
                 return Err(format!("the {name} is found to run at {at:.3} s, and is not told to hold"));
             }

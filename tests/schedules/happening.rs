@@ -26,13 +26,13 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use crate::checker::{Evidence, Shown};
 use crate::cue::Cues;
-use crate::ledger::{Disk, Kept, SharedDisk, Written};
+use crate::ledger::{Disk, LifeJournal, SharedDisk, Written};
 use crate::life::Life;
 use crate::machines::{Machines, Plant};
 use crate::net::{Net, Weather};
 use crate::outside::{Hindered, Office, Outside};
-use crate::part::{self, Wanted};
-use crate::person::{Given, Person, actor};
+use crate::part::{self, RequiredQuality};
+use crate::person::{GivenOrder, Person, actor};
 use crate::schedule::{Act, Schedule, Tally};
 use crate::wire::Wires;
 
@@ -179,7 +179,7 @@ impl<'s> Happening<'s> {
                 InterruptedRun::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
             (Journal::open_locked(lock, None).unwrap(), Some(interrupted))
         };
-        let kept = Kept::new(journal, &self.disk, life, &self.written, &self.cues);
+        let kept = LifeJournal::new(journal, &self.disk, life, &self.written, &self.cues);
         let journal = kept.shared();
         let (notices, _) = mpsc::unbounded_channel();
         let disk = self.disk.clone();
@@ -242,7 +242,7 @@ impl<'s> Happening<'s> {
     }
 
     fn settings(&self, which: usize) -> ModbusSettings {
-        let cell = &part::setting(Wanted::Good).cell;
+        let cell = &part::setting(RequiredQuality::Good).cell;
         let link = if which == 0 { &cell.cmm.link } else { &cell.grinder.link };
         setup::modbus_settings(link, true, 7, self.lives as u32).unwrap()
     }
@@ -282,7 +282,7 @@ impl<'s> Happening<'s> {
         let grinder = match self.schedule.rsh {
             None => AnyGrinder::ModbusTcp(ModbusGrinder::on(of_grinder, self.settings(1))),
             Some(_) => {
-                let dial = self.nets[1].dial(life, Some(&wires));
+                let dial = self.nets[1].connect(life, Some(&wires));
                 let seed = self.schedule.seed ^ 0x70 ^ (self.lives << 8);
                 AnyGrinder::Linuxcnc(LinuxcncGrinder::with_connector(self.rsh_settings(folder), dial, seed))
             }
@@ -290,7 +290,7 @@ impl<'s> Happening<'s> {
         let cmm = match self.schedule.dme {
             None => AnyCmm::ModbusTcp(ModbusCmm::on(of_cmm, self.settings(0))),
             Some(_) => {
-                let dial = self.nets[0].dial(life, Some(&wires));
+                let dial = self.nets[0].connect(life, Some(&wires));
                 AnyCmm::Ippdme(IppdmeCmm::with_connector(dme_settings(), dial))
             }
         };
@@ -309,7 +309,7 @@ impl<'s> Happening<'s> {
                 settings.line,
                 settings.request_timeout,
                 settings.quarantine,
-                self.nets[which].dial(life, Some(&(self.wires.clone(), self.cues.clone()))),
+                self.nets[which].connect(life, Some(&(self.wires.clone(), self.cues.clone()))),
                 seed,
             )
         };
@@ -364,7 +364,7 @@ impl<'s> Happening<'s> {
 
     fn evidence(self, folder: PathBuf, ending: Option<Ending>) -> Evidence {
         let log = self.machines.log.lock().unwrap().clone();
-        let given: Vec<Given> = self.person.given.lock().unwrap().clone();
+        let given: Vec<GivenOrder> = self.person.given.lock().unwrap().clone();
         let written = self.written.lock().unwrap().clone();
         let fired = self.faults.iter().map(|faults| faults.fired().len() as u64).sum();
         let passes = log.iter().filter(|m| matches!(m.what, HandshakeEvent::Began { .. })).count() as u64;
@@ -388,10 +388,10 @@ impl<'s> Happening<'s> {
         let told = ending.as_ref().and_then(|ending| serde_json::to_value(ending).ok());
         let told = told.as_ref().or(finish.map(|finish| &finish.payload)).and_then(|told| told["ending"].as_str());
         let ended_well = match (told, self.schedule.wanted) {
-            (Some("accepted"), Wanted::Good) | (Some("not_accepted"), Wanted::Perfect) => true,
+            (Some("accepted"), RequiredQuality::Good) | (Some("not_accepted"), RequiredQuality::Perfect) => true,
             // A wheel under program control leaves more between tracks that are 6 mm apart than the limits of this part
             // allow: RMS 2.5 um, limit 2.
-            (Some("not_accepted"), Wanted::Good) if self.schedule.rsh.is_some() => true,
+            (Some("not_accepted"), RequiredQuality::Good) if self.schedule.rsh.is_some() => true,
             // A fault can have ended it.
             _ => !self.schedule.dies_alone(),
         };
@@ -421,7 +421,7 @@ impl<'s> Happening<'s> {
 
 /// Returns the settings of a server of I++ DME: the defaults of a cell file.
 fn dme_settings() -> IppdmeSettings {
-    let cell = &part::setting(Wanted::Good).cell;
+    let cell = &part::setting(RequiredQuality::Good).cell;
     let wire = IppdmeWire { host: "cmm".into(), tool: "Probe1".into(), ..IppdmeWire::default() };
     let ms = |ms: u32| Duration::from_millis(ms.into());
     IppdmeSettings {

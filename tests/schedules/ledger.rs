@@ -84,7 +84,7 @@ pub struct Recorded {
 pub type Written = Arc<Mutex<Vec<Recorded>>>;
 
 /// Journal in a life of the program.
-pub struct Kept {
+pub struct LifeJournal {
     journal: SharedJournal,
     folder: PathBuf,
     disk: SharedDisk,
@@ -98,7 +98,7 @@ pub struct Kept {
 /// Journal that is dropped with its life: tasks of a dead life can neither write it nor keep its lock.
 pub type SharedJournal = Arc<Mutex<Option<Journal>>>;
 
-impl Kept {
+impl LifeJournal {
     pub fn new(journal: Journal, disk: &SharedDisk, life: &Arc<Life>, written: &Written, cues: &Cues) -> Self {
         let folder = journal.folder().to_owned();
         let journal = Arc::new(Mutex::new(Some(journal)));
@@ -154,7 +154,7 @@ fn text_of(entry: &Entry) -> String {
     format!("{} {} {}", entry.kind.as_str(), entry.mono_ns, entry.payload)
 }
 
-impl JournalSink for Kept {
+impl JournalSink for LifeJournal {
     fn folder(&self) -> &Path {
         &self.folder
     }

@@ -23,7 +23,7 @@ use tokio::time::Instant;
 
 use crate::cue::Cues;
 use crate::net::Far;
-use crate::part::{Wanted, setting};
+use crate::part::{RequiredQuality, setting};
 use crate::schedule::Schedule;
 
 /// Time step of the machines.
@@ -121,7 +121,7 @@ impl Machines {
     /// duplicates.
     pub fn new(schedule: &Schedule, cues: &Cues) -> Self {
         let Schedule { seed, speed, trusting, .. } = *schedule;
-        let truth = setting(Wanted::Good).recipe.simulation.clone().unwrap();
+        let truth = setting(RequiredQuality::Good).recipe.simulation.clone().unwrap();
         let mut spec = WorldSpec::deserialize(toml::Value::Table(truth)).unwrap();
         spec.seed = 1 + seed % 7;
         if schedule.dme.is_some() {
@@ -215,7 +215,7 @@ fn by_programs(
     faults: RshFaults,
     (log, deeds, cues): (&Log, &RshDeeds, &Cues),
 ) -> SharedController {
-    let radius_mm = setting(Wanted::Good).recipe.grinding.wheel.radius_mm();
+    let radius_mm = setting(RequiredQuality::Good).recipe.grinding.wheel.radius_mm();
     let mut controller = Controller::new(world.plain_wheel(radius_mm), speed, faults);
     let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
     controller.set_observer(Box::new(move |deed| {

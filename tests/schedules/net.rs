@@ -258,7 +258,7 @@ impl Net {
     }
 
     /// Returns the dialler by which a life of the program reaches the machines. Only these connections are watched.
-    pub fn dial(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Connector> {
+    pub fn connect(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Connector> {
         Box::new(Caller { net: self.clone(), life: life.clone(), wires: wires.cloned() })
     }
 }

@@ -20,7 +20,7 @@ use crate::ledger::{Disk, SharedDisk};
 use crate::life::Life;
 use crate::machines::Plant;
 use crate::net::{Net, Weather};
-use crate::person::{Given, give, take_supplies};
+use crate::person::{GivenOrder, give, take_supplies};
 use crate::schedule::Act;
 
 /// Receiver of orders in the current life of the program.
@@ -39,7 +39,7 @@ pub struct Outside {
     pub faults: [SharedFaultPlan; 2],
     pub disk: SharedDisk,
     pub orders: Office,
-    pub given: Arc<Mutex<Vec<Given>>>,
+    pub given: Arc<Mutex<Vec<GivenOrder>>>,
     pub settings: [ModbusSettings; 2],
     pub is_serial: bool,
     pub hindered: Hindered,
@@ -196,7 +196,7 @@ impl Outside {
         let life = Arc::new(Life::new(u64::MAX));
         let settings = ModbusSettings { owner: 99, epoch: 1, ..self.settings[which].clone() };
         let seed = self.number as u64;
-        let dial = self.nets[which].dial(&life, None);
+        let dial = self.nets[which].connect(&life, None);
         let link =
             Link::with_connector(settings.line.clone(), settings.request_timeout, settings.quarantine, dial, seed);
         // The command is refused if the machine has an owner that is alive; its content does not matter here.

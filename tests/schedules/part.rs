@@ -27,7 +27,7 @@ fn changed(file: &str, changes: &[(&str, &str)]) -> String {
 
 /// Required quality of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wanted {
+pub enum RequiredQuality {
     /// Quality that a part reaches after two or three cycles.
     Good,
     /// Quality that a part never reaches: the run uses all five cycles.
@@ -35,12 +35,12 @@ pub enum Wanted {
 }
 
 /// Returns recipe and cell, which differ only in the required quality.
-pub fn setting(wanted: Wanted) -> &'static Setting {
+pub fn setting(wanted: RequiredQuality) -> &'static Setting {
     static SETTINGS: [OnceLock<Setting>; 2] = [OnceLock::new(), OnceLock::new()];
     SETTINGS[wanted as usize].get_or_init(|| {
         let [pv_um, rms_um] = match wanted {
-            Wanted::Good => ["pv_um = 12.0", "rms_um = 2.0"],
-            Wanted::Perfect => ["pv_um = 0.1", "rms_um = 0.01"],
+            RequiredQuality::Good => ["pv_um = 12.0", "rms_um = 2.0"],
+            RequiredQuality::Perfect => ["pv_um = 0.1", "rms_um = 0.01"],
         };
         let text = changed(
             "recipes/freeform-mirror.toml",
@@ -76,19 +76,19 @@ pub fn setting(wanted: Wanted) -> &'static Setting {
 }
 
 /// Returns the inputs of a run's computations and of its cell's decisions.
-pub fn task(wanted: Wanted) -> (Task, CellPlan) {
+pub fn task(wanted: RequiredQuality) -> (Task, CellPlan) {
     let Setting { recipe, cell } = setting(wanted);
     setup::prepare(recipe, cell).unwrap()
 }
 
 /// Returns the interval between two polls of each machine.
 pub fn poll() -> [Duration; 2] {
-    let cell = &setting(Wanted::Good).cell;
+    let cell = &setting(RequiredQuality::Good).cell;
     [cell.cmm.link.timing.poll, cell.grinder.link.timing.poll]
 }
 
 /// Returns the height at which the centre of an I++ DME probe travels above the highest target of a plan.
 pub fn clearance_mm() -> f64 {
-    let measure = &setting(Wanted::Good).recipe.measure;
+    let measure = &setting(RequiredQuality::Good).recipe.measure;
     measure.safe_height_mm + measure.probe_radius_mm
 }

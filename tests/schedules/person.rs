@@ -25,7 +25,7 @@ const NO_LONGER_THAN: Duration = Duration::from_secs(1200);
 
 /// Order, and the cell's answer.
 #[derive(Clone, Debug)]
-pub struct Given {
+pub struct GivenOrder {
     pub at: Instant,
     pub answered: Instant,
     pub what: &'static str,
@@ -44,7 +44,7 @@ pub fn actor() -> Actor {
 
 pub struct Person {
     pub plants: [Plant; 2],
-    pub given: Arc<Mutex<Vec<Given>>>,
+    pub given: Arc<Mutex<Vec<GivenOrder>>>,
     chance: StdRng,
     resumes: u32,
     began: Instant,
@@ -121,7 +121,7 @@ impl Person {
 pub async fn give(
     orders: &OrderSender,
     life: &Life,
-    given: &Mutex<Vec<Given>>,
+    given: &Mutex<Vec<GivenOrder>>,
     (what, reason): (&'static str, String),
     plants: &[Plant; 2],
     request: impl FnOnce(String) -> Request,
@@ -132,7 +132,7 @@ pub async fn give(
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
     let accepted = reply.taken;
     let done = accepted || reply.message.contains("make the cell safe were carried out");
-    given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted, done, moved });
+    given.lock().unwrap().push(GivenOrder { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }
 
 /// Opens the interlock of air and coolant of a machine.

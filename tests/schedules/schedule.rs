@@ -16,7 +16,7 @@ use crate::cue::{Cue, When, any_length};
 use crate::happening::Happening;
 use crate::ledger::Disk;
 use crate::net::Weather;
-use crate::part::Wanted;
+use crate::part::RequiredQuality;
 
 /// Maximum number of lives of the program that are cut short.
 const MAX_DEATHS: usize = 3;
@@ -64,7 +64,7 @@ pub struct Schedule {
     pub acts: Vec<(When, Act)>,
     /// Effects before which the lives of the program end, one for each life.
     pub deaths: Vec<u64>,
-    pub wanted: Wanted,
+    pub wanted: RequiredQuality,
 }
 
 /// External act on the cell.
@@ -182,7 +182,7 @@ impl Schedule {
             }
         }
         let speed = [2000.0, 400.0, 60.0][chance.random_range(0..3)];
-        Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
+        Self { speed, acts, wanted: RequiredQuality::Good, ..Self::with_deaths(seed, Vec::new()) }
     }
 
     /// Draws a run in which registers of the status and of the header of a result have false values for a while: one
@@ -204,7 +204,7 @@ impl Schedule {
             acts.push((when, Act::Lie { machine: chance.random_range(0..2), block, at, word, lasts }));
         }
         let speed = [2000.0, 400.0, 60.0][chance.random_range(0..3)];
-        Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
+        Self { speed, acts, wanted: RequiredQuality::Good, ..Self::with_deaths(seed, Vec::new()) }
     }
 
     /// Returns true if machines report false values.
@@ -252,7 +252,7 @@ impl Schedule {
         let deaths = if chance.random::<f64>() < 0.4 { chance.random_range(1..=MAX_DEATHS) } else { 0 };
         let deaths = (0..deaths).map(|_| chance.random_range(1..700)).collect::<Vec<u64>>();
         let drawn = Self { seed, speed, trusting, baud, deaths, ..Self::with_deaths(seed, Vec::new()) };
-        let drawn = Self { wanted: Wanted::Good, ..drawn };
+        let drawn = Self { wanted: RequiredQuality::Good, ..drawn };
         match chance.random_range(0..10) {
             0 if drawn.deaths.is_empty() => {
                 let acts = if chance.random::<f64>() < 0.5 { asleep(&mut chance) } else { astray(&mut chance) };
@@ -288,7 +288,7 @@ impl Schedule {
             rsh: None,
             acts: Vec::new(),
             deaths,
-            wanted: Wanted::Perfect,
+            wanted: RequiredQuality::Perfect,
         }
     }
 
@@ -339,7 +339,7 @@ impl Schedule {
 impl fmt::Display for Schedule {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "seed {}", self.seed)?;
-        if self.wanted == Wanted::Perfect {
+        if self.wanted == RequiredQuality::Perfect {
             write!(f, ", deaths {:?}", self.deaths)?;
         }
         Ok(())

@@ -41,7 +41,7 @@ pub(in super::super) fn prove(
         found.fetch(&link, config.artefacts.as_ref(), &copy).await?;
         let proven = found.prove(&copy, keys)?;
         if let Some(folder) = &folder {
-            found.stands_in(folder)?;
+            found.check_local_journal(folder)?;
         }
         let told = json!({
             "run": found.name, "cell": found.cell, "sound": true, "records": proven.records, "head": proven.head,

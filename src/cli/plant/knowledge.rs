@@ -23,7 +23,7 @@ pub(in super::super) struct PlantKnowledge {
 }
 
 /// Queries the knowledge of other cells about similar parts. An unreachable plant does not prevent the run.
-pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
+pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
     let config = super::read(plant)?;
     // A plant file for live values only has no database to query.
     if config.database.is_none() {
@@ -52,7 +52,7 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<PlantKnowledge,
         Err(_) => return Ok(without(&format!("nothing came within {} s", PATIENCE.as_secs()))),
     };
     let words = knowledge.left_alone;
-    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.lessons, &alike), words })
+    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
 }
 
 /// Returns the similarity of machines, from a stated value or from the recipes that two machines share.

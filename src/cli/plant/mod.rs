@@ -46,7 +46,7 @@ enum PlantCommand {
     Cells(members::ToList),
     Runs(runs::ToList),
     Fetch(runs::ToFetch),
-    Incidents(runs::ToTell),
+    Incidents(runs::ToListIncidents),
     Propose(recipes::ToPropose),
     Approve(recipes::ToApprove),
     Withdraw(recipes::ToWithdraw),
@@ -110,7 +110,7 @@ pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
 /// Signs in to the database of a plant file. Its schema must be the version of this program.
 pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
     let link = open_any(config).await?;
-    regrind_plant::is_known(link.client()).await?;
+    regrind_plant::check_layout(link.client()).await?;
     Ok(link)
 }
 
@@ -124,7 +124,7 @@ pub(super) struct PlantProcesses {
 impl PlantProcesses {
     /// Starts the replication of the runs in a folder if the plant file names a database, and the publication of live
     /// values if it names a receiver.
-    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
+    pub(super) fn start(runs: &Path, plant: &Path) -> Result<Self, Failure> {
         // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;
         let tells = config.sparkplug.is_some() || config.opcua.is_some();

@@ -63,7 +63,7 @@ Example:
   regrind plant incidents --plant planner.toml
 
 Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
-pub(super) struct ToTell {
+pub(super) struct ToListIncidents {
     /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]
     most: u32,
@@ -116,7 +116,7 @@ pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {
     })
 }
 
-pub(super) fn incidents(arguments: &ToTell) -> Result<Outcome, Failure> {
+pub(super) fn incidents(arguments: &ToListIncidents) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;

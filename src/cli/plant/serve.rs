@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use clap::Args;
-use regrind_page::{Door as PageDoor, PageSubject};
+use regrind_page::{GuardedServer as PageDoor, PageSubject};
 use regrind_plant::PlantPage;
 
 use super::super::Outcome;

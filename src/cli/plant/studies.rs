@@ -8,7 +8,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use regrind::formats::{ResultFolder, ScratchFolder, write_atomic};
 use regrind::recipe::Recipe;
-use regrind_plant::{Job, PlantError, Study, glance};
+use regrind_plant::{Job, PlantError, Study, run_overview};
 use serde_json::{Map, Value, json};
 
 use super::super::failure::Failure;
@@ -295,7 +295,7 @@ fn made_of(study: &Study, job: &Job) -> Result<Value, String> {
     let done = command.stdin(Stdio::null()).stdout(Stdio::null()).output().map_err(|error| words(&error))?;
     let run = std::fs::read_dir(&runs).ok().and_then(|mut runs| Some(runs.next()?.ok()?.path()));
     let Some(run) = run else { return Err(String::from_utf8_lossy(&done.stderr).trim_end().to_owned()) };
-    let mut told = glance(&run).map_err(|error| words(&error))?;
+    let mut told = run_overview(&run).map_err(|error| words(&error))?;
     told["truth"] = std::fs::read(&truth).ok().and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default();
     Ok(told)
 }

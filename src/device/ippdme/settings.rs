@@ -144,7 +144,7 @@ impl DriverFactory for IppdmeWire {
             return document.report("grinder.wire.kind", "is \"ippdme\"", allowed, "name another wire");
         }
         self.check_address(place, document);
-        if !document.is_there("cmm.travel") {
+        if !document.contains_key("cmm.travel") {
             let allowed = "every position is checked against the machine's volume before it moves";
             document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
         }

@@ -337,7 +337,7 @@ impl RegisterMap {
             for &(other, start, length) in &blocks[..k] {
                 if u32::from(start) < end && u32::from(first) < u32::from(start) + u32::from(length) {
                     // If only the earlier block was moved, the earlier block is the one to correct.
-                    let moved = document.is_there(&key);
+                    let moved = document.contains_key(&key);
                     let (key, of) =
                         if moved { (key.clone(), other) } else { (place.key(&format!("registers.{other}")), name) };
                     let found = format!("overlaps the block `{of}`");

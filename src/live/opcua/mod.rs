@@ -42,7 +42,7 @@ const CLIENTS: usize = 32;
 pub struct UaServer {
     listen: SocketAddr,
     cell: String,
-    keeps: std::path::PathBuf,
+    pki_folder: std::path::PathBuf,
     status: watch::Receiver<CellStatus>,
     notes: EventSender,
 }
@@ -63,7 +63,7 @@ impl UaServer {
         if !listen.ip().is_loopback() {
             return Err(LiveError::ForOthers { listen });
         }
-        Ok(Self { listen, cell: cell.to_owned(), keeps: turn.folder().join("opcua"), status: told, notes })
+        Ok(Self { listen, cell: cell.to_owned(), pki_folder: turn.folder().join("opcua"), status: told, notes })
     }
 
     /// Serves the state of the cell until its source closes.
@@ -125,7 +125,7 @@ impl UaServer {
             .build_info(about)
             .host(address.ip().to_string())
             .port(address.port())
-            .pki_dir(&self.keeps)
+            .pki_dir(&self.pki_folder)
             .discovery_urls(vec!["/".to_owned()])
             .add_endpoint("none", ServerEndpoint::new_none("/", &[ANONYMOUS_USER_TOKEN_ID.to_string()]))
             .max_sessions(CLIENTS)

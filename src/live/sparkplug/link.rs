@@ -41,7 +41,7 @@ impl BrokerOptions {
     }
 
     /// Returns the options of a connection with this last will.
-    pub(super) fn with_death(&self, topic: &str, death: Vec<u8>) -> MqttOptions {
+    pub(super) fn with_last_will(&self, topic: &str, death: Vec<u8>) -> MqttOptions {
         let mut options = self.options.clone();
         options.set_last_will(LastWill::new(topic, death, QoS::AtLeastOnce, false));
         options

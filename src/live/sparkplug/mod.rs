@@ -30,8 +30,8 @@ use crate::publisher_lock::{BdSeqCounter, PublisherLock};
 use crate::settings::SparkplugSettings;
 
 /// Limits of the time between two attempts to connect to the broker.
-const SHORTEST_WAIT: Duration = Duration::from_millis(500);
-const LONGEST_WAIT: Duration = Duration::from_secs(30);
+const MIN_RETRY_DELAY: Duration = Duration::from_millis(500);
+const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// Minimum time between two births, however many hosts request one.
 const BETWEEN_BIRTHS: Duration = Duration::from_secs(1);
 /// Time before a message that the broker did not accept is sent again.
@@ -110,7 +110,7 @@ impl Node {
     /// # Errors
     /// The number of the connection cannot be written.
     pub async fn run(mut self) -> Result<(), LiveError> {
-        let mut wait = SHORTEST_WAIT;
+        let mut wait = MIN_RETRY_DELAY;
         let mut connection = self.bd_seq.next()?;
         loop {
             let began = Instant::now();
@@ -121,7 +121,7 @@ impl Node {
             }
             // After a connection that lasted, the next attempt comes soon. After one that ended at once, the wait keeps
             // growing.
-            wait = if began.elapsed() > LONGEST_WAIT { SHORTEST_WAIT } else { wait };
+            wait = if began.elapsed() > MAX_RETRY_DELAY { MIN_RETRY_DELAY } else { wait };
             let until = Instant::now() + wait;
             while Instant::now() < until {
                 tokio::select! {
@@ -129,13 +129,13 @@ impl Node {
                     changed = self.status.changed() => if changed.is_err() { return Ok(()) },
                 }
             }
-            wait = (2 * wait).min(LONGEST_WAIT);
+            wait = (2 * wait).min(MAX_RETRY_DELAY);
         }
     }
 
     /// Runs one connection, from its beginning to its end.
     async fn session(&mut self, connection: u8) -> SessionEnd {
-        let options = self.broker.with_death(&self.topics.death, message::death(connection));
+        let options = self.broker.with_last_will(&self.topics.death, message::death(connection));
         let (client, mut broker) = AsyncClient::new(options, WAITING);
         broker.network_options.set_tcp_nodelay(true);
         // Polls in a task of its own: cancelling a poll in the middle of a message would end the connection.

@@ -13,7 +13,7 @@ use super::super::link::Link;
 use super::rank::{ENOUGH, holm, rank_sum};
 use super::selection::{Selection, SelectionQuery, mark};
 use super::words::{encoded, interval, share, shown, um};
-use super::{Made, Shared, Unmade, page};
+use super::{PageContent, Shared, PageError, page};
 
 /// Maximum number of cells compared at once, and of parts of each cell (the newest).
 const CELLS: usize = 40;
@@ -43,7 +43,7 @@ pub(super) async fn cells(
     page(&session, made(&plant, &asked, after.and_then(|after| after.parse().ok()).unwrap_or(0))).await
 }
 
-async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<PageContent, PageError> {
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
     let form = selection.form(&link, "/cells", &["recipe", "grinder", "cmm", "wheel", "probe"]).await?;
@@ -70,7 +70,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Ma
             }
         }
     };
-    Ok(Made { title: "Cells".into(), again_s: None, main })
+    Ok(PageContent { title: "Cells".into(), again_s: None, main })
 }
 
 /// Reads the parts of one cell more than the page shows.

@@ -13,7 +13,7 @@ use super::control_chart::Value;
 use super::run::file;
 use super::selection::{Selection, SelectionQuery};
 use super::trend::parts;
-use super::{PlantPage, Shared, Unmade, unmade, within};
+use super::{PlantPage, Shared, PageError, unmade, within};
 
 /// Maximum number of parts in a file.
 const MAX_PARTS: i64 = 20_000;
@@ -73,7 +73,7 @@ pub(super) async fn csv(
     }
 }
 
-async fn csv_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Unmade> {
+async fn csv_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, PageError> {
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
     let (condition, values) = selection.condition();
@@ -122,12 +122,12 @@ pub(super) async fn dfq(
     }
 }
 
-async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Unmade> {
+async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, PageError> {
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
     let parts = parts(&link, &selection, MAX_PARTS).await?;
     if parts.is_empty() {
-        return Err(Unmade::NotHere(
+        return Err(PageError::NotHere(
             "nothing was measured of such parts; choose others on the page of the trend".into(),
         ));
     }

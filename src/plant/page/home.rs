@@ -14,7 +14,7 @@ use super::super::link::Link;
 use super::bars::{Count, Day, bars};
 use super::selection::{is_simulated, mark, today};
 use super::words::{encoded, interval, share, shown};
-use super::{Made, Shared, Unmade, cells, page};
+use super::{PageContent, Shared, PageError, cells, page};
 
 /// Number of days over which parts are counted.
 const DAYS: i64 = 14;
@@ -39,7 +39,7 @@ pub(super) async fn home(
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &HomeQuery) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &HomeQuery) -> Result<PageContent, PageError> {
     let link = plant.lease().await?;
     let cells = cells::read(&link).await?;
     let simulated = is_simulated(&link, &asked.parts).await?;
@@ -59,7 +59,7 @@ async fn made(plant: &Shared, asked: &HomeQuery) -> Result<Made, Unmade> {
             p .quiet { "This page looks and gives no orders. It is asked for again every " (AGAIN_S) " s. Days are those of UTC." }
         }
     };
-    Ok(Made { title: "Plant".into(), again_s: Some(AGAIN_S), main })
+    Ok(PageContent { title: "Plant".into(), again_s: Some(AGAIN_S), main })
 }
 
 /// Counts of the parts that ended in the last days, by day, by recipe and by cell.

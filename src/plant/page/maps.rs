@@ -15,7 +15,7 @@ use super::super::copy::content;
 use super::super::link::Link;
 use super::selection::mark;
 use super::words::{shown, um};
-use super::{Made, Shared, Unmade, page};
+use super::{PageContent, Shared, PageError, page};
 
 /// Maximum number of maps on the page.
 const MAX_MAPS: usize = 4;
@@ -65,9 +65,9 @@ fn parse_requests(query: &str) -> Vec<MapRequest> {
     named.filter_map(one).take(MAX_MAPS).collect()
 }
 
-async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<PageContent, PageError> {
     if asked.is_empty() {
-        return Err(Unmade::Nonsense(
+        return Err(PageError::Nonsense(
             "name the runs, as in /maps?run=17&run=18, or tick them in the list of parts".into(),
         ));
     }
@@ -85,10 +85,10 @@ async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<Made, Unmade> {
             (drawn.unwrap_or_default())
         }
     };
-    Ok(Made { title: "Maps".into(), again_s: None, main })
+    Ok(PageContent { title: "Maps".into(), again_s: None, main })
 }
 
-async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, Unmade> {
+async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
         WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
     let rows = link.query(text, &[&asked.run, &asked.cycle]).await?;
@@ -109,10 +109,10 @@ async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, Unm
 }
 
 /// Returns the entry of a run that has no map, for display next to runs that have one.
-async fn without(link: &Link, asked: MapRequest) -> Result<Map, Unmade> {
+async fn without(link: &Link, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;
-    let missing = || Unmade::NotHere(format!("the plant has no run {} that made a part", asked.run));
+    let missing = || PageError::NotHere(format!("the plant has no run {} that made a part", asked.run));
     let row = rows.first().ok_or_else(missing)?;
     let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
     Ok(Map {
@@ -129,7 +129,7 @@ async fn without(link: &Link, asked: MapRequest) -> Result<Map, Unmade> {
 }
 
 /// Reads a map from the files of a run; in words, why there is none.
-async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, Unmade> {
+async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {
     let rows = link.query("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
     let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
     let sha256: Vec<u8> = row.get(0);

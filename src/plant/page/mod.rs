@@ -95,14 +95,14 @@ async fn style() -> Response {
 }
 
 /// Finished page.
-struct Made {
+struct PageContent {
     title: String,
     again_s: Option<u32>,
     main: Markup,
 }
 
 /// Reason why a page is not made.
-enum Unmade {
+enum PageError {
     /// The database cannot be reached, or refuses.
     Plant(Box<PlantError>),
     /// There is nothing of that name.
@@ -111,40 +111,40 @@ enum Unmade {
     Nonsense(String),
 }
 
-impl From<PlantError> for Unmade {
+impl From<PlantError> for PageError {
     fn from(error: PlantError) -> Self {
         Self::Plant(Box::new(error))
     }
 }
 
 /// Answers with a page, within the time limit.
-async fn page(session: &Session, making: impl Future<Output = Result<Made, Unmade>>) -> Response {
+async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
     match within(making).await {
-        Ok(Made { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
+        Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
         Err(why) => unmade(session, &why),
     }
 }
 
 /// Runs a future within the time limit.
-async fn within<T>(making: impl Future<Output = Result<T, Unmade>>) -> Result<T, Unmade> {
+async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result<T, PageError> {
     let late = || {
         let what = format!("nothing came within {} s", PATIENCE.as_secs());
-        Unmade::from(PlantError::Unreachable { place: "the other end".into(), what })
+        PageError::from(PlantError::Unreachable { place: "the other end".into(), what })
     };
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
 /// Renders the reason why there is no page. If the reason can pass, the browser retries.
-fn unmade(session: &Session, why: &Unmade) -> Response {
+fn unmade(session: &Session, why: &PageError) -> Response {
     let (status, again_s, title, words) = match why {
-        Unmade::Plant(error) if error.may_pass() => {
+        PageError::Plant(error) if error.may_pass() => {
             (StatusCode::SERVICE_UNAVAILABLE, Some(AGAIN_S), "The database of the plant is away", error.to_string())
         }
-        Unmade::Plant(error) => {
+        PageError::Plant(error) => {
             (StatusCode::INTERNAL_SERVER_ERROR, None, "The database of the plant says no", error.to_string())
         }
-        Unmade::NotHere(what) => (StatusCode::NOT_FOUND, None, "Not here", what.clone()),
-        Unmade::Nonsense(what) => (StatusCode::BAD_REQUEST, None, "That cannot be asked", what.clone()),
+        PageError::NotHere(what) => (StatusCode::NOT_FOUND, None, "Not here", what.clone()),
+        PageError::Nonsense(what) => (StatusCode::BAD_REQUEST, None, "That cannot be asked", what.clone()),
     };
     let main = html! {
         main .list .plant {

@@ -11,7 +11,7 @@ use super::super::error::PlantError;
 use super::super::link::Link;
 use super::super::{Row, ToSql};
 use super::words::{encoded, shown, um};
-use super::{Made, Shared, Unmade, page};
+use super::{PageContent, Shared, PageError, page};
 
 /// Maximum number of parts on a page.
 const MAX_ROWS: usize = 100;
@@ -34,7 +34,7 @@ pub(super) async fn parts(
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &PartsQuery) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &PartsQuery) -> Result<PageContent, PageError> {
     let serial = asked.serial.trim().replace('\0', "");
     let link = plant.lease().await?;
     let rows = read(&link, &serial, asked.after).await?;
@@ -55,7 +55,7 @@ async fn made(plant: &Shared, asked: &PartsQuery) -> Result<Made, Unmade> {
             p .quiet { @if serial.is_empty() { "The newest first." } @else { "By serial number, of each the newest first." } }
         }
     };
-    Ok(Made { title: "Parts".into(), again_s: None, main })
+    Ok(PageContent { title: "Parts".into(), again_s: None, main })
 }
 
 const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";

@@ -8,7 +8,7 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 
 use super::super::error::{PlantError, refused};
 use super::super::link::Link;
-use super::super::schema::is_known;
+use super::super::schema::check_layout;
 use super::super::settings::DatabaseSettings;
 
 /// Maximum number of connections.
@@ -62,7 +62,7 @@ impl Pool {
     /// Opens a new connection and checks that the layout of the database is the one this program knows.
     pub(super) async fn open(&self) -> Result<Link, PlantError> {
         let link = Link::open(&self.database).await?;
-        is_known(link.client()).await?;
+        check_layout(link.client()).await?;
         link.client().batch_execute(RULES).await.map_err(refused("to keep to reading"))?;
         Ok(link)
     }

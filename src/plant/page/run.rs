@@ -19,7 +19,7 @@ use super::super::link::Link;
 use super::proof::{Proof, proven};
 use super::selection::mark;
 use super::words::{encoded, shown, um};
-use super::{Made, PlantPage, Shared, Unmade, page, unmade};
+use super::{PageContent, PlantPage, Shared, PageError, page, unmade};
 
 /// Time that the page waits for the proof before it is shown without it, and seconds until the browser then retries.
 const WAITS: Duration = Duration::from_secs(3);
@@ -38,10 +38,10 @@ impl Run {
     const COLUMNS: &str = "id, cell, run, head, serial, part_name, recipe, recipe_sha256, operator, simulation, to_char(began, 'YYYY-MM-DD HH24:MI:SS'),
         to_char(ended, 'YYYY-MM-DD HH24:MI:SS'), result, verdict, grinder, cmm, wheel, probe, alarms, records, pv_limit_um, rms_limit_um";
 
-    async fn read(link: &Link, id: i32) -> Result<Self, Unmade> {
+    async fn read(link: &Link, id: i32) -> Result<Self, PageError> {
         let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
         let mut rows = link.query(&text, &[&id]).await?;
-        let row = rows.pop().ok_or_else(|| Unmade::NotHere(format!("the plant has no run {id} that made a part")))?;
+        let row = rows.pop().ok_or_else(|| PageError::NotHere(format!("the plant has no run {id} that made a part")))?;
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
 
@@ -56,8 +56,8 @@ impl Run {
 }
 
 /// Parses the id of a run in an address.
-fn number(id: &str) -> Result<i32, Unmade> {
-    id.parse().map_err(|_| Unmade::NotHere("runs go by their numbers here, as in /runs/17".into()))
+fn number(id: &str) -> Result<i32, PageError> {
+    id.parse().map_err(|_| PageError::NotHere("runs go by their numbers here, as in /runs/17".into()))
 }
 
 /// A run by the names that a cell knows it by.
@@ -76,7 +76,7 @@ pub(super) async fn by_name(
         let link = plant.lease().await?;
         let [cell, name] = [cell, name].map(|text| text.replace('\0', ""));
         let rows = link.query("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
-        let missing = || Unmade::NotHere(format!("the plant has nothing of the run {name} of {cell} yet"));
+        let missing = || PageError::NotHere(format!("the plant has nothing of the run {name} of {cell} yet"));
         rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
     };
     match super::within(found).await {
@@ -93,7 +93,7 @@ pub(super) async fn run(
     page(&session, async { made(&plant, number(&id)?).await }).await
 }
 
-async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, id: i32) -> Result<PageContent, PageError> {
     let (run, cycles, maps) = {
         let link = plant.lease().await?;
         let run = Run::read(&link, id).await?;
@@ -124,7 +124,7 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
             }
         }
     };
-    Ok(Made { title: shown(&title), again_s: proof.is_none().then_some(AGAIN_S), main })
+    Ok(PageContent { title: shown(&title), again_s: proof.is_none().then_some(AGAIN_S), main })
 }
 
 fn about(run: &Run) -> Markup {
@@ -225,7 +225,7 @@ async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
 }
 
 /// Returns the proof of a run, however long it takes.
-async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), Unmade> {
+async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), PageError> {
     let run = {
         let link = plant.lease().await?;
         Run::read(&link, number(id)?).await?
@@ -297,7 +297,7 @@ pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response 
 
 /// Returns the answer for a copy that cannot be believed, from which no document is made.
 fn not_made(session: &Session, why: &str) -> Response {
-    let mut response = unmade(session, &Unmade::NotHere(why.to_owned()));
+    let mut response = unmade(session, &PageError::NotHere(why.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;
     response
 }

@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use super::super::error::PlantError;
 use super::super::link::Link;
-use super::Unmade;
+use super::PageError;
 use super::words::{encoded, shown};
 
 /// Filters of parts: the column of the views, which is also the word in an address, and the label for people.
@@ -59,7 +59,7 @@ pub(super) struct Selection {
 impl Selection {
     /// Builds the selection from an address. Defaults: real parts if there are any, the recipe of the newest part, and
     /// the last days.
-    pub(super) async fn from_query(link: &Link, asked: &SelectionQuery) -> Result<Self, Unmade> {
+    pub(super) async fn from_query(link: &Link, asked: &SelectionQuery) -> Result<Self, PageError> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
             Some(recipe) => recipe.clone(),
@@ -182,14 +182,14 @@ pub(super) fn today() -> Date {
 }
 
 /// Parses a day that a person wrote; `None` for an empty text.
-fn day(text: &str) -> Result<Option<Date>, Unmade> {
+fn day(text: &str) -> Result<Option<Date>, PageError> {
     let text = text.trim();
     if text.is_empty() {
         return Ok(None);
     }
     // Accepts only days that the database can represent.
     let found = text.parse::<Date>().ok().filter(|day| (1970..=9000).contains(&day.year()));
-    let bad = || Unmade::Nonsense(format!("{text:?} is no day; write it as 2026-07-04"));
+    let bad = || PageError::Nonsense(format!("{text:?} is no day; write it as 2026-07-04"));
     found.map(Some).ok_or_else(bad)
 }
 
@@ -219,7 +219,7 @@ mod tests {
 
     #[test]
     fn day_refuses_invalid_dates() {
-        assert!(matches!(day("yesterday"), Err(Unmade::Nonsense(_))) && matches!(day(" "), Ok(None)));
-        assert!(matches!(day("-9999-01-01"), Err(Unmade::Nonsense(_))));
+        assert!(matches!(day("yesterday"), Err(PageError::Nonsense(_))) && matches!(day(" "), Ok(None)));
+        assert!(matches!(day("-9999-01-01"), Err(PageError::Nonsense(_))));
     }
 }

@@ -11,7 +11,7 @@ use super::super::link::Link;
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
 use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
 use super::words::{shown, um};
-use super::{Made, Shared, Unmade, page};
+use super::{PageContent, Shared, PageError, page};
 
 /// Maximum number of parts in a chart, and of parts in the list of those out of limits.
 const MAX_PARTS: i64 = 250;
@@ -31,7 +31,7 @@ pub(super) async fn trend(
     page(&session, made(&plant, &asked)).await
 }
 
-async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<Made, Unmade> {
+async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, PageError> {
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
     let form = selection.form(&link, "/trend", &ALL_KINDS).await?;
@@ -51,7 +51,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<Made, Unmade> {
             }
         }
     };
-    Ok(Made { title: "Trend".into(), again_s: None, main })
+    Ok(PageContent { title: "Trend".into(), again_s: None, main })
 }
 
 /// Reads the newest parts of a selection, in order from the oldest to the newest.

@@ -39,11 +39,11 @@ const ANSWERS_WITHIN: Duration = Duration::from_secs(25);
 const LONGEST_BODY: usize = 4096;
 
 /// Access to a page that gives no orders to a cell.
-pub struct Door {
+pub struct GuardedServer {
     guard: Arc<Guard>,
 }
 
-impl Door {
+impl GuardedServer {
     /// Prepares access to a page. `log` gets the refusals and the sign-ins.
     ///
     /// # Errors

@@ -23,7 +23,7 @@ const INK: [u8; 4] = [0, 0, 0, 255];
 const GROUND: [u8; 4] = [0xff, 0xc8, 0x00, 255];
 
 /// Picture in red, green, blue and opacity, rows from the top.
-pub(super) struct Marked {
+pub(super) struct MarkedPicture {
     pub width: usize,
     pub height: usize,
     pub rgba: Vec<u8>,
@@ -31,7 +31,7 @@ pub(super) struct Marked {
 
 /// Puts the word SIMULATION in a band above the pixels. A small picture is enlarged: each pixel becomes a square of
 /// several pixels.
-pub(super) fn marked(pixels: &[[u8; 4]], columns: usize) -> Marked {
+pub(super) fn mark_simulation(pixels: &[[u8; 4]], columns: usize) -> MarkedPicture {
     let rows = pixels.len() / columns;
     let enlarged = MIN_WIDTH.div_ceil(columns);
     let width = columns * enlarged;
@@ -49,7 +49,7 @@ pub(super) fn marked(pixels: &[[u8; 4]], columns: usize) -> Marked {
         let line: Vec<u8> = row.iter().flat_map(|pixel| pixel.repeat(enlarged)).collect();
         (0..enlarged).for_each(|_| rgba.extend_from_slice(&line));
     }
-    Marked { width, height: band + rows * enlarged, rgba }
+    MarkedPicture { width, height: band + rows * enlarged, rgba }
 }
 
 /// Returns true if a pixel of the band belongs to a letter. `x` counts from the first letter.
@@ -70,7 +70,7 @@ mod tests {
     fn simulation_mark_above_pixels() {
         for (columns, rows) in [(1, 1), (7, 5), (103, 63), (500, 300)] {
             let pixels: Vec<[u8; 4]> = (0..columns * rows).map(|k| [k as u8, (k >> 8) as u8, 7, 255]).collect();
-            let picture = marked(&pixels, columns);
+            let picture = mark_simulation(&pixels, columns);
             assert_eq!(picture.rgba.len(), 4 * picture.width * picture.height);
             let enlarged = picture.width / columns;
             let band = picture.height - rows * enlarged;
