@@ -101,9 +101,11 @@ fn main() {
     for (name, planted) in KINDS {
         let of = |seed| measured(&shape, &nominal, planted, limits, seed);
         let all: Vec<PartResult> = (first..first + worlds).into_par_iter().map(of).collect();
-        let share =
-            |of: &dyn Fn(&PartResult) -> bool| all.iter().filter(|seen| of(seen)).count() as f64 * 100.0 / worlds as f64;
-        let mean = |of: &dyn Fn(&PartResult) -> usize| all.iter().map(|seen| of(seen) as f64).sum::<f64>() / worlds as f64;
+        let share = |of: &dyn Fn(&PartResult) -> bool| {
+            all.iter().filter(|seen| of(seen)).count() as f64 * 100.0 / worlds as f64
+        };
+        let mean =
+            |of: &dyn Fn(&PartResult) -> usize| all.iter().map(|seen| of(seen) as f64).sum::<f64>() / worlds as f64;
         let (hit, found) = (share(&|seen| seen.hit > 0), share(&|seen| seen.found));
         let both = share(&|seen| seen.found && seen.hit > 0);
         println!(

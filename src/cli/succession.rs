@@ -145,7 +145,8 @@ struct Proof {
 /// successor names.
 pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
     let mut proof = Proof::default();
-    let mut all: Vec<(Option<RunPlace>, PathBuf)> = folders(runs).map(|folder| (RunPlace::read(&folder), folder)).collect();
+    let mut all: Vec<(Option<RunPlace>, PathBuf)> =
+        folders(runs).map(|folder| (RunPlace::read(&folder), folder)).collect();
     all.sort_by_key(|(place, folder)| (place.as_ref().map_or(0, |place| place.number), folder.clone()));
     let mut last: Option<(u64, &Path)> = None;
     for (place, folder) in &all {

@@ -13,8 +13,8 @@
 mod alarms;
 mod assets;
 mod chart;
-mod guarded_server;
 mod guard;
+mod guarded_server;
 mod history;
 mod live;
 mod orders;
@@ -34,8 +34,8 @@ use axum::Router;
 use axum::routing::{get, post};
 use tokio::net::TcpListener;
 
-pub use guarded_server::GuardedServer;
 pub use guard::{Entrance, Session};
+pub use guarded_server::GuardedServer;
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
 pub use view::{PageSubject, plant_document};

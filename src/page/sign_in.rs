@@ -18,7 +18,7 @@ use tokio::task::spawn_blocking;
 
 use super::guard::{Guard, Peer, Rate, Session, foreign, foreign_origin, printable, random_word};
 use super::texts::Text;
-use super::users::{Person, AuthenticatedUser, UsersFile};
+use super::users::{AuthenticatedUser, Person, UsersFile};
 use super::view;
 
 /// Duration of a session: a shift and its handover.

@@ -24,7 +24,7 @@ pub use link::Link;
 pub use page::PlantPage;
 pub use recipes::{Approval, PlantRecipe};
 pub use replication::{ReplicationResult, Replicator, run_overview};
-pub use schema::{PlantRole, enrol, enrol_cell, check_layout, migrate, retire_cell};
+pub use schema::{PlantRole, check_layout, enrol, enrol_cell, migrate, retire_cell};
 pub use settings::{Approver, ArtefactSettings, DatabaseSettings};
 pub use studies::{Job, Study};
 pub use tokio_postgres::Row;

@@ -290,7 +290,12 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
 
 /// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
 /// the state.
-async fn send_records(link: &Link, run: &str, there: PlantRunState, batch: &[Record]) -> Result<PlantRunState, PlantError> {
+async fn send_records(
+    link: &Link,
+    run: &str,
+    there: PlantRunState,
+    batch: &[Record],
+) -> Result<PlantRunState, PlantError> {
     let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
     let texts: Vec<String> = batch.iter().map(Record::text).collect();
     let from = there.records + 1;

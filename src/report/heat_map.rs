@@ -11,8 +11,8 @@ use regrind_formats::write_atomic;
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};
-use super::simulation_mark::mark_simulation;
 use super::raster::Raster;
+use super::simulation_mark::mark_simulation;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
 

@@ -5,7 +5,7 @@
 //! root mean square along the normal. Its surface profile is a different figure (twice the largest deviation). Units:
 //! millimetres. `combinedUncertainty` is the standard uncertainty, half of the expanded uncertainty that reports show.
 
-use super::results::{Figure, Measured, Results, LimitStatus};
+use super::results::{Figure, LimitStatus, Measured, Results};
 use super::xml::Xml;
 
 /// Identifiers within the document. Those of figures and measurements continue from the last one.

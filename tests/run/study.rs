@@ -2,12 +2,12 @@
 //! with the truth.
 #![allow(dead_code, reason = "not every program that includes this uses all of it")]
 
+#[path = "identifiability.rs"]
+pub mod identifiability;
 #[path = "made_part.rs"]
 pub mod made_part;
 #[path = "transfer.rs"]
 pub mod transfer;
-#[path = "identifiability.rs"]
-pub mod identifiability;
 
 use std::path::Path;
 

@@ -292,7 +292,8 @@ async fn go(setup: Setup) -> Ran {
     let tolerance_mm = [plan.tolerance.pv_mm, plan.tolerance.rms_mm];
     let world = world(&setup, &recipe);
     let radius_mm = recipe.measure.probe_radius_mm;
-    let eye = Arc::new(WorldRecorder { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
+    let eye =
+        Arc::new(WorldRecorder { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
     let (servings, [of_cmm, of_grinder]) = serve(&setup, &cell, &eye).await;
     let journal: Box<dyn JournalSink> = Box::new(Journal::create(&folder, header("test part")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();

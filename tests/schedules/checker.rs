@@ -126,7 +126,13 @@ impl Evidence {
     }
 
     /// Returns the records of an event of a machine between two moments.
-    fn events_between(&self, event: &str, machine: usize, from: Instant, to: Instant) -> impl Iterator<Item = &Recorded> {
+    fn events_between(
+        &self,
+        event: &str,
+        machine: usize,
+        from: Instant,
+        to: Instant,
+    ) -> impl Iterator<Item = &Recorded> {
         let of_it = move |w: &&Recorded| w.payload["event"] == event && w.payload["device"] == NAMES[machine];
         self.written.iter().filter(move |w| from <= w.at && w.at <= to).filter(of_it)
     }
@@ -430,7 +436,8 @@ fn moved_by_nothing_that_stands(evidence: &Evidence) -> Result<(), String> {
 /// Checks that the cell, if it holds, sends HOLD to a job that was out of sight and is found running.
 fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
     for (k, name) in NAMES.iter().enumerate() {
-        let found = evidence.events_between("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
+        let found =
+            evidence.events_between("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
         for found in found.filter(|found| found.payload["outcome"] == "running") {
             let by = found.at + HOLDS_WITHIN;
             let holds = |shown: &Shown| shown.state == Some(StateName::Holding);

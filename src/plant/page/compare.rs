@@ -13,7 +13,7 @@ use super::super::link::Link;
 use super::rank::{ENOUGH, holm, rank_sum};
 use super::selection::{Selection, SelectionQuery, mark};
 use super::words::{encoded, interval, share, shown, um};
-use super::{PageContent, Shared, PageError, page};
+use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of cells compared at once, and of parts of each cell (the newest).
 const CELLS: usize = 40;

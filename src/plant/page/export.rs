@@ -13,7 +13,7 @@ use super::control_chart::Value;
 use super::run::file;
 use super::selection::{Selection, SelectionQuery};
 use super::trend::parts;
-use super::{PlantPage, Shared, PageError, unmade, within};
+use super::{PageError, PlantPage, Shared, unmade, within};
 
 /// Maximum number of parts in a file.
 const MAX_PARTS: i64 = 20_000;

@@ -14,7 +14,7 @@ use super::super::link::Link;
 use super::bars::{Count, Day, bars};
 use super::selection::{is_simulated, mark, today};
 use super::words::{encoded, interval, share, shown};
-use super::{PageContent, Shared, PageError, cells, page};
+use super::{PageContent, PageError, Shared, cells, page};
 
 /// Number of days over which parts are counted.
 const DAYS: i64 = 14;

@@ -15,7 +15,7 @@ use super::super::copy::content;
 use super::super::link::Link;
 use super::selection::mark;
 use super::words::{shown, um};
-use super::{PageContent, Shared, PageError, page};
+use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of maps on the page.
 const MAX_MAPS: usize = 4;
@@ -129,7 +129,12 @@ async fn without(link: &Link, asked: MapRequest) -> Result<Map, PageError> {
 }
 
 /// Reads a map from the files of a run; in words, why there is none.
-async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {
+async fn samples(
+    plant: &Shared,
+    link: &Link,
+    run: i32,
+    name: &str,
+) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {
     let rows = link.query("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
     let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
     let sha256: Vec<u8> = row.get(0);

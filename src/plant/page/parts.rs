@@ -11,7 +11,7 @@ use super::super::error::PlantError;
 use super::super::link::Link;
 use super::super::{Row, ToSql};
 use super::words::{encoded, shown, um};
-use super::{PageContent, Shared, PageError, page};
+use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of parts on a page.
 const MAX_ROWS: usize = 100;

@@ -19,7 +19,7 @@ use super::super::link::Link;
 use super::proof::{Proof, proven};
 use super::selection::mark;
 use super::words::{encoded, shown, um};
-use super::{PageContent, PlantPage, Shared, PageError, page, unmade};
+use super::{PageContent, PageError, PlantPage, Shared, page, unmade};
 
 /// Time that the page waits for the proof before it is shown without it, and seconds until the browser then retries.
 const WAITS: Duration = Duration::from_secs(3);
@@ -41,7 +41,8 @@ impl Run {
     async fn read(link: &Link, id: i32) -> Result<Self, PageError> {
         let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
         let mut rows = link.query(&text, &[&id]).await?;
-        let row = rows.pop().ok_or_else(|| PageError::NotHere(format!("the plant has no run {id} that made a part")))?;
+        let row =
+            rows.pop().ok_or_else(|| PageError::NotHere(format!("the plant has no run {id} that made a part")))?;
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
 

@@ -11,7 +11,7 @@ use super::super::link::Link;
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
 use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
 use super::words::{shown, um};
-use super::{PageContent, Shared, PageError, page};
+use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of parts in a chart, and of parts in the list of those out of limits.
 const MAX_PARTS: i64 = 250;

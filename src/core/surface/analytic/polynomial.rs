@@ -33,7 +33,7 @@ pub struct XyPolynomialDefinition {
     pub base: Option<ConicDefinition>,
 }
 
-/// What a list of terms looks like: powers up to [`MAX_POWER`].
+/// Returns the schema of a list of terms: powers up to [`MAX_POWER`].
 #[cfg(feature = "schema")]
 fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
     let power = schemars::json_schema!({ "type": "integer", "minimum": 0, "maximum": MAX_POWER });
