@@ -324,7 +324,8 @@ pub fn record(bytes: &[u8]) -> bool {
     true
 }
 
-/// What is told and asked in the cell, as it stands in the record; one in a line.
+/// Reads each line as an event, a command, a judgement or an ending of the cell, in the form of the record.
+/// Returns true if at least one line is valid.
 pub fn event(bytes: &[u8]) -> bool {
     let mut read = 0;
     for line in bytes.split(|&b| b == b'\n') {
@@ -339,7 +340,8 @@ pub fn order(bytes: &[u8]) -> bool {
     comes_back::<Request>(bytes) | comes_back::<Reply>(bytes)
 }
 
-/// What can be read is written as what is read as the same.
+/// Returns true if the bytes are a valid `T`.
+/// Asserts that the value does not change when it is written and read again.
 fn comes_back<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> bool {
     let Ok(found) = serde_json::from_slice::<T>(bytes) else { return false };
     let text = serde_json::to_string(&found).expect("what was read can be written");
@@ -348,7 +350,8 @@ fn comes_back<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> bool {
     true
 }
 
-/// What a run leaves to the next part.
+/// Reads the file of learned errors that a run leaves to the next part.
+/// Asserts that its first correction is finite.
 pub fn learned(bytes: &[u8]) -> bool {
     let Ok(learned) = Learned::from_saved(Path::new("learned.json"), bytes) else { return false };
     assert!(learned.correction.grid.is_valid());
@@ -360,7 +363,7 @@ pub fn learned(bytes: &[u8]) -> bool {
 
 // ---- wires --------------------------------------------------------------------------------------------------------------------------
 
-/// What the simulated machines are sent and send; the first byte says which.
+/// Decodes a payload that a simulated machine receives or sends. The first byte selects the kind of payload.
 pub fn payload(bytes: &[u8]) -> bool {
     let Some((kind, bytes)) = bytes.split_first() else { return false };
     match kind % 6 {

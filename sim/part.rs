@@ -40,7 +40,7 @@ const MARGIN_NODES: usize = 2;
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PartSpec {
-    /// What it should be.
+    /// Nominal shape of the part.
     pub shape: ShapeSpec,
     /// Where it is.
     pub aperture: Aperture,
@@ -144,7 +144,7 @@ pub enum ShapeSpec {
     },
     /// [`XyPolynomial`].
     XyPolynomial {
-        /// What x and y are divided by.
+        /// Divisor of x and y.
         normalisation_radius_mm: f64,
         /// The terms.
         coefficients: Vec<Coefficient>,
@@ -159,7 +159,7 @@ pub struct Coefficient {
     pub i: u32,
     /// Power of y.
     pub j: u32,
-    /// What it is multiplied by.
+    /// Coefficient of the term.
     pub value_mm: f64,
 }
 

@@ -46,7 +46,7 @@ struct CheckedFile {
     kind: &'static str,
     good: bool,
     sha256: Option<String>,
-    /// What is so on this computer and makes the file no worse: a serial port that is not here.
+    /// Notes that do not make the file invalid, for example a serial port that this computer does not have.
     notes: Vec<String>,
     problems: Vec<ProblemDocument>,
 }

@@ -60,30 +60,30 @@ struct Document {
     removal_budget_um: f64,
     tracks: u64,
     track_mm: f64,
-    /// What the tracks leave between them; absent where no path can be laid.
+    /// Scallops between the tracks; absent if no path can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     scallops: Option<ScallopsDocument>,
     path_mm: f64,
     grinding_minutes: f64,
-    /// What one pass takes off, reckoned as depth of cut times the ground that its tracks cover.
+    /// Volume that one pass removes: depth of cut times the area that its tracks cover.
     removed_mm3_a_pass: f64,
-    /// What the wheel loses by that; absent where the recipe gives no grinding ratio.
+    /// Volume that the wheel loses in one pass; absent if the recipe gives no grinding ratio.
     #[serde(skip_serializing_if = "Option::is_none")]
     wheel_loss_mm3_a_pass: Option<f64>,
     /// The passes that the recipe allows, and the measurements beside them.
     most_passes: u32,
     most_measurements: u32,
-    /// What the search moves of one measurement take by themselves; absent where the operator takes the points.
+    /// Minimum duration of one measurement, from its search moves alone; absent if the operator takes the points.
     #[serde(skip_serializing_if = "Option::is_none")]
     least_measuring_minutes: Option<f64>,
     /// All passes and what is known of all measurements.
     least_hours_to_last: f64,
-    /// What a person should know before this is run.
+    /// Warnings to read before the run.
     warnings: Vec<String>,
-    /// Of the program of one pass; absent where none can be made.
+    /// Number of points in the program of one pass; absent if no program can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     program_points: Option<u64>,
-    /// What becomes of these points in arcs; absent where the cell asks for none.
+    /// Arcs of the program of one pass; absent if the cell does not require arcs.
     #[serde(skip_serializing_if = "Option::is_none")]
     arcs: Option<ArcsDocument>,
     /// The dialect that it is written in.

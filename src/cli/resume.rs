@@ -119,7 +119,7 @@ fn is_bare(run: &Path) -> bool {
     names.all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
 }
 
-/// What the first record of a run tells of how to go on with it.
+/// Content of the first record of a run that is required to resume the run.
 #[derive(Deserialize)]
 struct RunStart {
     recipe: PathBuf,

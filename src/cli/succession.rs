@@ -33,7 +33,7 @@ pub(super) struct RunPlace {
     before: Option<Before>,
 }
 
-/// What is known of a run when the next one begins.
+/// State of a run at the time when the next run begins.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Before {
     run: String,

@@ -38,7 +38,7 @@ struct DeliveredResult {
     learned: Learned,
 }
 
-/// What of a file says for whom it is.
+/// Part of a result file that names the kind of parts to which the result applies.
 #[derive(Deserialize)]
 struct Head {
     kind: Option<String>,

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use regrind_sim::command::interlock;
 
-/// What the handshake asked of the physics, in order, but for the time that passed.
+/// Calls of the handshake to the physics, in order, without those that only advance the time.
 pub type RecordedCalls = Arc<Mutex<Vec<String>>>;
 
 /// A job is a number of seconds; a payload whose first byte is 0xEE is of another part.

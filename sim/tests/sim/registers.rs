@@ -74,7 +74,7 @@ impl Desk {
         self.get_payloads();
     }
 
-    /// What a client that wants jobs done would command now.
+    /// Returns the command that a client with jobs to run would send in the present state.
     fn sensible(&mut self) -> Command {
         match self.machine.state() {
             _ if self.status().owner == 0 => Command::Claim,
@@ -393,7 +393,8 @@ fn check_outbox(desk: &mut Desk, start: u32) {
     assert_eq!((desk.u32(&page, 0), page[2]), (99, 0), "a page beyond the last has no data");
 }
 
-/// What each command is answered in each state, and where it leads at once; rows are the states in order.
+/// Checks the answer to each command in each state, and the state immediately after it.
+/// Each row is a command with its allowed transitions.
 #[test]
 fn commands_answer_by_state_table() {
     use Command::*;

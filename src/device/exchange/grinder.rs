@@ -55,7 +55,7 @@ struct Confirmation {
     map: String,
     job: Option<u32>,
     cycle: Option<u16>,
-    /// Who says so.
+    /// Name of the operator who confirms.
     operator: Option<String>,
     wheel_radius_mm: Option<f64>,
     temperature_c: Option<f64>,

@@ -40,17 +40,17 @@ const ENDINGS: [(HandOverStatus, &str); 5] = [
     (HandOverStatus::Closed, ".done"),
 ];
 
-/// What a hand-over says of itself.
+/// Content of the header file of a hand-over.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct HandOverHeader {
-    /// Of this file's layout: 1.
+    /// Version of the layout of this file: 1.
     pub format: u16,
     pub part: String,
     pub job: u32,
     pub cycle: u16,
     pub digest: u32,
     pub start_number: u32,
-    /// Of the plan, or of the map, 64 hexadecimal digits.
+    /// Identity of the plan or of the map, 64 hexadecimal digits.
     pub identity: String,
     /// Radius of the probe, or of the wheel.
     pub tool_radius_mm: f64,
@@ -97,7 +97,7 @@ fn nanoseconds(at: SystemTime) -> u128 {
     at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
 }
 
-/// What was accepted as the answer to a hand-over.
+/// Files that were accepted as the answer to a hand-over.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct AcceptedFiles {
     pub job: u32,

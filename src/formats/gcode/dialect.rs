@@ -339,11 +339,11 @@ impl Default for Frame {
 pub struct Fault {
     /// The key as a path.
     pub key: String,
-    /// What was found.
+    /// Value found.
     pub found: String,
-    /// What is allowed.
+    /// Allowed values.
     pub allowed: &'static str,
-    /// What to do.
+    /// Remedy.
     pub remedy: &'static str,
 }
 

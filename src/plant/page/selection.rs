@@ -25,7 +25,7 @@ const DAYS: i64 = 90;
 /// Maximum number of names in a form.
 const NAMES: i64 = 5000;
 
-/// What an address says; what it does not say is chosen.
+/// Query of an address. A missing parameter receives its default.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct SelectionQuery {

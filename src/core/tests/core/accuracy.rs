@@ -1,4 +1,4 @@
-//! What is predicted of the distance from the nominal points alone, against what it is.
+//! Predicted error of the distance, estimated from the nominal points alone, compared with the true error.
 
 use crate::common::points;
 use regrind_core::geometry::Point;
@@ -10,7 +10,7 @@ fn free_form(columns: usize, rows: usize) -> Vec<Point> {
     points(&FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows))
 }
 
-/// Points of a deterministic scatter: a grid with every node moved by up to 0.4 of a spacing.
+/// Returns points of a deterministic scatter: the nodes of a grid, each moved by up to 0.4 of a spacing.
 fn scattered(columns: usize, rows: usize) -> Vec<Point> {
     let shape = FreeForm::default();
     let at =
@@ -25,7 +25,7 @@ fn scattered(columns: usize, rows: usize) -> Vec<Point> {
         .collect()
 }
 
-/// PV and rms of the true error in nanometres, at exact probe centres well inside the part.
+/// Returns PV and RMS of the true error in nanometres, at exact probe centres well inside the part.
 fn true_error_nm(points: Vec<Point>, distance: DistanceModel, step_mm: f64) -> [f64; 2] {
     let shape = FreeForm::default();
     let nominal = Nominal::from_points(points, PlaneProjection::Auto).unwrap();

@@ -1,4 +1,4 @@
-//! What the tests share: clouds from the simulated truth, and how far a pose is from it.
+//! Shared functions of the tests: point clouds from the simulated truth, and the error of a pose.
 
 use rand::RngExt;
 use rand::rngs::StdRng;
@@ -12,12 +12,12 @@ use regrind_sim::shape::{FreeForm, Shape};
 /// Radius of the probe in millimetres.
 pub const RADIUS_MM: f64 = 1.5;
 
-/// Points of the library from those of the simulator.
+/// Converts points of the simulator to points of the library.
 pub fn points(from: &[Vec3]) -> Vec<Point> {
     from.iter().copied().map(Point::from).collect()
 }
 
-/// The pose of the library for a placement of the simulator.
+/// Converts a placement of the simulator to a pose of the library.
 pub fn pose(placement: &Placement) -> Pose {
     let [r, t] = [&placement.rotation, &[placement.translation_mm; 3]];
     Pose::from_rows([
@@ -29,13 +29,14 @@ pub fn pose(placement: &Placement) -> Pose {
     .unwrap()
 }
 
-/// The free form as a gridded nominal surface.
+/// Returns the free form as a gridded nominal surface.
 pub fn free_form(columns: usize, rows: usize) -> Nominal {
     let grid = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
     Nominal::from_points(points(&grid), PlaneProjection::Auto).unwrap()
 }
 
-/// Probe centres over a rectangle of a shape, in the model frame: columns x rows, given by its two corners.
+/// Returns probe centres over a rectangle of a shape, in the model frame: columns x rows.
+/// Two corners give the rectangle.
 pub fn centres(
     shape: &dyn Shape,
     form: &FormError,
@@ -49,7 +50,7 @@ pub fn centres(
         .collect()
 }
 
-/// A number of the standard normal distribution.
+/// Draws a number from the standard normal distribution.
 pub fn normal(rng: &mut StdRng) -> f64 {
     let (u, v): (f64, f64) = (rng.random(), rng.random());
     (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
@@ -60,7 +61,7 @@ pub fn placed(placement: &Placement, centres: &[Vec3]) -> Vec<Vec3> {
     centres.iter().map(|c| placement.apply(*c)).collect()
 }
 
-/// How far a pose carries the corners of the free form from where the truth has them: the largest distance in millimetres.
+/// Returns the pose error: the largest distance, in mm, between a corner of the free form by `found` and by `truth`.
 pub fn pose_error_mm(found: &Pose, truth: &Pose) -> f64 {
     [[-50.0, -30.0], [50.0, -30.0], [-50.0, 30.0], [50.0, 30.0]]
         .iter()

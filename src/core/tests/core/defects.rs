@@ -1,4 +1,5 @@
-//! What is wrong with a part is in its figures, however high and however small; what is wrong with one touch is left out and named.
+//! Tests of defects. The figures include a defect of the part, whatever its height.
+//! A single faulty point is rejected as an outlier and reported.
 
 use std::f64::consts::TAU;
 use std::sync::OnceLock;
@@ -26,7 +27,8 @@ fn nominal() -> &'static Nominal {
     })
 }
 
-/// A pattern of touches on a part that is good to a tenth of a micrometre but for what is planted: heights above the surface, by place.
+/// Returns the measured points of a part with planted heights above the surface, given by place.
+/// Without the planted heights, the form error of the part is a tenth of a micrometre.
 fn touched([columns, rows]: [usize; 2], noise_mm: f64, planted_mm: impl Fn(f64, f64) -> f64) -> Vec<Point> {
     let shape = FreeForm::default();
     let form = FormError::new(7, 30.0, 1e-4, 102.0, 62.0);
@@ -50,7 +52,7 @@ fn left_out(found: &Registration) -> Vec<usize> {
     (0..found.deviations.len()).filter(|&k| found.deviations[k].status == PointStatus::Outlier).collect()
 }
 
-/// A height within a rectangle about a place.
+/// Returns a function of the place: a constant height inside a rectangle, and zero outside.
 fn within(middle: [f64; 2], size: [f64; 2], height_mm: f64) -> impl Fn(f64, f64) -> f64 {
     move |x, y| {
         let inside = (x - middle[0]).abs() <= 0.5 * size[0] && (y - middle[1]).abs() <= 0.5 * size[1];
@@ -65,7 +67,7 @@ fn bump(middle: [f64; 2], width_mm: f64, height_mm: f64) -> impl Fn(f64, f64) ->
     }
 }
 
-/// Every touch of a defect counts, and the peak to valley is the defect's.
+/// Asserts that every point of a defect is an inlier, and that PV is the height of the defect.
 fn counts_whole(name: &str, height_mm: f64, planted: &dyn Fn(f64, f64) -> f64) {
     let found = registered(&touched(COUNTS, NOISE_MM, planted));
     let pv_mm = found.quality.pv_mm;
@@ -88,7 +90,8 @@ fn figures_include_two_point_defects() {
     }
 }
 
-/// With a measurement that has no noise, six times the scatter is nothing: the flanks of a bump are beyond it too.
+/// Checks a bump in a measurement without noise. The outlier limit of six noise sigmas is then almost zero.
+/// The flanks of the bump exceed this limit too.
 #[test]
 fn bump_on_clean_map_is_inlier() {
     let found = registered(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
@@ -108,7 +111,8 @@ fn lone_deviation_is_outlier() {
     }
 }
 
-/// A touch that was made twice at one place repeats its mistake.
+/// Checks a faulty point that was measured twice at one place.
+/// The second point repeats the fault and confirms nothing.
 #[test]
 fn repeated_point_is_no_neighbour() {
     let mut measured = touched(COUNTS, NOISE_MM, within([0.847, 1.034], [0.5, 0.5], 0.05));
@@ -125,7 +129,8 @@ fn opposite_neighbours_are_outliers() {
     assert_eq!(left_out(&found).len(), 2);
 }
 
-/// The form has what was touched: no defect that the deviations show is smoothed away as scatter.
+/// Checks that the form includes every defect that the deviations show.
+/// The model must not smooth a defect away as noise.
 #[test]
 fn form_height_matches_deviations() {
     // Neighbours are 2.9 mm apart along x and 3.5 mm along y: two touches, six, and a dozen.
@@ -155,7 +160,7 @@ fn form_height_matches_deviations() {
     }
 }
 
-/// RMS and PV of what is planted, after its own best fit: of the same touches without scatter.
+/// Returns RMS and PV of the planted heights after their own best fit, from the same points without noise.
 fn true_figures_mm(counts: [usize; 2], planted_mm: impl Fn(f64, f64) -> f64) -> [f64; 2] {
     let exact = registered(&touched(counts, 0.0, planted_mm)).deviations;
     let heights = DVector::from_iterator(exact.len(), exact.iter().map(|d| d.deviation_mm));

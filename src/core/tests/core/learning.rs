@@ -1,4 +1,5 @@
-//! What is learned of a grinder over many drawn worlds: what comes back is found down to the scatter of the mean, and the scatter is told.
+//! Learning of the repeatable error of a grinder over many simulated worlds.
+//! The remaining error falls to the noise of the mean, and the state estimates the noise.
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -10,7 +11,7 @@ const NOISE_MM: f64 = 1e-3;
 const SEED: u64 = 20_260;
 const WORLDS: u64 = 40;
 
-/// Waves of 6 to 40 mm in all directions with phases drawn.
+/// Returns a sum of waves of 6 to 40 mm with random directions and phases.
 fn random_waves(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
     let waves: Vec<[f64; 3]> = (0..40)
         .map(|_| {

@@ -1,4 +1,5 @@
-//! What a registration does not know it says, or refuses with the place: edges, gaps, sides, held poses, points that cannot be.
+//! Limits of a registration: edges, gaps, sides, locked poses and invalid points.
+//! The registration reports each limit, or returns an error with the place.
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose, pose_error_mm};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -16,7 +17,7 @@ fn placement() -> Placement {
     Placement::new([12.0, -8.0, 5.0], [4.0, -3.0, 20.0])
 }
 
-/// Probe centres over a rectangle of the free form, in the model frame.
+/// Returns probe centres over a rectangle of the free form, in the model frame.
 fn model_centres(corners: [[f64; 2]; 2], counts: [usize; 2], noise_mm: f64) -> Vec<[f64; 3]> {
     let form = FormError::new(7, 30.0, 5e-4, 102.0, 62.0);
     let mut all = centres(&FreeForm::default(), &form, corners, counts);
@@ -38,7 +39,7 @@ fn has_warning(found: &Registration, word: &str) -> bool {
     found.quality.warnings.iter().any(|warning| warning.contains(word))
 }
 
-/// A free form that reaches so far along x from one end.
+/// Returns the part of the free form from its end at negative x to `to_x_mm`.
 fn part_of_the_free_form(to_x_mm: f64) -> Nominal {
     let columns = ((to_x_mm + 51.0) / 0.5).round() as usize + 1;
     let shape = FreeForm::default();
@@ -89,7 +90,7 @@ fn points_beyond_edge_have_no_effect() {
     }
 }
 
-/// Scattered nominal points over the free form, so many a square millimetre by place.
+/// Returns scattered nominal points over the free form. Their spacing is a function of x.
 fn scattered(step_mm: impl Fn(f64) -> f64, noise_mm: f64) -> Vec<Point> {
     let (mut rng, shape) = (StdRng::seed_from_u64(5), FreeForm::default());
     let mut all = Vec::new();

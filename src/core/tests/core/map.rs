@@ -1,4 +1,4 @@
-//! The error map against what a filter must do: sines, planes, edges, holes, outliers, and scatter that is drawn again and again.
+//! Tests of the error map against filter theory: sines, planes, edges, holes, outliers and noise over many draws.
 
 use std::f64::consts::{PI, TAU};
 
@@ -10,7 +10,7 @@ use regrind_core::compensation::{
 };
 use regrind_core::geometry::{DeviationSample, Grid, GridError};
 
-/// Readings at the nodes of a grid about the origin, of a function of the place.
+/// Returns readings of a function of the place, at the nodes of a grid about the origin.
 fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     let at = |k: usize, n: usize, step: f64| (k as f64 - 0.5 * (n - 1) as f64) * step;
     let place = |k: usize| [at(k % columns, columns, step_mm[0]), at(k / columns, rows, step_mm[1])];
@@ -18,12 +18,12 @@ fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) 
     (0..columns * rows).map(place).map(reading).collect()
 }
 
-/// The measurement of the trials: 60 x 30 points over 102 x 62 mm.
+/// Returns the measurement of the trials: 60 x 30 points over 102 x 62 mm.
 fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     sampled(60, 30, [102.0 / 59.0, 62.0 / 29.0], f)
 }
 
-/// Readings strewn evenly over a rectangle about the origin.
+/// Returns readings at random places, evenly distributed over a rectangle about the origin.
 fn scattered(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
@@ -52,7 +52,7 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
     (sum / f64::max(count, 1.0)).sqrt()
 }
 
-/// Share of a wave that a map let pass, by least squares over valid nodes far enough from edges and holes.
+/// Returns the share of a wave that a map transmits, by least squares over valid nodes far from edges and holes.
 fn transmission(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
     let nodes = (0..map.grid.len()).filter(|&k| map.valid[k] && counts(map.grid.place_mm(k)));
     let (top, bottom) = nodes.fold((0.0, 0.0), |(top, bottom), k| {
@@ -63,7 +63,7 @@ fn transmission(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn(
     top / bottom
 }
 
-/// The direct sum over all readings at every node, as the filter is defined: first order.
+/// Returns the first-order filter by its definition: the direct sum over all readings, at every node.
 fn direct(readings: &[DeviationSample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
     let width2 = (2f64.ln() / PI) * cutoff_mm * cutoff_mm;
     (0..grid.len())
@@ -123,7 +123,7 @@ fn scattered_filter_half_at_cutoff() {
     }
 }
 
-/// Spreading readings over nodes changes what the definition gives by less than a thousandth of what is filtered.
+/// Checks that the separable filter differs from its definition by less than a thousandth of the filtered values.
 #[test]
 fn separable_filter_matches_definition() {
     for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
@@ -194,12 +194,13 @@ fn noise_alone_gives_no_outliers() {
     assert!(lost <= 9, "{lost} of 90,000 points");
 }
 
-/// A form of the size and wavelengths of what grinding leaves.
+/// Returns a form with the size and the wavelengths of the error after grinding.
 fn form(x: f64, y: f64) -> f64 {
     2e-3 * ((0.11 * x + 0.05 * y).sin() + (0.14 * y - 0.06 * x + 1.0).cos() + 2e-4 * x * y)
 }
 
-/// Puts a spike of 20 standard deviations on one point in a hundred, none beside another; returns which.
+/// Adds a spike of `height_mm` to about one point in a hundred. No two spikes are neighbours.
+/// Returns their indices.
 fn spiked(readings: &mut [DeviationSample], height_mm: f64, seed: u64) -> Vec<usize> {
     const APART_MM: f64 = 4.0;
     let mut rng = StdRng::seed_from_u64(seed);
@@ -252,7 +253,9 @@ fn robust_filter_ignores_spikes() {
     assert!(plain_form > 10.0 * robust_form, "{plain_form} {robust_form}");
 }
 
-/// What counts crests less that stand out of the filtered surface lets less of them pass: that is of the rule, and not of the arithmetic.
+/// Checks that the robust filter attenuates a lone wave more than the plain filter.
+/// It gives less weight to crests that protrude from the filtered surface.
+/// The cause is this rule, not a numerical error.
 #[test]
 fn robust_filter_attenuates_lone_wave() {
     const CUTOFF_MM: f64 = 10.0;
@@ -334,7 +337,9 @@ fn top_of_low_bump_is_inlier() {
     }
 }
 
-/// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
+/// Compares the observed noise of the map over many draws with its stated sigma.
+/// Returns the RMS of their ratio at valid nodes, the share of nodes with a ratio outside 0.8 to 1.2, and the
+/// ratio of the stated to the true noise of a point.
 fn observed_over_stated_sigma(
     readings: &[DeviationSample],
     options: &MapOptions,

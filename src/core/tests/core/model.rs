@@ -1,4 +1,6 @@
-//! What the model says of registered parts, held against what was planted: form, figures, and the place of the nominal frame.
+//! Tests of the model on registered parts with a planted form.
+//! The intervals of the form, of the figures and of the
+//! pose of the nominal frame must cover the true values.
 
 use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
 use rand::SeedableRng;
@@ -18,12 +20,12 @@ use regrind_sim::shape::{FreeForm, Shape};
 
 const NOISE_MM: f64 = 3e-4;
 
-/// Parts drawn by each test of intervals.
+/// Returns the number of parts that each test of intervals draws.
 fn parts() -> u64 {
     seeds(8)
 }
 
-/// As many parts as intervals of 95 % may miss by chance where they may miss so many of sixteen.
+/// Returns the number of parts whose intervals of 95 % may miss by chance, scaled from the number for sixteen parts.
 fn allowed_misses(of_sixteen: u64) -> u64 {
     parts() * of_sixteen / 16
 }
@@ -35,12 +37,12 @@ struct Part {
     model: Form,
 }
 
-/// A part with a form of some rms and a length of 30 mm, somewhere near, registered from where it is about.
+/// Returns a part with a form of this RMS and a length of 30 mm, registered from a start at its true pose.
 fn part(seed: u64, rms_mm: f64) -> Part {
     drifting(seed, rms_mm, 0.0)
 }
 
-/// The same with a probe of whose scatter the next point along the path has so much.
+/// Returns the same part, measured with probe noise whose autocorrelation along the path is `drift`.
 fn drifting(seed: u64, rms_mm: f64, drift: f64) -> Part {
     let mut rng = StdRng::seed_from_u64(seed);
     let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, rms_mm);
@@ -59,12 +61,13 @@ fn drifting(seed: u64, rms_mm: f64, drift: f64) -> Part {
 }
 
 impl Part {
-    /// The true form at the points, after its own best fit.
+    /// Returns the true form at the points, after its own best fit.
     fn form(&self) -> Vec<f64> {
         after_best_fit(&self.registration, |d| self.form.height(d.point.x, d.point.y))
     }
 
-    /// The square of the error of the pose in units of a covariance, by its degrees of freedom: 1 where the covariance is right.
+    /// Returns the squared error of the pose in units of a covariance, divided by the degrees of freedom.
+    /// The result is 1 if the covariance is correct.
     fn pose_error(&self, covariance: &Matrix6<f64>) -> f64 {
         let twist = (self.truth.inverse() * self.registration.cmm_from_model).log();
         let off = Vector6::from_iterator(twist.iter().copied());
@@ -72,7 +75,7 @@ impl Part {
     }
 }
 
-/// Heights at the points of a registration after their own best fit.
+/// Returns heights at the points of a registration, after their own best fit.
 fn after_best_fit(found: &Registration, height_mm: impl Fn(&Deviation) -> f64) -> Vec<f64> {
     let form = DVector::from_iterator(found.deviations.len(), found.deviations.iter().map(height_mm));
     let motions = DMatrix::from_fn(form.len(), 6, |r, c| {
@@ -125,7 +128,8 @@ fn form_and_frame_intervals_cover_truth() {
     assert!(repeated > 20.0, "{repeated}");
 }
 
-/// A form of polynomials up to the fourth degree, as clamps, weight and figuring leave it, with an RMS of about one in millimetres.
+/// Returns a form of polynomials up to the fourth degree, as clamps, weight and figuring cause it.
+/// Its RMS has the magnitude of `rms_mm`.
 fn bent(seed: u64, rms_mm: f64) -> impl Fn(f64, f64) -> f64 {
     let mut rng = StdRng::seed_from_u64(seed);
     let of: Vec<[f64; 3]> = (2..=4_i32)
@@ -208,7 +212,8 @@ fn form_as_small_as_noise() {
     assert!(raw[0] > 1.3 && raw[1] > 1.5, "{raw:?}");
 }
 
-/// A part that was measured by a machine with errors of its scales and its angles, in units of what is stated of it, and with a wrong radius.
+/// Returns a part that was measured with a wrong radius, by a machine with errors of its scales and angles.
+/// The errors are drawn from the stated uncertainties.
 fn measured_by_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm: f64) -> (FormError, Registration) {
     let mut rng = StdRng::seed_from_u64(seed);
     let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 2e-3);
@@ -255,7 +260,8 @@ fn machine_uncertainty_widens_form() {
     assert!(with >= MACHINES as u32 - 1 && with > without && wider > 1.5, "{with} {without} {wider}");
 }
 
-/// A part that a fixture holds beside its place in x, y and about z, by some standard uncertainties, registered as if it did not.
+/// Returns a part that the fixture holds with an offset in x, y and about z, drawn from the standard uncertainties.
+/// The registration locks these directions and ignores the offset.
 fn held_with_offset(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
     let mut rng = StdRng::seed_from_u64(seed);
     let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 2e-3);
@@ -309,7 +315,9 @@ fn fixture_uncertainty_widens_form() {
     );
 }
 
-/// A part that was corrected by a machine with errors until it looks good on it, as this measures it, and as it is.
+/// Returns two registrations of a part.
+/// A machine with errors corrected the part until its own measurement was good.
+/// The first registration is the measurement of this machine, the second is the true part.
 fn corrected_by_machine(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]) -> (Registration, Registration) {
     let mut rng = StdRng::seed_from_u64(seed);
     let seen = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 1e-3);
@@ -413,7 +421,7 @@ fn figures_of_formless_part_exclude_noise() {
     assert!(!part.model.is_detected && told.rms.low_mm == 0.0 && told.pv.low_mm == 0.0, "{told:?}");
 }
 
-/// What is true of the figures of an area: of the planted form at the points.
+/// Returns the true figures of an area: the figures of the planted form at the points.
 fn area_figures(part: &Part) -> (IsoFormValues, [f64; 2]) {
     let places: Vec<[f64; 2]> = part.registration.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
     let slope = part.model.slope.unwrap();
@@ -422,7 +430,7 @@ fn area_figures(part: &Part) -> (IsoFormValues, [f64; 2]) {
     (IsoFits::new(&places, None).unwrap().evaluate(&part.form()), slopes.evaluate(&part.form()))
 }
 
-/// Whether each figure of an area is held: ISO 10110-5 from the power on, and the slopes.
+/// Returns for each figure of an area whether its interval covers the truth: ISO 10110-5 from the power on, and slopes.
 fn covered_area_figures(part: &Part) -> [bool; 9] {
     let (iso, slopes) = area_figures(part);
     let (told, slope) = (part.model.iso.unwrap(), part.model.slope.unwrap());
@@ -486,7 +494,8 @@ fn few_points_give_no_area_figures() {
     assert!(told.slope.is_none() && told.iso.is_none());
 }
 
-/// A probe that scatters less than the touches do: the rest is form, and between the touches no more than at them.
+/// Checks a probe with less noise than the deviations show. The remainder is form.
+/// Between the points, the form is no larger than at the points.
 #[test]
 fn no_extra_form_between_points() {
     let given = ModelInputs { probe_noise_mm: [0.5 * NOISE_MM, 0.1], ..ModelInputs::default() };
@@ -499,7 +508,8 @@ fn no_extra_form_between_points() {
     }
 }
 
-/// A reference sphere is touched some twenty times and may by chance tell of a probe that scatters a fifth less: that is no form yet.
+/// Checks a probe noise that is one fifth too small by chance, because a sphere has only about twenty points.
+/// This difference is not sufficient evidence of form.
 #[test]
 fn sphere_noise_by_chance_is_not_form() {
     let low_mm = |part: &Part, share: f64| {
@@ -518,7 +528,8 @@ fn sphere_noise_by_chance_is_not_form() {
     assert!(told < 0.09, "{told}");
 }
 
-/// 16 points leave 10 degrees of freedom, which tell no form from scatter: the upper end holds the form of the whole part then.
+/// Checks 16 points with 10 degrees of freedom, which cannot separate form from noise.
+/// The upper bound then covers the form of the whole part.
 #[test]
 fn few_points_upper_bound_covers_form() {
     let (mut held, parts) = (0, parts());

@@ -13,10 +13,11 @@ use regrind_sim::shape::{FreeForm, Shape, Sphere};
 
 const WHEEL_MM: f64 = 12.5;
 const FREE_MOTIONS: [bool; 6] = [false, false, true, true, true, true];
-/// How well it holds: to next to nothing.
+/// Standard uncertainties of the locked directions: almost zero.
 const EXACT: Option<[f64; 2]> = Some([1e-9, 1e-9]);
 
-/// Contacts on a shape, 60 x 40 over 100 x 60 mm, off by a function of the contact and its progress along y.
+/// Returns 60 x 40 contacts on a shape over 100 x 60 mm.
+/// `off` gives the deviation as a function of the contact and of its progress along y.
 fn contacts_on(shape: &dyn Shape, off: impl Fn(&SurfacePoint, f64) -> f64) -> Vec<SurfacePoint> {
     (0..60 * 40)
         .map(|k| {
@@ -45,13 +46,13 @@ fn estimate_of(found: &ParameterEstimation, kind: ParameterKind) -> &EstimatedPa
     found.estimates.iter().find(|p| p.kind == kind).unwrap()
 }
 
-/// What the simulated grinder does with a wheel larger by dr, off by ex and ey.
+/// Returns the deviation that the simulated grinder causes with a radius error `dr` and setting errors `ex` and `ey`.
 fn planted(contact: &SurfacePoint, dr: f64, ex: f64, ey: f64) -> f64 {
     let n = contact.normal;
     -dr * (1.0 / n.z - 1.0) - ex * n.x - ey * n.y
 }
 
-/// A touch of scatter, without which there is no field to be told.
+/// Returns a source of very small noise. Without noise, no field can be estimated.
 fn tiny_noise() -> impl Fn() -> f64 {
     let noise = std::cell::RefCell::new(StdRng::seed_from_u64(1));
     move || 1e-6 * normal(&mut noise.borrow_mut())
@@ -161,7 +162,8 @@ fn setting_limited_by_lock_uncertainty() {
     assert!(told(Some([0.001, 0.0])).is_offered);
 }
 
-/// Two dozen worlds: how far values are off in units of their stated uncertainty, and how often by more than three.
+/// Tests the estimates in 24 worlds. Returns for each parameter the RMS error in units of its stated uncertainty,
+/// the number of errors above three of these units, and the mean stated uncertainty.
 fn coverage(
     free: [bool; 6],
     kinds: &[ParameterKind],
@@ -252,7 +254,7 @@ fn parameters_report_confounding() {
     );
 }
 
-/// Progress along a path that winds to and fro.
+/// Returns the progress along a path that goes back and forth.
 fn winding(contact: &SurfacePoint) -> f64 {
     0.5 + 0.5 * (0.15 * contact.point.x).sin()
 }

@@ -1,4 +1,4 @@
-//! What earlier parts teach, held against planted parts of which few points are touched.
+//! Effect of the priors from earlier parts on simulated parts with few measured points.
 
 use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
@@ -18,7 +18,7 @@ use regrind_sim::shape::{FreeForm, Shape};
 const NOISE_MM: f64 = 3e-4;
 const TOUCHES: usize = 45;
 
-/// A part, its pattern of 22 by 14 targets, and what was touched of it.
+/// Part with a pattern of 22 by 14 targets, and the registration of its measured points.
 struct Part {
     targets: Vec<(Point, Vector)>,
     form: FormError,
@@ -52,7 +52,7 @@ impl Part {
         Form::estimate_at(&self.registration, &inputs_with_prior(lesson), &self.targets).unwrap()
     }
 
-    /// The true form at all targets after its own best fit: RMS and PV.
+    /// Returns RMS and PV of the true form at all targets, after its own best fit.
     fn truth(&self) -> [f64; 2] {
         let rows = DMatrix::from_fn(self.targets.len(), 6, |r, c| {
             let (at, n) = self.targets[r];
@@ -78,7 +78,8 @@ fn parts() -> u64 {
     seeds(5)
 }
 
-/// Of some parts: how many RMS and PV were held, and the mean width of both in the true ones.
+/// Counts the parts whose RMS and PV intervals cover the truth.
+/// Returns both counts, and the mean width of both intervals relative to the true values.
 fn coverage(length_mm: f64, rms_mm: f64, lesson: Option<PartFit>) -> ([u64; 2], [f64; 2]) {
     let (mut held, mut wide) = ([0; 2], [0.0; 2]);
     for seed in 0..parts() {
@@ -103,7 +104,7 @@ fn hyperparameters(range_mm: f64, ratio: f64) -> Hyperparameters {
     Hyperparameters { field: Field::new(2e-3, range_mm), noise_sigma_mm: 2e-3 * ratio, noise_autocorrelation: 0.0 }
 }
 
-/// A field at 50 places of a part of 102 x 62 mm, moved and tilted by what nobody knows.
+/// Simulates a field at 50 places of a part of 102 x 62 mm. The offset and the tilt are unknown to the model.
 fn simulated(hyperparameters: &Hyperparameters, seed: u64) -> Observations {
     let places: Vec<[f64; 2]> = (0..50)
         .map(|k| f64::from(k) + 0.5)

@@ -1,4 +1,5 @@
-//! What is said of a fit that was found, and of one that was not: each false cloud with its cause, each good one in silence.
+//! Plausibility messages of registrations and of failed registrations.
+//! Each implausible point cloud has a message with its cause. A good point cloud has no message.
 
 use std::sync::OnceLock;
 
@@ -10,7 +11,7 @@ use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{Shape, XyPolynomial};
 
-/// The free-form mirror that ships as a recipe.
+/// Returns the free-form mirror that is supplied as a recipe.
 fn mirror() -> XyPolynomial {
     #[rustfmt::skip]
     let terms = vec![
@@ -27,7 +28,7 @@ fn nominal() -> &'static Nominal {
     })
 }
 
-/// 1,800 centres of a part with 20 um of form error, within a rectangle.
+/// Returns 1,800 probe centres of a part with a form error of 20 micrometres, within a rectangle.
 fn measured(seed: u64, half: [f64; 2]) -> Vec<Point> {
     let form = FormError::new(seed, 30.0, 0.02, 102.0, 62.0);
     let placement = Placement::new([12.0, -8.0, 5.0], [4.0, -3.0, 20.0]);

@@ -139,7 +139,7 @@ pub async fn until(grinder: &mut LinuxcncGrinder, state: State) -> Status {
     panic!("it does not come to {state}: {last:?} {:?}", grinder.notes());
 }
 
-/// What an error must be, by its variant.
+/// Asserts that an answer is an error of the given variant, and returns the error.
 #[macro_export]
 macro_rules! refuses {
     ($answer:expr, $($pattern:tt)+) => {

@@ -9,7 +9,7 @@ use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 
-/// What goes wrong with a line.
+/// Fault in the response to a line.
 #[derive(Clone, Debug)]
 pub enum Fault {
     /// The connection is closed, and nothing is done.

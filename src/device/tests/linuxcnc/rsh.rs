@@ -347,7 +347,7 @@ async fn deleted_record_makes_start_unknown() {
     assert_eq!(fake.controller().runs, 0);
 }
 
-/// What a cell does when the wire is lost: it meets the machine again, and asks what became of its start.
+/// Connects to the machine again and reconciles an armed start, as a cell does after it has lost the connection.
 async fn reconnect_and_reconcile(grinder: &mut LinuxcncGrinder, armed: Option<&Armed>) -> Option<Reconciled> {
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();

@@ -1,4 +1,4 @@
-//! What a disk would still hold if the power went now.
+//! Content of a disk after a power cut.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,22 +8,22 @@ use std::sync::Arc;
 
 use crate::seeded_numbers::SeededNumbers;
 
-/// A disk writes these whole or not at all.
+/// Unit of writing of the disk, in bytes. A power cut keeps a sector completely or not at all.
 const SECTOR: u64 = 512;
 
-/// What becomes of the bytes that were written and not brought to the disk when the power goes.
+/// Result of a power cut for the changes that no sync has brought to the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// All of them are gone.
+    /// All changes are lost.
     Lost,
-    /// All of them are there.
+    /// All changes are on the disk.
     Kept,
-    /// Of each write, each sector is there or is not; and so is each change of a file's length.
+    /// Each sector of a write is kept or lost by chance, and so is each change of a file's length.
     Torn,
 }
 
 impl Outcome {
-    /// All there are.
+    /// All outcomes.
     pub const ALL: [Self; 3] = [Self::Lost, Self::Kept, Self::Torn];
 
     fn keeps(self, drawn: &mut SeededNumbers) -> bool {
@@ -35,7 +35,7 @@ impl Outcome {
     }
 }
 
-/// A change of a file that no sync has brought to the disk.
+/// Change of a file that no sync has brought to the disk.
 #[derive(Clone, Debug)]
 enum Change {
     Write { at: u64, bytes: Arc<[u8]> },
@@ -43,7 +43,7 @@ enum Change {
 }
 
 impl Change {
-    /// Brings to the bytes of a file what becomes of this change.
+    /// Applies this change to the bytes of a file, as the outcome of the power cut decides.
     fn settle(&self, file: &mut Vec<u8>, outcome: Outcome, drawn: &mut SeededNumbers) {
         match self {
             Self::Truncate(length) if outcome.keeps(drawn) => file.resize(*length as usize, 0),
@@ -61,7 +61,8 @@ impl Change {
     }
 }
 
-/// A sector that was lost beyond the end of the file leaves a hole, if one behind it was kept, or whatever the disk held there before.
+/// Applies the write of one sector.
+/// A lost sector beyond the end of the file becomes a hole if a later sector is kept, or it has old data of the disk.
 fn settle_sector(file: &mut Vec<u8>, at: usize, bytes: &[u8], outcome: Outcome, drawn: &mut SeededNumbers) {
     let keeps = outcome.keeps(drawn);
     let is_stale = !keeps && outcome == Outcome::Torn && at >= file.len() && drawn.below(4) == 0;
@@ -77,10 +78,10 @@ fn settle_sector(file: &mut Vec<u8>, at: usize, bytes: &[u8], outcome: Outcome, 
     }
 }
 
-/// A file, whatever its name.
+/// Content of a file, independent of its name.
 #[derive(Clone, Debug, Default)]
 struct Content {
-    /// As it was when it was last brought to the disk.
+    /// Bytes of the file after its last sync.
     lasting: Arc<Vec<u8>>,
     changes: Vec<Change>,
 }
@@ -100,39 +101,39 @@ impl Content {
     }
 }
 
-/// A change of a folder that may not have come to the disk.
+/// Change of a folder that no sync has brought to the disk.
 #[derive(Clone, Debug)]
 enum Naming {
     Made(PathBuf, usize),
     Gone(PathBuf),
 }
 
-/// What a disk holds of the files of SQLite in one folder.
+/// Content of a disk: the SQLite files of one folder.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Image {
     files: Vec<Content>,
-    /// The names as the program sees them.
+    /// Names of the files as the program sees them.
     names: BTreeMap<PathBuf, usize>,
-    /// The names that are on the disk.
+    /// Names of the files that are on the disk.
     lasting: BTreeMap<PathBuf, usize>,
-    /// What is not, in order: a file system keeps the order.
+    /// Changes of names that are not on the disk yet, in order. A file system keeps this order.
     naming: Vec<Naming>,
 }
 
 impl Image {
-    /// Returns the file of a name, if it is known.
+    /// Returns the number of the file with this name, if the file is known.
     pub(crate) fn find(&self, path: &Path) -> Option<usize> {
         self.names.get(path).copied()
     }
 
-    /// Takes up a file that was there before this disk looked.
+    /// Adds a file that existed before this disk was installed.
     pub(crate) fn found(&mut self, path: &Path, bytes: Vec<u8>) -> usize {
         let file = self.add(path, bytes);
         self.lasting.insert(path.to_owned(), file);
         file
     }
 
-    /// Takes up a file that was made just now.
+    /// Adds a file that the program has just created.
     pub(crate) fn made(&mut self, path: &Path) -> usize {
         let file = self.add(path, Vec::new());
         self.naming.push(Naming::Made(path.to_owned(), file));
@@ -163,18 +164,19 @@ impl Image {
         self.files[file].settle(Outcome::Kept, &mut SeededNumbers::new(0));
     }
 
-    /// A sync failed, and the system takes what it could not bring to the disk for brought there: nothing will bring it any more.
+    /// Applies a failed sync after which the system regards all changes as written.
+    /// No later sync writes the lost changes.
     pub(crate) fn forgotten(&mut self, file: usize, drawn: &mut SeededNumbers) {
         self.files[file].settle(Outcome::Torn, drawn);
     }
 
-    /// The folder itself was brought to the disk.
+    /// Applies a sync of the folder itself.
     pub(crate) fn folder_synced(&mut self) {
         self.naming.clear();
         self.lasting.clone_from(&self.names);
     }
 
-    /// Returns the files that are found afterwards.
+    /// Returns the files that exist after the power cut.
     fn settled(&self, outcome: Outcome, drawn: &mut SeededNumbers) -> BTreeMap<PathBuf, Vec<u8>> {
         let most = self.naming.len() as u64;
         let kept = match outcome {
@@ -193,23 +195,23 @@ impl Image {
     }
 }
 
-/// A moment at which the power may go: in the middle of a change, which may be there afterwards, or not, or in parts.
+/// Moment of a possible power cut, in the middle of a change. The change can be kept, lost or torn.
 #[derive(Clone, Debug)]
 pub struct Cut {
-    /// What was being done.
+    /// Operation during which the power is cut.
     pub during: String,
-    /// The newest mark that the test had made by then.
+    /// Last mark that the test had set before the cut.
     pub mark: u64,
     pub(crate) image: Image,
-    /// Files that SQLite does not know. They are as they were: what a program brings to the disk by itself is not looked at here.
+    /// Files that do not belong to SQLite, with their bytes at the cut. The simulated disk does not model their syncs.
     pub(crate) others: Arc<BTreeMap<PathBuf, Vec<u8>>>,
 }
 
 impl Cut {
-    /// Makes a folder as it might be found after this cut.
+    /// Creates a folder with the files that a program can find after this cut.
     ///
     /// # Errors
-    /// A folder that cannot be written.
+    /// The folder cannot be written.
     pub fn restore(&self, folder: &Path, outcome: Outcome, drawn: &mut SeededNumbers) -> io::Result<()> {
         fs::create_dir_all(folder)?;
         for (path, bytes) in self.others.iter() {

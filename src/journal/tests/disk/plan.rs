@@ -1,4 +1,4 @@
-//! What a disk is told to do, and how often it was asked.
+//! Planned faults of a disk, and the number of its operations.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,35 +10,35 @@ use crate::image::{Cut, Image};
 use crate::seeded_numbers::SeededNumbers;
 use crate::vfs;
 
-/// What SQLite asks of its files.
+/// File operation that SQLite requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Operation {
-    /// To open a file, or make it.
+    /// Opens a file, or creates it.
     Open,
-    /// To read bytes.
+    /// Reads bytes.
     Read,
-    /// To write bytes.
+    /// Writes bytes.
     Write,
-    /// To change the length of a file.
+    /// Changes the length of a file.
     Truncate,
-    /// To bring a file to the disk.
+    /// Syncs a file to the disk.
     Sync,
-    /// To tell the length of a file.
+    /// Reads the length of a file.
     Size,
-    /// To lock the database.
+    /// Locks the database.
     Lock,
-    /// To lock a part of the index of the log.
+    /// Locks a part of the index of the log.
     IndexLock,
-    /// To map a part of the index of the log into memory.
+    /// Maps a part of the index of the log into memory.
     IndexMap,
-    /// To delete a file.
+    /// Deletes a file.
     Delete,
-    /// To tell whether a file is there.
+    /// Checks whether a file exists.
     Access,
 }
 
 impl Operation {
-    /// All there are.
+    /// All operations.
     pub const ALL: [Self; 11] = [
         Self::Open,
         Self::Read,
@@ -53,7 +53,8 @@ impl Operation {
         Self::Access,
     ];
 
-    /// The faults that it can have, each with a share of chance where it needs one; a stall left out.
+    /// Returns the faults that this operation can have, except a stall.
+    /// Draws a random number for the faults that need one.
     pub fn faults(self, drawn: &mut SeededNumbers) -> Vec<Fault> {
         let chance = drawn.below(1 << 32);
         match self {
@@ -67,34 +68,35 @@ impl Operation {
     }
 }
 
-/// What is wrong with an operation.
+/// Fault of an operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// It fails, and nothing is done: an error of input or output, a file that cannot be opened.
+    /// The operation fails and changes nothing: an I/O error, or a file that cannot be opened.
     Error,
-    /// It fails for want of room, and nothing is done.
+    /// The operation fails because the disk is full, and changes nothing.
     Full,
-    /// A write fails for want of room after a share of the bytes, which follows from the number.
+    /// A write fails because the disk is full, after it has written a part of the bytes.
+    /// The number determines the part.
     Torn(u64),
-    /// It is done, and fails all the same: nobody knows what became of it.
+    /// The operation succeeds but returns an error. The caller cannot know its result.
     Late,
-    /// A sync fails, and what it should have brought to the disk is given up: by chance it is there or not, and no later sync brings it.
+    /// A sync fails and drops its changes. Each change is on the disk or lost, by chance. No later sync writes it.
     Forget(u64),
     /// Another process has the lock.
     Busy,
-    /// A read gives zeros from some byte on, and says nothing.
+    /// A read returns zeros from some byte on, without an error.
     Zeros(u64),
-    /// A read gives a bit that is wrong, and says nothing.
+    /// A read returns one wrong bit, without an error.
     Flipped(u64),
 }
 
-/// What waits for an operation.
+/// Planned fault or stall of an operation.
 enum Waiting {
     Fault(Fault),
     Stall(Sender<()>, Receiver<()>),
 }
 
-/// What becomes of an operation.
+/// Result of an operation: done, or a fault.
 pub(crate) enum Verdict {
     Done,
     Wrong(Fault),
@@ -102,9 +104,9 @@ pub(crate) enum Verdict {
 
 struct Planned {
     operation: Operation,
-    /// The operations of that kind that are done before it strikes.
+    /// Number of operations of that kind that succeed before the fault or stall.
     after: u64,
-    /// How often it strikes.
+    /// Number of operations that the fault or stall affects.
     times: u64,
     waiting: Waiting,
 }
@@ -119,43 +121,43 @@ struct State {
     mark: u64,
 }
 
-/// What SQLite and the test share of a disk.
+/// State of a disk, shared by SQLite and the test.
 pub(crate) struct Shared {
     folder: PathBuf,
-    /// Pages in the log after which it is brought into the database.
+    /// Number of pages in the log that starts a checkpoint.
     pub(crate) checkpoint_pages: u32,
     state: Mutex<State>,
 }
 
 static DISKS: Mutex<Vec<Weak<Shared>>> = Mutex::new(Vec::new());
 
-/// A test that failed has said why; the others go on.
+/// Locks a mutex, even if a failed test has poisoned it, so that the other tests continue.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Returns the disk under a file.
+/// Returns the disk of a file, if its folder has one.
 pub(crate) fn disk_of(path: &Path) -> Option<Arc<Shared>> {
     let folder = path.parent()?;
     locked(&DISKS).iter().filter_map(Weak::upgrade).find(|disk| disk.folder == folder)
 }
 
-/// The disk under one folder; with it the faults go.
+/// Simulated disk of one folder. Its faults end when it is dropped.
 pub struct Disk(Arc<Shared>);
 
-/// A disk that blocks in an operation until it is let go, by [`Stall::release`] or by dropping this.
+/// Handle of an operation that blocks until [`Stall::release`], or until this handle is dropped.
 pub struct Stall {
     reached: Receiver<()>,
     go: Sender<()>,
 }
 
 impl Stall {
-    /// Waits until the operation is reached. Returns false if it never will be.
+    /// Waits until the operation begins. Returns false if it can no longer begin.
     pub fn is_reached(&self) -> bool {
         self.reached.recv().is_ok()
     }
 
-    /// Lets the operation go on.
+    /// Lets the operation continue.
     pub fn release(self) {
         // Where nobody waits any more, nobody has to be told.
         let _ = self.go.send(());
@@ -163,16 +165,18 @@ impl Stall {
 }
 
 impl Disk {
-    /// Lays a disk under a folder, which is made if it is not there. The log of a database in it is brought into the database whenever it
-    /// has so many pages: a short life sees it too.
+    /// Installs a disk under a folder, and creates the folder if it does not exist.
+    /// SQLite runs a checkpoint whenever the log of a database has this number of pages.
+    /// A short test then has checkpoints too.
     ///
     /// # Panics
-    /// A folder that cannot be made.
+    /// The folder cannot be created.
     pub fn under(folder: &Path, checkpoint_pages: u32) -> Self {
         Self::laid(folder, checkpoint_pages, None)
     }
 
-    /// As [`Disk::under`], and the disk keeps what it would hold if the power went, at each change of a file.
+    /// Installs a disk as [`Disk::under`] does.
+    /// At each change of a file, the disk also records its content for a power cut.
     ///
     /// # Panics
     /// As [`Disk::under`].
@@ -192,18 +196,20 @@ impl Disk {
         Self(shared)
     }
 
-    /// Returns how many operations of a kind there were.
+    /// Returns the number of operations of a kind that SQLite has requested.
     pub fn asked(&self, operation: Operation) -> u64 {
         locked(&self.0.state).asked.get(&operation).copied().unwrap_or(0)
     }
 
-    /// Lets so many operations of a kind pass from here on, and spoils those that follow them, as many times as wanted; [`u64::MAX`] is for ever.
-    /// It takes the place of what was planned before.
+    /// Lets the next `after` operations of a kind succeed.
+    /// Then the fault affects `times` operations; [`u64::MAX`] means all.
+    /// Replaces the earlier plan.
     pub fn spoil(&self, operation: Operation, after: u64, times: u64, fault: Fault) {
         self.plan(operation, after, times, Waiting::Fault(fault));
     }
 
-    /// Lets so many operations of a kind pass from here on, and blocks in the next.
+    /// Lets the next `after` operations of a kind succeed, and blocks in the one that follows.
+    /// Replaces the earlier plan.
     pub fn stall(&self, operation: Operation, after: u64) -> Stall {
         let ((told, reached), (go, waits)) = (channel(), channel());
         self.plan(operation, after, 1, Waiting::Stall(told, waits));
@@ -216,22 +222,22 @@ impl Disk {
         state.planned = Some(Planned { operation, after, times, waiting });
     }
 
-    /// Ends what was planned.
+    /// Removes the planned fault or stall.
     pub fn heal(&self) {
         locked(&self.0.state).planned = None;
     }
 
-    /// Returns how often what was planned has struck.
+    /// Returns how often the planned fault or stall has occurred.
     pub fn struck(&self) -> u64 {
         locked(&self.0.state).struck
     }
 
-    /// Marks all cuts that follow.
+    /// Sets the mark of all later cuts.
     pub fn mark(&self, mark: u64) {
         locked(&self.0.state).mark = mark;
     }
 
-    /// Returns the cuts so far, the last of them as things stand now, and begins with none again.
+    /// Returns the recorded cuts and clears the list. The last cut has the present content of the disk.
     pub fn cuts(&self) -> Vec<Cut> {
         self.0.cut(|| "nothing".to_owned());
         std::mem::take(&mut locked(&self.0.state).cuts)
@@ -239,7 +245,7 @@ impl Disk {
 }
 
 impl Shared {
-    /// Tells what becomes of the next operation of a kind. Blocks in one that stalls.
+    /// Counts an operation and returns its result by the plan. Blocks if the plan is a stall.
     pub(crate) fn ask(&self, operation: Operation) -> Verdict {
         let mut state = locked(&self.state);
         *state.asked.entry(operation).or_default() += 1;
@@ -270,12 +276,12 @@ impl Shared {
         locked(&self.state).image.is_some()
     }
 
-    /// Changes what the disk holds.
+    /// Changes the recorded content of the disk, if the disk records it.
     pub(crate) fn change<T>(&self, change: impl FnOnce(&mut Image) -> T) -> Option<T> {
         locked(&self.state).image.as_mut().map(change)
     }
 
-    /// Lays a cut by.
+    /// Records a cut, if the disk records its content.
     pub(crate) fn cut(&self, during: impl FnOnce() -> String) {
         let mut state = locked(&self.state);
         let Some(image) = state.image.clone() else { return };
@@ -286,7 +292,8 @@ impl Shared {
     }
 }
 
-/// Reads the files that SQLite does not know. Those that it does know are left alone: whoever closes one gives its locks back.
+/// Reads the files that do not belong to SQLite.
+/// Does not open a file of SQLite, because closing it would release the locks that this process has on it.
 fn files_below(folder: &Path, below: &Path, found: &mut BTreeMap<PathBuf, Vec<u8>>) {
     for entry in fs::read_dir(folder.join(below)).into_iter().flatten().flatten() {
         let name = below.join(entry.file_name());

@@ -1,4 +1,5 @@
-//! The layer between SQLite and the system's own files: it hands everything on, and asks the disk first.
+//! Layer between SQLite and the system's own files.
+//! It asks the disk for the fault of each operation, and forwards it.
 
 use std::ffi::{CStr, OsStr, c_char, c_int, c_uint, c_void};
 use std::os::unix::ffi::OsStrExt;
@@ -12,7 +13,7 @@ use rusqlite::ffi::{self, sqlite3, sqlite3_file, sqlite3_io_methods, sqlite3_vfs
 use crate::plan::{Fault, Operation, Shared, Verdict, disk_of};
 use crate::seeded_numbers::SeededNumbers;
 
-/// The system's own files.
+/// File layer (VFS) of the system.
 struct System(*mut sqlite3_vfs);
 
 // SAFETY: SQLite never changes nor frees it, and its functions may be called from any thread.
@@ -22,7 +23,7 @@ unsafe impl Sync for System {}
 
 static SYSTEM: OnceLock<System> = OnceLock::new();
 
-/// Lays this layer under all databases that are opened from here on, once.
+/// Installs this layer, once, for all databases that are opened later.
 pub(crate) fn install() {
     SYSTEM.get_or_init(|| {
         // SAFETY: the name is a string with its end, and what is found lives as long as the process.
@@ -51,7 +52,8 @@ fn system() -> *mut sqlite3_vfs {
     SYSTEM.get().expect("installed before anything is opened").0
 }
 
-/// Sees that each connection that is opened on a disk hears when its first statement begins: what is set now, SQLite sets again.
+/// Registers `begun` for the statements of each connection on a disk.
+/// SQLite would overwrite a number of checkpoint pages that is set here.
 unsafe extern "C" fn opened(
     connection: *mut sqlite3,
     _: *mut *mut c_char,
@@ -66,7 +68,7 @@ unsafe extern "C" fn opened(
     }
 }
 
-/// Says to a connection after how many pages it brings its log into the database.
+/// Sets the number of log pages at which a connection runs a checkpoint.
 unsafe extern "C" fn begun(_: c_uint, connection: *mut c_void, _: *mut c_void, _: *mut c_void) -> c_int {
     let connection = connection.cast();
     // SAFETY: the connection runs a statement, so it is open.
@@ -87,21 +89,22 @@ unsafe fn disk_of_connection(connection: *mut sqlite3) -> Option<Arc<Shared>> {
     unsafe { path_of(ffi::sqlite3_db_filename(connection, c"main".as_ptr())) }.and_then(disk_of)
 }
 
-/// A file as SQLite holds it; the system's own follows it in memory. SQLite gives room at multiples of eight bytes, as both want.
+/// File as SQLite holds it. The system's own file follows it in memory.
+/// SQLite allocates at multiples of eight bytes, as both files require.
 #[repr(C)]
 struct Layer {
     base: sqlite3_file,
-    /// Null in a folder that has no disk.
+    /// Null in a folder without a disk.
     watched: *mut Watched,
 }
 
-/// A file in a folder that has a disk.
+/// File in a folder with a disk.
 struct Watched {
     disk: Arc<Shared>,
     path: PathBuf,
-    /// Its number in the memory of the disk, which not every disk has.
+    /// Number of the file in the recorded content; `None` if the disk does not record its content.
     file: Option<usize>,
-    /// Whether its next sync brings the folder to the disk too, as the system's files do for a log that they made.
+    /// True if its next sync also syncs the folder, as the system's layer does for a log that it has created.
     brings_folder: std::cell::Cell<bool>,
 }
 
@@ -110,7 +113,7 @@ impl Watched {
         self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// Tells what becomes of an operation: nothing is wrong, or what.
+    /// Returns the fault of an operation, if it has one.
     fn ask(&self, operation: Operation) -> Option<Fault> {
         match self.disk.ask(operation) {
             Verdict::Done => None,
@@ -130,7 +133,7 @@ impl Watched {
         self.disk.cut(|| format!("truncation of {} to {length}", self.name()));
     }
 
-    /// The cut stands before the sync: in the middle of it anything may be there that was written.
+    /// Records a cut and then a sync. During the sync, any part of the written bytes can be on the disk.
     fn synced(&self, fault: Option<Fault>) {
         let Some(file) = self.file else { return };
         self.disk.cut(|| format!("sync of {}", self.name()));
@@ -151,10 +154,10 @@ impl Watched {
     }
 }
 
-/// Returns a name that SQLite gives as a path.
+/// Returns a name from SQLite as a path.
 ///
 /// # Safety
-/// The name is null or a string with its end, and outlives what is returned.
+/// The name is null or a string with its end, and outlives the returned path.
 unsafe fn path_of<'a>(name: *const c_char) -> Option<&'a Path> {
     if name.is_null() {
         return None;
@@ -164,7 +167,7 @@ unsafe fn path_of<'a>(name: *const c_char) -> Option<&'a Path> {
     Some(Path::new(OsStr::from_bytes(name.to_bytes())))
 }
 
-/// Returns what is known of a file that is open.
+/// Returns the disk data of an open file, if its folder has a disk.
 ///
 /// # Safety
 /// The file was opened by [`open`] and is not closed.
@@ -176,13 +179,14 @@ unsafe fn watched<'a>(file: *mut sqlite3_file) -> Option<&'a Watched> {
 /// Returns the system's own file.
 ///
 /// # Safety
-/// The file has the room of a [`Layer`] and of a file of the system.
+/// The allocated memory contains a [`Layer`] and a file of the system.
 unsafe fn below(file: *mut sqlite3_file) -> *mut sqlite3_file {
     // SAFETY: SQLite gives every file the room that was asked for in `szOsFile`.
     unsafe { file.cast::<Layer>().add(1).cast() }
 }
 
-/// Hands an operation on to the system's own file. Those of a log in memory are missing in files that nobody shares.
+/// Forwards an operation to the system's own file.
+/// The operations of the log index are missing in files that no other process shares.
 macro_rules! hand_on {
     ($file:expr, $operation:ident $(, $argument:expr)*) => {{
         // SAFETY: the file is open, so its own functions are there, and they get what SQLite gave.
@@ -235,7 +239,7 @@ unsafe extern "C" fn open(
     ffi::SQLITE_OK
 }
 
-/// Returns the number of a file in the memory of a disk, which takes it up if it is new there.
+/// Returns the number of a file in the recorded content of a disk. Adds the file if it is new.
 fn known(disk: &Shared, path: &Path, file: *mut sqlite3_file, was_there: bool) -> Option<usize> {
     if !was_there {
         let made = disk.change(|image| image.made(path));
@@ -249,7 +253,7 @@ fn known(disk: &Shared, path: &Path, file: *mut sqlite3_file, was_there: bool) -
     disk.change(|image| image.found(path, bytes))
 }
 
-/// Reads a file through the descriptor that is open: closing another one would give back the locks of this process.
+/// Reads a file through its open descriptor. Closing another descriptor would release the locks of this process.
 fn whole(file: *mut sqlite3_file) -> Vec<u8> {
     let mut size = 0;
     let asked = hand_on!(file, xFileSize, &mut size);
@@ -293,7 +297,8 @@ unsafe extern "C" fn access(_: *mut sqlite3_vfs, name: *const c_char, flags: c_i
     unsafe { (*system()).xAccess.map_or(ffi::SQLITE_IOERR_ACCESS, |access| access(system(), name, flags, found)) }
 }
 
-/// Whoever waits for a lock asks again at once, as often as he would have.
+/// Yields the thread instead of sleeping, and reports the full sleep time to SQLite.
+/// A connection that waits for a lock retries at once, and as often as with a real sleep.
 unsafe extern "C" fn sleep(_: *mut sqlite3_vfs, microseconds: c_int) -> c_int {
     std::thread::yield_now();
     microseconds

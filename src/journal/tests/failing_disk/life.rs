@@ -1,4 +1,4 @@
-//! The life of a journal, and what has to stand when it is over or was cut off.
+//! Life of a journal on a simulated disk, and checks of the journal after its end or after a cut.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,11 +11,11 @@ use tempfile::TempDir;
 
 use crate::keep::KeepRunFolders;
 
-/// A short life brings its log into the database some times.
+/// Number of log pages that starts a checkpoint. It is small, so that a short life has several checkpoints.
 pub const CHECKPOINT_PAGES: u32 = 24;
 
-/// A folder in memory where there is one: what lasts is decided by the disk of the test. The journals in it are kept for the other
-/// verifier, where that is wanted.
+/// Temporary folder, in memory if possible, because the simulated disk decides which bytes are kept.
+/// Its journals are kept for the Python verifier on request.
 pub struct Home {
     _kept: KeepRunFolders,
     home: TempDir,
@@ -31,7 +31,7 @@ impl Home {
         self.home.path().join(name)
     }
 
-    /// A folder with nothing in it.
+    /// Creates an empty folder. Deletes an earlier folder of this name.
     pub fn empty(&self, name: &str) -> PathBuf {
         let folder = self.folder(name);
         let _ = fs::remove_dir_all(&folder);
@@ -40,7 +40,8 @@ impl Home {
     }
 }
 
-/// How much of all there is to try: `None` is a sample, a number is how often chance is asked at each place. Set by .ci/long.
+/// Returns the number of random draws at each place; `None` means a sample of the places.
+/// .ci/long sets the number.
 pub fn draws() -> Option<u64> {
     std::env::var("REGRIND_DISK_DRAWS").ok().and_then(|number| number.parse().ok())
 }
@@ -57,10 +58,10 @@ pub fn header() -> Header {
     }
 }
 
-/// What is done with a journal.
+/// Step in the life of a journal.
 #[derive(Clone, Copy)]
 pub enum Step {
-    /// With so many letters.
+    /// Note with this number of letters.
     Note(usize),
     Intend,
     Outcome,
@@ -69,7 +70,7 @@ pub enum Step {
     End,
 }
 
-/// Some thirty records, of which some need pages of their own.
+/// Returns the steps of a short life: about thirty records. Some records need pages of their own.
 pub fn short() -> Vec<Step> {
     use Step::{End, Intend, Note, Outcome, Reopen, Store};
     let first = [Store(10), Note(0), Intend, Note(300), Outcome, Note(6000), Intend, Store(9000), Outcome, Note(20)];
@@ -78,19 +79,19 @@ pub fn short() -> Vec<Step> {
     [&first[..], &second, &third, &[Note(60), Note(4000), Outcome, End]].concat()
 }
 
-/// So many that the head is sealed in the middle of them.
+/// Returns the steps of a long life. It is so long that the journal writes a seal in the middle.
 pub fn long() -> Vec<Step> {
     use Step::{End, Intend, Note, Outcome};
     [&[Note(0); 252][..], &[Intend, Note(10), Outcome, Note(10), Intend, Outcome, End]].concat()
 }
 
-/// What the journal has acknowledged: one record.
+/// Record that the journal has acknowledged.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AcknowledgedRecord {
     pub kind: Kind,
     pub mono_ns: u64,
     pub command_id: Option<u32>,
-    /// Its content, or the member of it by which it is known.
+    /// Content of the record, or the member that identifies the record.
     pub payload: Value,
 }
 
@@ -106,26 +107,27 @@ impl AcknowledgedRecord {
     }
 }
 
-/// A life on a disk, and what came of it.
+/// Life of a journal on a disk, and its results.
 pub struct Life<'d> {
     disk: &'d Disk,
     folder: PathBuf,
     key: Option<AuditKey>,
-    /// What is tried, for whoever reads of a failure.
+    /// Description of the trial for the message of a failure.
     at: String,
-    /// Every record that was acknowledged, in order.
+    /// Acknowledged records, in order.
     pub acknowledged: Vec<AcknowledgedRecord>,
-    /// What the journal said no for.
+    /// Errors that the journal returned.
     pub errors: Vec<JournalError>,
-    /// The last command.
+    /// Number of the last command.
     id: Option<u32>,
 }
 
-/// After so many refusals the disk is well again.
+/// Number of errors after which the disk has no fault any more.
 const PATIENCE: usize = 5;
 
 impl<'d> Life<'d> {
-    /// Leads a life from its beginning to its end. What is refused is tried again, as the drive does. Returns whether it could begin.
+    /// Leads a life from its beginning to its end. Retries each refused step, as the drive does.
+    /// Returns false if the journal cannot be created.
     pub fn led(disk: &'d Disk, folder: &Path, key: Option<AuditKey>, steps: &[Step], at: &str) -> (Self, bool) {
         let mut life = Self {
             disk,
@@ -209,7 +211,8 @@ impl<'d> Life<'d> {
         journal
     }
 
-    /// As the drive's journal thread does it: the same again, while that may help.
+    /// Retries a write until it succeeds, as the drive's journal thread does.
+    /// Asserts that each error can be temporary.
     fn until_written<T>(&mut self, mut write: impl FnMut() -> Result<T, JournalError>) -> T {
         loop {
             match write() {
@@ -222,7 +225,7 @@ impl<'d> Life<'d> {
         }
     }
 
-    /// As a person does it who resumes a run.
+    /// Retries to open the journal until it succeeds, as a person does who resumes a run.
     fn reopened(&mut self) -> Journal {
         loop {
             match Journal::open_with(&self.folder, self.key.clone()) {
@@ -249,7 +252,7 @@ impl<'d> Life<'d> {
         assert!(self.errors.len() < 4 * PATIENCE, "{}: refused for ever: {:?}", self.at, self.errors);
     }
 
-    /// The life came to its end: everything stands once.
+    /// Asserts that the journal is closed and has every acknowledged record exactly once.
     pub fn is_whole(&self) {
         let verified = verified(&self.folder, &self.at);
         assert!(verified.closed && !verified.lacks_last_seal(), "{}: {verified:?}", self.at);
@@ -257,7 +260,7 @@ impl<'d> Life<'d> {
     }
 }
 
-/// Tells how a database is written, as its file says, if the disk lets it be read.
+/// Returns the journal mode in the file of a database, if the disk permits the read.
 pub fn mode(folder: &Path) -> Option<String> {
     let database = Connection::open_with_flags(folder.join("journal.sqlite"), OpenFlags::SQLITE_OPEN_READ_ONLY).ok()?;
     database.query_row("SELECT count(*) FROM record", [], |_| Ok(())).ok()?;
@@ -277,13 +280,13 @@ pub fn records(folder: &Path) -> Vec<Record> {
     Reader::open(folder).unwrap().records(0).map(Result::unwrap).collect()
 }
 
-/// What stands in a journal, without what it writes by itself.
+/// Returns the records of a journal without the records that the journal writes by itself.
 pub fn read_acknowledged(folder: &Path) -> Vec<AcknowledgedRecord> {
     let own = [Kind::Begin, Kind::Reopen, Kind::Seal];
     records(folder).iter().filter(|record| !own.contains(&record.kind)).map(AcknowledgedRecord::from_record).collect()
 }
 
-/// The run can be gone on with: no number is used twice, and it comes to its end.
+/// Asserts that the run can be resumed and closed, and that no command number is used twice.
 pub fn is_gone_on_with(folder: &Path, key: Option<&AuditKey>, at: &str) {
     let before = records(folder);
     let mut journal = Journal::open_with(folder, key.cloned()).unwrap_or_else(|error| panic!("{at}: {error}"));

@@ -1,4 +1,4 @@
-//! The power goes at every moment of a journal's life.
+//! Tests of a power cut at every moment of a journal's life.
 
 use std::path::Path;
 
@@ -12,7 +12,8 @@ use crate::life::{
     short, verified,
 };
 
-/// What was acknowledged before a cut is there afterwards, and of what was under way all or nothing. Returns whether there is a run to go on with.
+/// Asserts that every record that was acknowledged before a cut exists after it.
+/// The record in progress at the cut exists completely or not at all. Returns true if the run can be resumed.
 fn is_sound(folder: &Path, cut: &Cut, told: &[AcknowledgedRecord], at: &str) -> bool {
     if cut.mark == 0 {
         // Nobody was told that there is a run. What can be believed nevertheless has begun.
@@ -34,7 +35,7 @@ fn note(k: u64) -> Entry {
     Entry::new(Kind::Note, k, 1, json!({ "k": k }))
 }
 
-/// The outcomes that are tried of one cut.
+/// Returns the outcomes to try for one cut.
 fn outcomes(drawn: &mut SeededNumbers) -> Vec<Outcome> {
     match draws() {
         Some(draws) => Outcome::ALL.into_iter().chain((1..draws).map(|_| Outcome::Torn)).collect(),
@@ -42,7 +43,7 @@ fn outcomes(drawn: &mut SeededNumbers) -> Vec<Outcome> {
     }
 }
 
-/// Tries one cut: restores what is left, looks through it and goes on.
+/// Tests one cut: restores the files, verifies the journal and resumes the run.
 fn is_survived(
     home: &Home,
     cut: &Cut,

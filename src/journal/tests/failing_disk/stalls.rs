@@ -1,4 +1,4 @@
-//! A disk that stands still: who writes waits, and who reads does not.
+//! Tests of a disk that stalls: a writer waits, and a reader does not.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -14,7 +14,7 @@ fn note(k: u64) -> Entry {
     Entry::new(Kind::Note, k, 1, json!({ "words": words(k, 200) }))
 }
 
-/// Who reads meanwhile sees all that was acknowledged, and that the run goes on.
+/// Asserts that a reader sees all acknowledged records during the stall, and that the run is under way.
 fn is_read(folder: &Path, records: RangeInclusive<usize>) {
     let found = verified(folder, "read while the disk stands still");
     assert!(found.under_way && !found.closed);

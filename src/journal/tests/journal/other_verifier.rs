@@ -1,4 +1,5 @@
-//! The verifier in Python, docs/verify_journal.py, which was written from docs/journal.md alone: both say the same of every journal.
+//! Tests of the Python verifier, docs/verify_journal.py, which was written from docs/journal.md alone.
+//! It must give the same verdict on every journal as this library.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,7 +16,8 @@ fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(name)
 }
 
-/// A Python that has `cryptography`: the one that REGRIND_PYTHON names if it has, else the usual one.
+/// Returns a Python that has the package `cryptography`.
+/// Tries the Python in REGRIND_PYTHON first, then the usual ones.
 fn python() -> String {
     let named = std::env::var("REGRIND_PYTHON").ok();
     let has = |python: &String| {
@@ -25,7 +27,7 @@ fn python() -> String {
     all.find(has).expect("a python3 with the package cryptography")
 }
 
-/// What it says of each run, in order.
+/// Runs the Python verifier and returns its verdict on each run, in order.
 fn run_verifier(arguments: &[&str], runs: &[PathBuf]) -> Vec<Value> {
     let mut command = Command::new(python());
     command.arg(script("docs/verify_journal.py")).arg("--json").args(arguments).args(runs);
@@ -37,7 +39,7 @@ fn run_verifier(arguments: &[&str], runs: &[PathBuf]) -> Vec<Value> {
     told
 }
 
-/// Compares a verdict with ours.
+/// Asserts that the verdict of the Python verifier equals the verdict of this library.
 fn assert_same(folder: &Path, told: &Value) {
     match verify(folder) {
         Ok(ours) => {

@@ -1,4 +1,4 @@
-//! Somebody changes a journal: it is found, and where.
+//! Tests of tampering: each change of a journal is detected and located.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use rusqlite::types::Value;
 
 use crate::written::{Home, closed, long, tamper};
 
-/// What somebody does to a journal, and the first record that cannot be believed then.
+/// Change of a journal, and the first record that fails verification after it.
 pub struct Tampering {
     pub sql: String,
     pub first_bad: u64,
@@ -20,7 +20,7 @@ const TEXTS: [&str; 10] =
     ["utc", "boot_id", "actor", "station", "kind", "part", "reason", "payload", "prev_hash", "hash"];
 
 impl Tampering {
-    /// Draws one of a journal of so many records that came to its end.
+    /// Draws a change of a closed journal with this number of records.
     pub fn drawn(drawn: &mut SeededNumbers, records: u64) -> Self {
         let at = 1 + drawn.below(records);
         match drawn.below(5) {
@@ -62,7 +62,7 @@ impl Tampering {
         Self { sql, first_bad: at }
     }
 
-    /// A record more, a copy of another one under a number of its own; those behind it count on.
+    /// Returns a change that inserts a copy of another record. The numbers of the later records increase by one.
     fn insertion(drawn: &mut SeededNumbers, at: u64, records: u64) -> Self {
         let copied = 1 + drawn.below(records);
         let copied = if copied >= at { copied + 1 } else { copied };
@@ -78,7 +78,7 @@ impl Tampering {
     }
 }
 
-/// The first record that cannot be believed, or is not there.
+/// Returns the number of the first record that is invalid or missing.
 pub fn place(found: &Result<Verified, JournalError>) -> Option<u64> {
     match found {
         Err(JournalError::Broken { seq, .. }) => Some(*seq),
@@ -87,7 +87,7 @@ pub fn place(found: &Result<Verified, JournalError>) -> Option<u64> {
     }
 }
 
-/// A copy of a journal, for somebody to change.
+/// Copies a journal, so that a test can change the copy.
 pub fn copied(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
     for name in ["journal.sqlite", "journal.anchor"] {
@@ -98,7 +98,7 @@ pub fn copied(from: &Path, to: &Path) {
     }
 }
 
-/// A long journal whose database is one file, without a log beside it.
+/// Creates a long journal whose database is one file without a log.
 pub fn long_and_whole(records: u64) -> (Home, PathBuf) {
     let (home, folder) = long(records);
     tamper(&folder, "SELECT 1");
@@ -115,7 +115,7 @@ fn journal_by_documentation_verifies() {
     assert!(verified.open_intents.is_empty() && !verified.lacks_last_seal(), "{verified:?}");
 }
 
-/// How many of the 5,000; the others are drawn by .ci/long.
+/// Returns how many of the 5,000 random changes to try. .ci/long sets the full number.
 pub fn tries(few: u64) -> u64 {
     std::env::var("REGRIND_TAMPERINGS").ok().and_then(|number| number.parse().ok()).unwrap_or(few)
 }

@@ -1,4 +1,4 @@
-//! What was acknowledged is there, and what was not is not.
+//! Tests of durability: a journal has every acknowledged record, and no record that was refused.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -117,10 +117,10 @@ fn store_refuses_escape_and_overwrite() {
     assert!(matches!(journal.store("a.txt", b"y", 0, 0), Err(JournalError::Recorded { .. })));
 }
 
-/// Says which part of this file a child process is to play, and where.
+/// Environment variable of a child process. Its value is the folder in which the process plays its part.
 const PLAY: &str = "REGRIND_JOURNAL_PLAY";
 
-/// This test program again, playing one of its parts in a folder.
+/// Checks that the verification ignores the temporary file of an anchor that was not completed.
 #[test]
 fn partial_anchor_is_ignored() {
     let (_home, folder, _) = closed();
@@ -135,12 +135,13 @@ fn child(part: &str, folder: &Path) -> Command {
     child
 }
 
-/// The folder in which this process plays a part; none in an ordinary test run.
+/// Returns the folder in which this process plays a part; `None` in an ordinary test run.
 fn stage() -> Option<PathBuf> {
     std::env::var_os(PLAY).map(PathBuf::from)
 }
 
-/// Not a test of its own: what a writer does until it is killed. It tells the number of every record that was acknowledged.
+/// Writes records until the process is killed, and prints the number of each acknowledged record.
+/// Only a child process plays this part. In an ordinary test run this function returns at once.
 #[test]
 fn part_of_a_writer() {
     let Some(folder) = stage() else { return };
@@ -182,7 +183,8 @@ fn killed_writer_loses_no_record() {
     }
 }
 
-/// Not a test of its own: what a writer does on a disk of half a mebibyte, until that is full and a file is taken away from it.
+/// Writes records to a disk of 512 KiB until it is full. Then removes a file and continues the run.
+/// Only a child process plays this part. In an ordinary test run this function returns at once.
 #[test]
 fn part_of_a_writer_on_a_small_disk() {
     let Some(disk) = stage() else { return };
@@ -219,7 +221,7 @@ fn is_named(file: &std::io::Result<std::fs::DirEntry>, part: &str) -> bool {
     file.as_ref().is_ok_and(|file| file.file_name().to_string_lossy().contains(part))
 }
 
-/// A disk of half a mebibyte, in a namespace of its own.
+/// Runs the writer on a disk of 512 KiB in its own mount namespace.
 #[test]
 #[ignore = "needs a system that gives users a mount namespace"]
 fn full_disk_stops_and_recovers() {
@@ -257,7 +259,7 @@ fn full_disk_reported_by_store() {
     journal.store("points.csv", b"1,2,3\n", 0, 1).unwrap();
 }
 
-/// Sets who may write a folder and everything in it.
+/// Sets or clears the write protection of a folder and of the files in it.
 #[cfg(unix)]
 fn make_read_only(folder: &Path, read_only: bool) {
     use std::os::unix::fs::PermissionsExt;

@@ -1,4 +1,4 @@
-//! Journals for the tests, and the hands of somebody who changes them.
+//! Journals for the tests, and functions that tamper with them.
 
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use tempfile::TempDir;
 
 use crate::keep::keep;
 
-/// A folder that is gone after the test. The journals in it are kept for the other verifier, where that is wanted.
+/// Folder that is deleted after the test. Its journals are kept for the Python verifier on request.
 pub struct Home(TempDir);
 
 pub fn home() -> Home {
@@ -44,7 +44,7 @@ pub fn header() -> Header {
     }
 }
 
-/// A run of a few records, closed.
+/// Creates a closed run of a few records.
 pub fn closed() -> (Home, PathBuf, Anchor) {
     let home = home();
     let folder = home.path().join("runs/run-1");
@@ -63,7 +63,7 @@ pub fn closed() -> (Home, PathBuf, Anchor) {
     (home, folder, anchor)
 }
 
-/// Changes the database as somebody would who knows SQL.
+/// Changes the database by SQL, after it has removed the triggers that protect the records.
 pub fn tamper(folder: &Path, sql: &str) {
     let database = Connection::open(folder.join("journal.sqlite")).unwrap();
     database.pragma_update(None, "synchronous", "off").unwrap();
@@ -73,7 +73,8 @@ pub fn tamper(folder: &Path, sql: &str) {
     database.execute_batch(&format!("BEGIN; {sql}; COMMIT")).unwrap_or_else(|error| panic!("{sql}: {error}"));
 }
 
-/// A signed journal of so many records that came to its end, written at once by the rules of docs/journal.md and not by the code under test.
+/// Writes a closed, signed journal with this number of records in one transaction.
+/// The records after the first two follow docs/journal.md and do not use the code under test.
 pub fn long(records: u64) -> (Home, PathBuf) {
     let home = home();
     let folder = home.path().join("run");
@@ -93,7 +94,7 @@ pub fn long(records: u64) -> (Home, PathBuf) {
     (home, folder)
 }
 
-/// A key, and its secret half as a library of its own reads it.
+/// Creates a key. Returns the key, and its secret half as an independent library reads it.
 fn key_and_secret(home: &Path) -> (AuditKey, KeyPair) {
     let path = home.join("audit.key");
     let key = AuditKey::make(&path).unwrap();
@@ -106,16 +107,16 @@ fn key_and_secret(home: &Path) -> (AuditKey, KeyPair) {
 struct Long {
     secret: KeyPair,
     records: u64,
-    /// The number of the last seal.
+    /// Number of the last seal.
     sealed: u64,
-    /// The command that has no outcome yet.
+    /// Command that has no outcome yet.
     open: Option<u32>,
     head: String,
     anchor: Value,
 }
 
 impl Long {
-    /// Of ten records two are a command and its outcome; every 256 are sealed.
+    /// Writes the next record. Of ten records, two are a command and its outcome. A seal follows every 256 records.
     fn write_next(&mut self, database: &Connection) {
         let seq = self.records + 1;
         let id = seq as u32 / 10 + 1;
