@@ -325,7 +325,7 @@ fn register_prints_json_or_text() {
     assert_eq!(printed, written);
     assert!(output.stderr.is_empty());
     let words = text(&bench.register("nominal.csv", "measured.csv", &[]).stdout);
-    for word in ["18,281 points", "1,500 points", " um", "iterations", "out/here"] {
+    for word in ["18,281 points", "1,500 points", " µm", "iterations", "out/here"] {
         assert!(words.contains(word), "`{word}` is missing:\n{words}");
     }
 }
