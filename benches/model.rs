@@ -8,7 +8,7 @@ use divan::Bencher;
 use nalgebra::DMatrix;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{DensePosterior, Field, Form, Hyperparameters, IncrementalPosterior, ModelInputs, Observations};
-use regrind::registration::{Options, Registration, Start, register};
+use regrind::registration::{RegistrationOptions, Registration, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{add_noise, centre};
@@ -109,7 +109,7 @@ fn registered(columns: usize, rows: usize) -> Registration {
     let touch = |k: usize| centre(&shape, &form, RADIUS_MM, place(k)[0], place(k)[1]);
     let mut centres: Vec<[f64; 3]> = (0..columns * rows).map(touch).collect();
     add_noise(&mut rng, &mut centres, 3e-4);
-    let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
     register(&nominal, &points(centres), &options).unwrap()
 }
 

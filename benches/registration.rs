@@ -11,7 +11,7 @@ use std::sync::LazyLock;
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use regrind::geometry::{Point, Pose};
-use regrind::registration::{Options, Registration, Start, register};
+use regrind::registration::{RegistrationOptions, Registration, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, centre};
@@ -76,7 +76,7 @@ fn scattered(points: Vec<Point>) -> Nominal {
 }
 
 fn found(nominal: &Nominal, measured: &[Point], start: Start) -> Registration {
-    let options = Options { start, ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start, ..RegistrationOptions::new(RADIUS_MM) };
     register(nominal, black_box(measured), &options).expect("the part is the free form")
 }
 

@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{Form, Interval, ModelInputs};
-use regrind::registration::{Deviation, Options, PointStatus, Start, register};
+use regrind::registration::{Deviation, RegistrationOptions, PointStatus, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
@@ -163,7 +163,7 @@ fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64
         Point::from(std::array::from_fn::<f64, 3, _>(|k| seen[k] + noise[k]))
     };
     let mut cloud: Vec<Point> = places.iter().zip(&noise).map(touch).collect();
-    let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
     let mut found = register(nominal, &cloud, &options).ok()?;
     if line.noise == Noise::Outliers {
         let again = scatter(line.noise, places.len(), &mut rng);
@@ -174,7 +174,7 @@ fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64
     let told = Form::estimate(&found, &ModelInputs::default()).ok()?;
     // The same part without noise, at the registered pose: a tilt moves the projections, and on strong forms this
     // effect is not of first order.
-    let held = Options { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
+    let held = RegistrationOptions { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
     let true_at = |places: &[[f64; 2]]| {
         let cloud: Vec<Point> = places.iter().map(|place| touch((place, &[0.0; 3]))).collect();
         Some(register(nominal, &cloud, &held).ok()?.deviations)

@@ -22,7 +22,7 @@ use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose, Twist, Vector, fit_rigid};
 use regrind::registration::{
-    Deviation, Method, Options, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
+    Deviation, Method, RegistrationOptions, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
 };
 use regrind::report::{Axis, ColourMap, HeatMap, Plot, Scale, Series};
 use regrind::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, PlaneProjection, Side};
@@ -201,13 +201,13 @@ const MISALIGNMENTS: [Misalignment; 8] = [
 ];
 
 /// Returns the options of the method as the paper describes it: start from the identity, known side, every point used.
-fn as_in_the_paper(distance: DistanceModel) -> Options {
-    Options {
+fn as_in_the_paper(distance: DistanceModel) -> RegistrationOptions {
+    RegistrationOptions {
         start: Start::Pose(Pose::identity()),
         side: ProbeSide::Above,
         outlier_sigmas: f64::INFINITY,
         distance_model: distance,
-        ..Options::new(PROBE_RADIUS_MM)
+        ..RegistrationOptions::new(PROBE_RADIUS_MM)
     }
 }
 
@@ -447,7 +447,7 @@ impl nabo::Point<f64> for Entry {
 fn equivalence(nominal: &Nominal, (measured, after): &(Measurement, Registration), figures: &Path) -> Outcome {
     heading("eq. (18): contact points, registered to the nominal surface");
     let contacts: Vec<Point> = after.deviations.iter().map(|d| d.point).collect();
-    let options = Options { method: Method::Contact, ..as_in_the_paper(DistanceModel::Curved) };
+    let options = RegistrationOptions { method: Method::Contact, ..as_in_the_paper(DistanceModel::Curved) };
     let found = register(nominal, &contacts, &options)?;
     let largest = (found.cmm_from_model.rotation - nalgebra::Matrix3::identity()).amax();
     row(
@@ -496,7 +496,7 @@ fn subtracting_the_radius(
 ) -> Outcome {
     heading("fig. 12b: centres on the nominal surface, the radius subtracted");
     for (distance, name) in [(DistanceModel::Triangle, "flat triangles"), (DistanceModel::Curved, "curved triangles")] {
-        let options = Options { method: Method::SubtractRadius, rms_limit_mm: Some(10.0), ..as_in_the_paper(distance) };
+        let options = RegistrationOptions { method: Method::SubtractRadius, rms_limit_mm: Some(10.0), ..as_in_the_paper(distance) };
         let found: Result<_, RegistrationError> = register(nominal, &measured.centres, &options);
         let found = match found {
             Ok(found) => found,

@@ -20,8 +20,8 @@ use std::time::Instant;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind::config::PlantConfig;
-use regrind::journal::{Kind, Reader, Record, restore, restore_file, sha256_hex};
-use regrind_plant::{DatabaseSettings, Link, Replicator, enrol_cell};
+use regrind::journal::{RecordKind, Reader, Record, restore, restore_file, sha256_hex};
+use regrind_plant::{DatabaseSettings, DatabaseLink, Replicator, enrol_cell};
 
 const PASSWORD: &str = "for-measuring";
 
@@ -59,16 +59,16 @@ impl Like {
             let at: jiff::Timestamp = utc.parse().unwrap();
             (at - jiff::SignedDuration::from_hours(24 * days as i64)).to_string()
         };
-        let unsigned = self.records.iter().filter(|record| record.kind != Kind::Seal);
+        let unsigned = self.records.iter().filter(|record| record.kind != RecordKind::Seal);
         let again = unsigned.enumerate().map(|(k, of)| {
             let mut record = Record { seq: k as u64 + 1, part: part.into(), utc: day(&of.utc), ..of.clone() };
-            if of.kind == Kind::Begin {
+            if of.kind == RecordKind::Begin {
                 let mut content = of.value();
                 content["run"] = name.into();
                 content["key"] = serde_json::Value::Null;
                 record.payload = regrind::journal::canonical_json(&content);
             }
-            if of.kind == Kind::End {
+            if of.kind == RecordKind::End {
                 let mut content = of.value();
                 content["records"] = (k as u64).into();
                 record.payload = regrind::journal::canonical_json(&content);
@@ -85,7 +85,7 @@ impl Like {
     fn lay(&self, runs: &Path, name: &str, part: &str) -> usize {
         let records = self.again(name, part, 0);
         let folder = runs.join(name);
-        let (count, files) = (records.len(), records.iter().filter(|record| record.kind == Kind::Artefact));
+        let (count, files) = (records.len(), records.iter().filter(|record| record.kind == RecordKind::Artefact));
         let files: Vec<String> = files.map(|record| record.value()["name"].as_str().unwrap().to_owned()).collect();
         restore(&folder, records, None).unwrap();
         for name in files {
@@ -99,7 +99,7 @@ async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usiz
     let home = tempfile::tempdir().unwrap();
     let mut records = 0;
     let stamp = jiff::Timestamp::now().as_second();
-    let mut owner = Link::open(database).await.unwrap();
+    let mut owner = DatabaseLink::open(database).await.unwrap();
     let mut shippers = Vec::new();
     for cell in 1..=cells {
         let (name, folder) = (format!("measured-{cell}"), home.path().join(cell.to_string()));
@@ -117,7 +117,7 @@ async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usiz
     let began = Instant::now();
     let shipping = shippers.into_iter().map(|(mut shipper, settings)| {
         tokio::spawn(async move {
-            let link = Link::open(&settings).await.unwrap();
+            let link = DatabaseLink::open(&settings).await.unwrap();
             shipper.round(&link).await.unwrap()
         })
     });
@@ -131,7 +131,7 @@ async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usiz
 }
 
 fn files_of(like: &Like) -> usize {
-    like.records.iter().filter(|record| record.kind == Kind::Artefact).count()
+    like.records.iter().filter(|record| record.kind == RecordKind::Artefact).count()
 }
 
 async fn fill(
@@ -141,7 +141,7 @@ async fn fill(
     runs: usize,
     [with_records, repeated]: [usize; 2],
 ) {
-    let link = Link::open(database).await.unwrap();
+    let link = DatabaseLink::open(database).await.unwrap();
     let began = Instant::now();
     let text = "INSERT INTO cell (name, role) SELECT 'cell-' || n, 'cell_' || n FROM generate_series(1, $1) n ON CONFLICT DO NOTHING";
     link.query(text, &[&(cells as i32)]).await.unwrap();

@@ -14,7 +14,7 @@ use regrind::cell::{PvPoints, Tolerance};
 use regrind::drive::AdaptiveOptions;
 use regrind::geometry::{Point, Pose, Vector};
 use regrind::model::{FIRST_BATCH, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, decide, farthest_points};
-use regrind::registration::{Options, Start, register};
+use regrind::registration::{RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::Rng;
 use regrind_sim::form::FormError;
@@ -170,7 +170,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         next.iter().for_each(|&k| tried[k] = Some(batch));
         touched.extend(&next);
         let cloud: Vec<Point> = touched.iter().map(|&k| centres[k]).collect();
-        let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+        let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(nominal, &cloud, &options).expect("a registration");
         let so_far = PartialMeasurement { targets: &targets, tried: &tried, touched: &touched };
         let decision = decide(&found, &given, &so_far, &adaptive.stopping_criteria(true), seed).expect("a model");

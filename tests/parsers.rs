@@ -13,7 +13,7 @@ use proptest::sample::Index;
 use regrind::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, PassObservation};
 use regrind::formats::Learned;
 use regrind::geometry::Grid;
-use regrind::journal::{Entry, Header, Journal, Kind};
+use regrind::journal::{Entry, Header, Journal, RecordKind};
 use regrind_sim::payload;
 use serde_json::json;
 
@@ -288,8 +288,8 @@ fn small_run() -> [(&'static str, Vec<u8>); 2] {
         content: json!({ "recipe": "abc" }),
     };
     let mut journal = Journal::create(&run, header).unwrap();
-    let intent = journal.intend(Entry::new(Kind::Intent, 5, 1, json!({ "command": "register" }))).unwrap();
-    let outcome = Entry { command_id: Some(intent), ..Entry::new(Kind::Outcome, 6, 1, json!({ "z": 1.5 })) };
+    let intent = journal.intend(Entry::new(RecordKind::Intent, 5, 1, json!({ "command": "register" }))).unwrap();
+    let outcome = Entry { command_id: Some(intent), ..Entry::new(RecordKind::Outcome, 6, 1, json!({ "z": 1.5 })) };
     journal.append(outcome).unwrap();
     journal.store("measured.csv", b"1,2,3\n", 7, 1).unwrap();
     journal.close(9, 1, json!("accepted")).unwrap();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use regrind::formats::{read_measured, read_points};
 use regrind::geometry::Pose;
-use regrind::registration::{Options, Start, register};
+use regrind::registration::{RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let (points, measured) = (read_points(nominal)?, read_measured(measured)?);
     let start = if start == "search" { Start::Search } else { Start::Pose(Pose::identity()) };
-    let options = Options { start, ..Options::new(radius.parse()?) };
+    let options = RegistrationOptions { start, ..RegistrationOptions::new(radius.parse()?) };
     let mut times = Vec::new();
     let mut turns = 0;
     for _ in 0..repeats.parse::<usize>()?.max(1) {

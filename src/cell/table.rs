@@ -21,13 +21,13 @@ pub const TABLE_VERSION: u32 = 12;
 
 /// Reaction to an event in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Row {
+pub struct TransitionRow {
     /// State.
     pub state: State,
     /// Name of the event, with the machine that it comes from.
     pub event: String,
     /// Possible answers. There is more than one if the answer depends on the values of the event or on earlier events.
-    pub answers: BTreeSet<Answer>,
+    pub answers: BTreeSet<Reaction>,
 }
 
 /// Name of the command that answers an event which does not fit.
@@ -35,7 +35,7 @@ const REFUSE: &str = "refuse";
 
 /// Possible answer.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Answer {
+pub struct Reaction {
     /// Next state.
     pub next: State,
     /// Commands, by name.
@@ -45,7 +45,7 @@ pub struct Answer {
 /// Next state, and the labels of the commands.
 type LabelledAnswer = (State, Vec<(&'static str, Option<Device>)>);
 
-impl Answer {
+impl Reaction {
     fn from_labels((next, labels): LabelledAnswer) -> Self {
         Self { next, commands: labels.into_iter().map(format_label).collect() }
     }
@@ -57,7 +57,7 @@ impl Answer {
 }
 
 /// Returns the table, sorted by state and event.
-pub fn transition_table() -> Vec<Row> {
+pub fn transition_table() -> Vec<TransitionRow> {
     let mut answers: HashMap<State, Vec<Vec<LabelledAnswer>>> = HashMap::new();
     let mut open: VecDeque<Cell> =
         [HoldOrStop::Hold, HoldOrStop::Stop].into_iter().map(|d| Cell::new(sample_plan(d))).collect();
@@ -87,13 +87,13 @@ pub fn transition_table() -> Vec<Row> {
         }
     }
     let names: Vec<String> = sample_events(0).iter().map(event_label).collect();
-    let mut rows: BTreeMap<(State, &str), BTreeSet<Answer>> = BTreeMap::new();
+    let mut rows: BTreeMap<(State, &str), BTreeSet<Reaction>> = BTreeMap::new();
     for (state, answers) in answers {
         for (name, answers) in names.iter().zip(answers) {
-            rows.entry((state, name)).or_default().extend(answers.into_iter().map(Answer::from_labels));
+            rows.entry((state, name)).or_default().extend(answers.into_iter().map(Reaction::from_labels));
         }
     }
-    rows.into_iter().map(|((state, event), answers)| Row { state, event: event.to_owned(), answers }).collect()
+    rows.into_iter().map(|((state, event), answers)| TransitionRow { state, event: event.to_owned(), answers }).collect()
 }
 
 /// Returns everything that decides the answer of a cell, without times and counts, and only as fine as the table needs.

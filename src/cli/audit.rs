@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use regrind::journal::{
-    Anchor, DATABASE, ExternalEvidence, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against,
+    Anchor, DATABASE, ExternalEvidence, JournalError, RecordKind, PublicKey, Reader, Record, Verified, verify_against,
 };
 use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};
@@ -94,7 +94,7 @@ struct ToShow {
     run: Option<PathBuf>,
     /// Only records of these kinds: begin, reopen, intent, outcome, event, artefact, note, seal, end
     #[arg(long, value_name = "KIND,...", value_delimiter = ',', value_parser = kind)]
-    kind: Vec<Kind>,
+    kind: Vec<RecordKind>,
     /// Only records of this cycle
     #[arg(long, value_name = "N")]
     cycle: Option<u32>,
@@ -133,8 +133,8 @@ enum Format {
     Csv,
 }
 
-fn kind(word: &str) -> Result<Kind, String> {
-    let known = || Kind::ALL.map(Kind::as_str).join(", ");
+fn kind(word: &str) -> Result<RecordKind, String> {
+    let known = || RecordKind::ALL.map(RecordKind::as_str).join(", ");
     word.parse().map_err(|()| format!("give one of {}", known()))
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
 use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, is_live, send_request};
-use regrind::journal::{Kind, MachineLock, Reader};
+use regrind::journal::{RecordKind, MachineLock, Reader};
 use regrind_control::{is_live_at, send_request_at};
 
 use super::Outcome;
@@ -275,7 +275,7 @@ pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
         let Ok(reader) = Reader::open(folder) else { return false };
         let mut records = reader.records(0).filter_map(Result::ok);
         let is_run = records.next().is_some_and(|first| first.value()["content"]["recover"] != true);
-        is_run && !records.any(|record| record.kind == Kind::End)
+        is_run && !records.any(|record| record.kind == RecordKind::End)
     };
     let mut all: Vec<_> = folders(runs).collect();
     all.sort_by_cached_key(|folder| began(folder));

@@ -7,9 +7,9 @@ use std::time::{Duration, SystemTime};
 use clap::Args;
 use regrind::cell::{Actor, Device};
 use regrind::config::{CellConfig, LinkConfig};
-use regrind::device::{Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, State};
+use regrind::device::{Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, MachineState};
 use regrind::drive::recovery::{self, RecoveryError, RecoveryStep, describe_status, read_status};
-use regrind::journal::{Header, Journal, Kind, MachineLock, Reader};
+use regrind::journal::{Header, Journal, RecordKind, MachineLock, Reader};
 use regrind::setup;
 use serde_json::json;
 
@@ -126,7 +126,7 @@ impl Recovery {
         loop {
             let seen = read_status(&mut machine).await.map_err(failed)?;
             super::print(&format!("{mark}{}: {}\n", machine.name(), describe_status(&seen)))?;
-            if matches!(seen.state, State::Stopping | State::Aborting) {
+            if matches!(seen.state, MachineState::Stopping | MachineState::Aborting) {
                 // The machine is changing its state by itself.
                 tokio::time::sleep(BETWEEN_LOOKS).await;
                 continue;
@@ -145,7 +145,7 @@ impl Recovery {
             match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await
             {
                 // A new state is shown. Without a change the same question would repeat for ever.
-                Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
+                Ok(now) if now.state == seen.state && now.state != MachineState::Idle => return Ok(false),
                 Ok(_) | Err(RecoveryError::Changed { .. }) => {}
                 Err(error) => return Err(failed(error)),
             }
@@ -157,7 +157,7 @@ impl Recovery {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;
             let begin = reader.records(0).next()?.ok()?.value();
-            let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End));
+            let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == RecordKind::End));
             Some(begin["content"]["job"] == job && !ended)
         };
         // The record of this recovery is open for writing. Reading it here as well would release its lock.

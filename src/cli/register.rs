@@ -10,7 +10,7 @@ use regrind::formats::{
 };
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, Interval, IsoFigures, ModelInputs, SlopeFigures};
-use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
+use regrind::registration::{Coordinate, Loss, Method, RegistrationOptions, ProbeSide, Start, register};
 use regrind::surface::{DistanceModel, Nominal, NominalKind, PlaneProjection};
 
 use super::choice::word_of;
@@ -141,14 +141,14 @@ fn method(arguments: &Arguments) -> Method {
     if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
 }
 
-fn options(arguments: &Arguments) -> Result<Options, Failure> {
+fn options(arguments: &Arguments) -> Result<RegistrationOptions, Failure> {
     let method = method(arguments);
     let radius_mm = match (arguments.probe_radius, method) {
         (Some(radius_mm), _) => radius_mm,
         (None, Method::Contact) => 0.0,
         (None, _) => return Err(Failure::NoProbeRadius),
     };
-    Ok(Options {
+    Ok(RegistrationOptions {
         method,
         distance_model: arguments.distance,
         loss: arguments.loss,
@@ -162,7 +162,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         },
         outlier_sigmas: arguments.outlier_sigmas,
         rms_limit_mm: arguments.max_rms,
-        ..Options::new(radius_mm)
+        ..RegistrationOptions::new(radius_mm)
     })
 }
 

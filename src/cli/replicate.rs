@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use regrind::config::PlantConfig;
 use regrind_live::{CellStatus, RunStatus};
-use regrind_plant::{Link, PlantError, ReplicationResult, Replicator};
+use regrind_plant::{DatabaseLink, PlantError, ReplicationResult, Replicator};
 use serde_json::json;
 
 use super::cell_monitor::CellMonitor;
@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 struct Replication<'a> {
     config: PlantConfig,
     shipper: Replicator,
-    link: Option<Link>,
+    link: Option<DatabaseLink>,
     arguments: &'a Arguments,
     /// Last known status of the cell. `None` while it is being read.
     monitor: Option<CellMonitor>,
@@ -135,7 +135,7 @@ impl Replication<'_> {
 
     /// Replicates new records and the status of the cell.
     async fn round(&mut self) -> Result<ReplicationResult, Failure> {
-        if self.link.as_ref().is_none_or(Link::is_closed) {
+        if self.link.as_ref().is_none_or(DatabaseLink::is_closed) {
             self.link = Some(plant::open(&self.config).await?);
         }
         let Some(link) = &self.link else { return Ok(ReplicationResult::default()) };
@@ -192,7 +192,7 @@ impl Replication<'_> {
 }
 
 /// Sends the status of the cell to the plant. An unknown status is not sent: the plant then detects the silence.
-async fn send_status(link: &Link, told: &CellStatus) -> Result<(), PlantError> {
+async fn send_status(link: &DatabaseLink, told: &CellStatus) -> Result<(), PlantError> {
     match &told.run_status {
         RunStatus::Active { run, snapshot } => {
             link.report_state(Some(run), &serde_json::to_value(snapshot).unwrap_or_default()).await

@@ -11,7 +11,7 @@ use regrind::config::CellConfig;
 use regrind::drive::{InterruptedRun, Request, Task};
 use regrind::formats::{FormatError, Learned};
 use regrind::journal::{
-    Artefact, DATABASE, Entry, Journal, JournalError, Kind, LOCK, Reader, RunLock, may_be_lost, newest_cycle, verify,
+    Artefact, DATABASE, Entry, Journal, JournalError, RecordKind, LOCK, Reader, RunLock, may_be_lost, newest_cycle, verify,
 };
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -104,7 +104,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         if let Some(what) = &begun.lost {
             let remark = format!("gone on with by --despite-loss, though the end of the record may be lost: {what}");
             let Actor { name: actor, station } = live.actor.clone();
-            let note = Entry::new(Kind::Note, 0, begun.cycle, json!({ "remark": remark }));
+            let note = Entry::new(RecordKind::Note, 0, begun.cycle, json!({ "remark": remark }));
             let entry = Entry { actor, station, ..note };
             journal.append(entry).map_err(Failure::Journal)?;
         }
@@ -175,7 +175,7 @@ impl RunStart {
         if let Some(what) = lost.clone().filter(|_| !despite_loss) {
             return Err(refused(what));
         }
-        if !records().any(|record| record.kind == Kind::Event) {
+        if !records().any(|record| record.kind == RecordKind::Event) {
             return Err(Failure::NotBegun { run: run.to_owned() });
         }
         let first = records().next().map(|record| record.value());
@@ -191,7 +191,7 @@ impl RunStart {
                 format!("it decides by table {}, and this program by table {TABLE_VERSION}", begun.table_version);
             return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
         }
-        for record in records().filter(|record| record.kind == Kind::Artefact) {
+        for record in records().filter(|record| record.kind == RecordKind::Artefact) {
             let file: Artefact = serde_json::from_value(record.value()).map_err(|error| Failure::EarlierRun {
                 run: run.to_owned(),
                 program: program.clone(),

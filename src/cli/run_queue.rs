@@ -8,9 +8,9 @@ use clap::Args;
 use regrind::config::{BUILT_IN_CELL, PlantConfig};
 use regrind::drive::is_live;
 use regrind::formats::{ResultFolder, write_atomic};
-use regrind::journal::{DATABASE, Kind, Reader};
+use regrind::journal::{DATABASE, RecordKind, Reader};
 use regrind::recipe::Recipe;
-use regrind_plant::{LEASE, Lease, Link, PlantError, PlantRecipe, StartedPart};
+use regrind_plant::{LEASE, Lease, DatabaseLink, PlantError, PlantRecipe, StartedPart};
 
 use super::failure::Failure;
 use super::{Outcome, check, plant, recover, run as making};
@@ -185,7 +185,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
 
 /// Returns true if a person at the cell confirms the part, or if the recipe needs no confirmation. Renews the lease
 /// while it waits.
-async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
+async fn confirmed(link: &DatabaseLink, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
     if let Some(serial) = &arguments.part {
         return Ok(*serial == lease.serial);
     }
@@ -207,7 +207,7 @@ async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Argu
 }
 
 /// Returns an error if a part that began here has not ended. No further part is taken then.
-async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
+async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure> {
     for begun in StartedPart::all(link).await? {
         let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
         let nothing = match run_progress(&folder) {
@@ -281,8 +281,8 @@ fn run_progress(folder: &Path) -> RunProgress {
     let mut far = RunProgress::Nowhere;
     for record in reader.records(0) {
         far = match record.map(|record| record.kind) {
-            Ok(Kind::End) => return RunProgress::Over,
-            Ok(Kind::Intent | Kind::Event) | Err(_) => RunProgress::UnderWay,
+            Ok(RecordKind::End) => return RunProgress::Over,
+            Ok(RecordKind::Intent | RecordKind::Event) | Err(_) => RunProgress::UnderWay,
             Ok(_) if far == RunProgress::Nowhere => RunProgress::Begun,
             Ok(_) => far,
         };

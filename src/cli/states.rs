@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::cell::{Answer, Row, transition_table};
+use regrind::cell::{Reaction, TransitionRow, transition_table};
 use regrind::report::{save_text, state_picture};
 use serde_json::{Value, json};
 
@@ -44,7 +44,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         return Ok(Outcome::Accepted);
     }
     let wanted = arguments.state.as_deref().unwrap_or_default().to_lowercase();
-    let chosen: Vec<&Row> =
+    let chosen: Vec<&TransitionRow> =
         rows.iter().filter(|row| row.state.to_string().to_lowercase().starts_with(&wanted)).collect();
     if chosen.is_empty() {
         let mut known: Vec<String> = rows.iter().map(|row| row.state.name().to_string()).collect();
@@ -60,15 +60,15 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 /// Returns true if an event has an effect.
-fn acts(row: &Row, answer: &Answer) -> bool {
+fn acts(row: &TransitionRow, answer: &Reaction) -> bool {
     !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
 }
 
-fn shown(row: &Row, all: bool) -> impl Iterator<Item = &Answer> {
+fn shown(row: &TransitionRow, all: bool) -> impl Iterator<Item = &Reaction> {
     row.answers.iter().filter(move |answer| all || acts(row, answer))
 }
 
-fn document(rows: &[&Row], all: bool) -> Value {
+fn document(rows: &[&TransitionRow], all: bool) -> Value {
     let rows = rows.iter().filter(|row| shown(row, all).next().is_some()).map(|row| {
         let answers: Vec<Value> = shown(row, all)
             .map(|answer| json!({ "next": answer.next.to_string(), "commands": answer.commands }))
@@ -78,7 +78,7 @@ fn document(rows: &[&Row], all: bool) -> Value {
     rows.collect()
 }
 
-fn text(rows: &[&Row], all: bool) -> String {
+fn text(rows: &[&TransitionRow], all: bool) -> String {
     let mut text = String::new();
     let mut state = None;
     for row in rows {

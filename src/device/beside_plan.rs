@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use crate::{Coordinates, Measurement, Plan, PointStatus, TargetKind};
+use crate::{Coordinates, Measurement, Plan, TouchStatus, TargetKind};
 use regrind_core::geometry::{Point, Vector, fit_rigid};
 
 /// Reason why a measurement does not belong to the plan.
@@ -49,7 +49,7 @@ impl Plan {
     /// * [`PlanMismatch::OffTarget`]: a point is too far from its target, or the fit needs too large a rotation.
     pub fn check(&self, measurement: &Measurement) -> Result<(), PlanMismatch> {
         let pairs = measurement.points.iter().zip(&self.targets);
-        let part = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.kind == TargetKind::Part);
+        let part = pairs.filter(|(p, t)| p.status == TouchStatus::Touched && t.kind == TargetKind::Part);
         let radius_mm = if measurement.coordinates == Coordinates::Centres { self.probe_radius_mm } else { 0.0 };
         let (mut found, mut contacts, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
         for (point, target) in part {
@@ -123,7 +123,7 @@ fn rounding_mm(value_mm: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{MeasuredPoint, Target};
+    use crate::{MeasuredPoint, PlanTarget};
 
     /// Returns a plan of 5 by 4 targets on a bowl, 8 mm apart.
     fn plan() -> Plan {
@@ -131,7 +131,7 @@ mod tests {
             let (x, y) = (8.0 * f64::from(k % 5) - 16.0, 8.0 * f64::from(k / 5) - 12.0);
             let normal = Vector::new(-x / 100.0, -y / 100.0, 1.0).normalize();
             let point_mm = [x, y, (x * x + y * y) / 200.0];
-            Target { index: k, kind: TargetKind::Part, point_mm, normal: normal.into() }
+            PlanTarget { index: k, kind: TargetKind::Part, point_mm, normal: normal.into() }
         };
         Plan {
             targets: (0..20).map(target).collect(),
@@ -171,7 +171,7 @@ mod tests {
             let target = &plan.targets[order(k)];
             let centre = Point::from(target.point_mm) + Vector::from(target.normal) * (1.5 + error_mm(k));
             let at_mm = [centre.x, centre.y, centre.z].map(|v| (v * scale).round() / scale);
-            MeasuredPoint { index: k as u32, status: PointStatus::Touched, quality: 0, position_mm: at_mm }
+            MeasuredPoint { index: k as u32, status: TouchStatus::Touched, quality: 0, position_mm: at_mm }
         };
         measurement((0..plan.targets.len()).map(touch).collect(), Coordinates::Centres)
     }
@@ -185,9 +185,9 @@ mod tests {
             let part = |k: usize| if k == 7 { 5.0 * 10f64.powi(-digits) } else { 0.0 };
             assert_eq!(plan.check(&measured(&plan, digits, part, |k| k)), Ok(()), "{digits}");
         }
-        let contacts = |target: &Target| MeasuredPoint {
+        let contacts = |target: &PlanTarget| MeasuredPoint {
             index: target.index,
-            status: PointStatus::Touched,
+            status: TouchStatus::Touched,
             quality: 0,
             position_mm: target.point_mm,
         };

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{Answer, Command, Fault, Job, MachineKind, State};
+use super::{Answer, MachineCommand, Fault, Job, MachineKind, MachineState};
 
 /// Answer of a machine, or the reason why there is no answer.
 pub(super) type DeviceResult<T> = Result<T, DeviceError>;
@@ -57,7 +57,7 @@ pub enum DeviceError {
         "{machine} did not acknowledge {command} number {sequence} (its last is {acknowledged}) after {tries} tries: \
          its application may have stopped, or its program does not follow docs/modbus.md"
     )]
-    NotAcknowledged { machine: Arc<str>, command: Command, sequence: u32, acknowledged: u32, tries: u32 },
+    NotAcknowledged { machine: Arc<str>, command: MachineCommand, sequence: u32, acknowledged: u32, tries: u32 },
     /// It is unknown whether the job was begun. The start is never repeated; see
     /// [`Machine::reconcile`](super::Machine::reconcile).
     #[error(
@@ -128,10 +128,10 @@ pub enum DeviceError {
     // -----------------------------------------------------------------------------------------------
     /// The machine refused a command.
     #[error("{machine} refused {command} in {state}: {answer}")]
-    Refused { machine: Arc<str>, command: Command, answer: Answer, state: State },
+    Refused { machine: Arc<str>, command: MachineCommand, answer: Answer, state: MachineState },
     /// The machine has a fault.
     #[error("{machine} is {state} with a fault: {fault}")]
-    Faulted { machine: Arc<str>, state: State, fault: Fault },
+    Faulted { machine: Arc<str>, state: MachineState, fault: Fault },
     /// The machine refused a payload.
     #[error("{machine} refused the {payload}: {answer}")]
     PayloadRefused { machine: Arc<str>, payload: &'static str, answer: Answer },
@@ -222,7 +222,7 @@ pub enum DeviceError {
         "{machine} is in {state} and has no finished result of {job}: a result is available from COMPLETE until it \
          is acknowledged"
     )]
-    NoResult { machine: Arc<str>, job: Job, state: State },
+    NoResult { machine: Arc<str>, job: Job, state: MachineState },
     /// An I++ DME server refused a method with an error number.
     #[error("{machine} refused {method} with {error}; check the machine's own panel, then clear")]
     MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },

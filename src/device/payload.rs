@@ -21,7 +21,7 @@ pub enum TargetKind {
 
 /// Point to be probed, in the frame of the CMM.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Target {
+pub struct PlanTarget {
     /// Number of the target, which the measured point repeats.
     pub index: u32,
     /// Object to which it belongs.
@@ -36,7 +36,7 @@ pub struct Target {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// Targets, in the order in which they are probed.
-    pub targets: Vec<Target>,
+    pub targets: Vec<PlanTarget>,
     /// Radius of the probe for which the plan is made, in mm.
     pub probe_radius_mm: f64,
     /// Distance from the point to the surface of the ball at which the probe turns into the normal, in mm.
@@ -98,7 +98,7 @@ pub struct Pass {
 
 /// Result of probing a target.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum PointStatus {
+pub enum TouchStatus {
     /// The probe touched; the coordinates are valid.
     Touched,
     /// The probe searched and touched nothing.
@@ -113,7 +113,7 @@ pub struct MeasuredPoint {
     /// Number of its target.
     pub index: u32,
     /// Result of probing the target.
-    pub status: PointStatus,
+    pub status: TouchStatus,
     /// Quality from 0 (good) to 100 (bad).
     pub quality: u16,
     /// Position in the frame of the CMM, in mm: centre of the probe or contact point, as the measurement says.

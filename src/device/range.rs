@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::{DeviceError, Measurement, PassRecord, PointStatus, SignalValue};
+use super::{DeviceError, Measurement, PassRecord, TouchStatus, SignalValue};
 
 /// Possible range of a value.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -93,7 +93,7 @@ impl Measurement {
             .or_else(|| DURATION.violation(self.duration_s))
             .or_else(|| PROBE_RADIUS.violation(self.probe_radius_mm));
         of_whole.or_else(|| {
-            let mut touched = self.points.iter().filter(|point| point.status == PointStatus::Touched);
+            let mut touched = self.points.iter().filter(|point| point.status == TouchStatus::Touched);
             touched.find_map(|point| {
                 let of_place = point.position_mm.into_iter().find_map(|at_mm| COORDINATE.violation(Some(at_mm)));
                 let flaw = of_place.or_else(|| QUALITY.violation(Some(f64::from(point.quality))))?;
@@ -121,8 +121,8 @@ mod tests {
     use crate::{Coordinates, MeasuredPoint};
 
     fn measurement() -> Measurement {
-        let point = MeasuredPoint { index: 7, status: PointStatus::Touched, quality: 0, position_mm: [1.0, 2.0, 3.0] };
-        let missed = MeasuredPoint { index: 8, status: PointStatus::NotFound, quality: 0, position_mm: [f64::NAN; 3] };
+        let point = MeasuredPoint { index: 7, status: TouchStatus::Touched, quality: 0, position_mm: [1.0, 2.0, 3.0] };
+        let missed = MeasuredPoint { index: 8, status: TouchStatus::NotFound, quality: 0, position_mm: [f64::NAN; 3] };
         Measurement {
             points: vec![point, missed],
             coordinates: Coordinates::Centres,

@@ -177,7 +177,7 @@ pub enum Reconciled {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u16)]
 #[expect(missing_docs, reason = "the same words as the methods of `Machine`")]
-pub enum Command {
+pub enum MachineCommand {
     Claim = 1,
     Prepare = 2,
     Start = 3,
@@ -190,7 +190,7 @@ pub enum Command {
     Release = 10,
 }
 
-impl fmt::Display for Command {
+impl fmt::Display for MachineCommand {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Claim => "CLAIM",
@@ -209,7 +209,7 @@ impl fmt::Display for Command {
 
 /// State of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum State {
+pub enum MachineState {
     /// Nothing is prepared and nothing runs.
     Idle,
     /// A job is checked; START would begin it.
@@ -232,14 +232,14 @@ pub enum State {
     Faulted,
 }
 
-impl State {
+impl MachineState {
     /// Returns true if something may be moving.
     pub fn is_moving(self) -> bool {
         matches!(self, Self::Execute | Self::Holding | Self::Stopping | Self::Aborting)
     }
 }
 
-impl fmt::Display for State {
+impl fmt::Display for MachineState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Idle => "IDLE",
@@ -428,7 +428,7 @@ impl SignalValue {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Status {
     /// State of the machine.
-    pub state: State,
+    pub state: MachineState,
     /// Job that is prepared, running or finished.
     pub job: Option<Job>,
     /// Sequence number of the START whose job ended last; 0 if there is none.
@@ -455,7 +455,7 @@ pub struct Status {
 
 impl Status {
     /// Returns the status of a machine that reports nothing but its state.
-    pub(super) fn from_state(state: State) -> Self {
+    pub(super) fn from_state(state: MachineState) -> Self {
         Self {
             state,
             job: None,

@@ -51,7 +51,7 @@ use crate::device::{
     PassRecord, PreliminaryPoints, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
-use crate::journal::{self, Artefact, Entry, Kind};
+use crate::journal::{self, Artefact, Entry, RecordKind};
 
 pub use blocking_executor::{BlockingExecutor, BlockingWork};
 use cycles::Cycles;
@@ -609,7 +609,7 @@ impl Drive {
     fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let origin = (actor.name.clone(), actor.station.clone());
         let payload = json!({ "remark": what });
-        let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
+        let ticket = self.recorder.append(entry(RecordKind::Note, self.now(), self.cell.cycle(), origin, payload));
         if let Some(answer) = answer {
             let then = RecordAction::Answer { answer, accepted: true, message: "recorded".into() };
             self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
@@ -626,7 +626,7 @@ impl Drive {
                 payload.extend([("confirmed".to_owned(), json!(confirmed)), ("device".to_owned(), json!(device))]);
             }
             let origin = (actor.name.clone(), actor.station.clone());
-            let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
+            let ticket = self.recorder.append(entry(RecordKind::Note, self.now(), self.cell.cycle(), origin, payload));
             let (told, taken) = oneshot::channel();
             self.backlog.push_back(PendingRecord {
                 receipt: ticket,
@@ -698,7 +698,7 @@ impl Drive {
             self.status.send_replace(self.snapshot());
             if !messages.is_empty() {
                 let payload = json!({ "device": device, "notes": messages });
-                self.record_note(Kind::Note, (device.to_string(), "wire".into()), payload);
+                self.record_note(RecordKind::Note, (device.to_string(), "wire".into()), payload);
                 self.notify(Notice::Note { device, messages });
             }
         }
@@ -707,7 +707,7 @@ impl Drive {
         }
         if let Some(FetchedResult::Record(record)) = &fetched {
             let payload = json!({ "pass_record": pass_record::pass_record_document(record) });
-            self.record_note(Kind::Note, ("grinder".into(), "wire".into()), payload);
+            self.record_note(RecordKind::Note, ("grinder".into(), "wire".into()), payload);
             if let Some(why) = self.pass_record_flaw(record) {
                 self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), why }, None).await;
             }
@@ -754,7 +754,7 @@ impl Drive {
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
-        self.record_note(Kind::Note, ("cmm".into(), "wire".into()), payload);
+        self.record_note(RecordKind::Note, ("cmm".into(), "wire".into()), payload);
         self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
@@ -830,21 +830,21 @@ impl Drive {
         if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
             map.insert("detail".into(), detail);
         }
-        let ticket = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload));
+        let ticket = self.recorder.append(entry(RecordKind::Event, now, self.cell.cycle(), event.origin(), payload));
         // Record the outcome of each command that the event answers.
         let (answered, open): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.open_commands).into_iter().partition(|(_, c)| outcome::answers(event, c));
         self.open_commands = open;
         for (intent, _) in answered {
             let payload = json!({ "event": event.name() });
-            let record = entry(Kind::Outcome, now, self.cell.cycle(), event.origin(), payload);
+            let record = entry(RecordKind::Outcome, now, self.cell.cycle(), event.origin(), payload);
             let ticket = self.recorder.append_outcome(intent, record);
             self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
         }
         ticket
     }
 
-    fn record_note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
+    fn record_note(&mut self, kind: RecordKind, actor: (String, String), payload: Value) {
         let ticket = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload));
         self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
     }
@@ -865,13 +865,13 @@ impl Drive {
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
             map.insert("intent".into(), self.armed[*device as usize].clone().unwrap_or(Value::Null));
         }
-        let record = Entry::new(Kind::Intent, recorder::nanoseconds(self.now()), self.cell.cycle(), payload);
+        let record = Entry::new(RecordKind::Intent, recorder::nanoseconds(self.now()), self.cell.cycle(), payload);
         let ticket = if outcome::expects_answer(&command) {
             let (intent, ticket) = self.recorder.append_intent(record);
             self.open_commands.push((intent, command.clone()));
             ticket
         } else {
-            self.recorder.append(Entry { kind: Kind::Note, ..record })
+            self.recorder.append(Entry { kind: RecordKind::Note, ..record })
         };
         let then =
             if is_immediate(&command) { RecordAction::Nothing } else { RecordAction::Execute(Box::new(command)) };

@@ -18,7 +18,7 @@ use crate::compensation::{
     self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map,
     estimate_response,
 };
-use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus, TargetKind};
+use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TouchStatus, TargetKind};
 use crate::form::pv_998;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
@@ -27,7 +27,7 @@ use crate::formats::{
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
 use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
-use crate::registration::{Options, PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
+use crate::registration::{RegistrationOptions, PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
 
 use super::adaptive_measurement;
 use super::cycle_output;
@@ -116,17 +116,17 @@ fn merge_repeated_touches(
             "the machine returned {found} points, at least {planned} are required"
         )));
     }
-    let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
+    let found = measurement.points.iter().filter(|point| point.status == TouchStatus::Touched).count();
     let (repeated, rest) = measurement.points.split_at(outliers);
     let (controls, around) = rest.split_at(again.control_points.len());
     check_control_points(again, points, controls)?;
     let mut all = points.clone();
     all.repeat_rounds += 1;
-    for (point, &number) in repeated.iter().zip(&again.outlier_points).filter(|(p, _)| p.status == PointStatus::Touched)
+    for (point, &number) in repeated.iter().zip(&again.outlier_points).filter(|(p, _)| p.status == TouchStatus::Touched)
     {
         all.part[number] = point.position_mm.into();
     }
-    all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.position_mm)));
+    all.part.extend(around.iter().filter(|p| p.status == TouchStatus::Touched).map(|p| Point::from(p.position_mm)));
     Ok((all, found as u32))
 }
 
@@ -141,7 +141,7 @@ fn check_control_points(
     points: &UsablePoints,
     repeated: &[MeasuredPoint],
 ) -> Result<(), GateFailure> {
-    let pairs = again.control_points.iter().zip(repeated).filter(|(_, p)| p.status == PointStatus::Touched);
+    let pairs = again.control_points.iter().zip(repeated).filter(|(_, p)| p.status == TouchStatus::Touched);
     let change_mm = |control: &ControlPoint, now: &MeasuredPoint| {
         (Point::from(now.position_mm) - points.part[control.point_index]).dot(&control.normal).abs()
     };
@@ -167,10 +167,10 @@ fn check_control_points(
 /// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
 /// the points that the operator took.
 fn touched_points(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
-    let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.position_mm.into());
+    let taken = measurement.points.iter().filter(|p| p.status == TouchStatus::Touched).map(|p| p.position_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
         let pairs = measurement.points.iter().zip(&plan.targets);
-        let touched = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.kind == kind);
+        let touched = pairs.filter(|(p, t)| p.status == TouchStatus::Touched && t.kind == kind);
         touched.map(|(p, _)| p.position_mm.into()).collect()
     };
     let part = if planned == 0 { taken.collect() } else { of(TargetKind::Part) };
@@ -240,7 +240,7 @@ impl TouchRecord {
             so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
         if !asked.is_empty() {
             let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.kind == TargetKind::Part);
-            let found = pairs.zip(asked).filter(|((p, _), _)| p.status == PointStatus::Touched);
+            let found = pairs.zip(asked).filter(|((p, _), _)| p.status == TouchStatus::Touched);
             of.extend(found.map(|(_, target)| *target));
             tried.push(asked.to_vec());
         }
@@ -312,7 +312,7 @@ fn repeated_result_failure(
     measurement: &Measurement,
 ) -> Option<GateFailure> {
     let (number, points) = earlier.filter(|_| !task.rehearsal)?;
-    let touched = || measurement.points.iter().filter(|point| point.status == PointStatus::Touched);
+    let touched = || measurement.points.iter().filter(|point| point.status == TouchStatus::Touched);
     // Ignore the order of the plan and the points of the reference sphere.
     let bits = |at_mm: [f64; 3]| at_mm.map(f64::to_bits);
     let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
@@ -546,7 +546,7 @@ fn write_registration(
     task: &Task,
     files: &mut OutputFiles,
     found: &Registration,
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Result<(), FormatError> {
     let nominal = NominalInput {
         file: &task.nominal_path,
@@ -911,7 +911,7 @@ mod tests {
         let points = heights_mm.iter().zip(x_mm).zip(0..).map(|((height, x), index)| MeasuredPoint {
             index,
             position_mm: [x, 0.0, height.unwrap_or(0.0)],
-            status: if height.is_some() { PointStatus::Touched } else { PointStatus::NotFound },
+            status: if height.is_some() { TouchStatus::Touched } else { TouchStatus::NotFound },
             quality: 0,
         });
         Measurement {

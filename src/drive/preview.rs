@@ -3,7 +3,7 @@
 
 use regrind_control::PreviewStatistics;
 
-use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, PreliminaryPoints, TargetKind};
+use crate::device::{Coordinates, Job, MeasuredPoint, Plan, TouchStatus, PreliminaryPoints, TargetKind};
 
 /// Sums over the touches of the part received for a job so far.
 #[derive(Debug, Default)]
@@ -32,7 +32,7 @@ impl PreviewAccumulator {
         }
         self.received_points += points.len();
         let part = points.iter().zip(due).filter(|(_, target)| target.kind == TargetKind::Part);
-        for (point, target) in part.filter(|(point, _)| point.status == PointStatus::Touched) {
+        for (point, target) in part.filter(|(point, _)| point.status == TouchStatus::Touched) {
             let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
             self.add_deviation(deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
         }
@@ -66,12 +66,12 @@ fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::device::Target;
+    use crate::device::PlanTarget;
 
     const JOB: Job = Job { job: 1, cycle: 1, digest: 7 };
 
     fn plan() -> Plan {
-        let target = |index: u32| Target {
+        let target = |index: u32| PlanTarget {
             index,
             kind: if index == 0 { TargetKind::ReferenceSphere } else { TargetKind::Part },
             point_mm: [f64::from(index), 0.0, 5.0],
@@ -92,7 +92,7 @@ mod tests {
     fn centres(from: u32, proud_mm: &[f64]) -> PreliminaryPoints {
         let point = |(index, proud): (u32, &f64)| MeasuredPoint {
             index,
-            status: PointStatus::Touched,
+            status: TouchStatus::Touched,
             quality: 0,
             position_mm: [f64::from(index) + (2.0 + proud) * 0.6 + 0.8, 0.3, 5.0 + (2.0 + proud) * 0.8 - 0.6],
         };
@@ -106,7 +106,7 @@ mod tests {
         assert_eq!(touching.statistics(), None);
         touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
         let mut rest = centres(2, &[-0.004, 9.0]);
-        rest.points[1].status = PointStatus::NotFound;
+        rest.points[1].status = TouchStatus::NotFound;
         touching.add_points(&plan(), &rest);
         let told = touching.statistics().unwrap();
         assert_eq!(told.touched, 2);

@@ -14,7 +14,7 @@ use tokio::sync::{mpsc, oneshot};
 use super::blocking_executor::{BlockingExecutor, BlockingWork};
 use crate::cell::RecordFailure;
 use crate::formats::{FormatError, ResultFolder};
-use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, Kind};
+use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, RecordKind};
 
 /// Result of a record: resolves when it is on the disk, or when it is certain that it never will be.
 pub(super) type RecordReceipt = oneshot::Receiver<Result<(), RecordFailure>>;
@@ -252,7 +252,7 @@ impl JournalWriter {
             }
             JournalTask::Outcome(intent, entry) => {
                 let command_id = self.command_ids.get(intent).copied();
-                journal.append(Entry { kind: Kind::Outcome, command_id, ..Entry::clone(entry) })?;
+                journal.append(Entry { kind: RecordKind::Outcome, command_id, ..Entry::clone(entry) })?;
                 self.command_ids.remove(intent);
                 Ok(())
             }
@@ -363,7 +363,7 @@ fn record_failure(error: JournalError) -> RecordFailure {
 }
 
 /// Creates an entry for an event.
-pub(super) fn entry(kind: Kind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
+pub(super) fn entry(kind: RecordKind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
     let (actor, station) = actor;
     Entry { actor, station, ..Entry::new(kind, nanoseconds(now), cycle, payload) }
 }

@@ -9,8 +9,8 @@ use tokio::time::Instant;
 
 use super::recorder::nanoseconds;
 use crate::cell::{Actor, Device};
-use crate::device::{Answer, DeviceError, Fault, Machine, State, Status};
-use crate::journal::{Entry, Journal, JournalError, Kind};
+use crate::device::{Answer, DeviceError, Fault, Machine, MachineState, Status};
+use crate::journal::{Entry, Journal, JournalError, RecordKind};
 
 /// Interval between two status reads of a machine in motion.
 const STATUS_INTERVAL: Duration = Duration::from_millis(200);
@@ -43,16 +43,16 @@ pub enum RecoveryError {
     #[error("the {device} was {shown} and is now {found}; no command was sent; check the machine again")]
     Changed { device: Device, shown: String, found: String },
     #[error("the {device} is still {found} after {} s; check the machine, then run the command again", .limit.as_secs())]
-    TimedOut { device: Device, found: State, limit: Duration },
+    TimedOut { device: Device, found: MachineState, limit: Duration },
 }
 
 impl RecoveryStep {
     /// Returns the next step for a machine in a state, or `None` if it is idle. A machine that moves is stopped.
-    pub fn for_state(state: State) -> Option<Self> {
+    pub fn for_state(state: MachineState) -> Option<Self> {
         match state {
-            State::Idle => None,
-            State::Complete => Some(Self::Acknowledge),
-            State::Aborted | State::Faulted => Some(Self::Clear),
+            MachineState::Idle => None,
+            MachineState::Complete => Some(Self::Acknowledge),
+            MachineState::Aborted | MachineState::Faulted => Some(Self::Clear),
             _ => Some(Self::Stop),
         }
     }
@@ -114,7 +114,7 @@ pub async fn execute_step<M: Machine>(
         Entry { actor, station, ..Entry::new(kind, nanoseconds(began.elapsed()), 0, payload) }
     };
     let payload = json!({ "recover": step.name(), "device": device, "seen": describe_status(&found) });
-    let intent = journal.intend(by(Kind::Intent, payload))?;
+    let intent = journal.intend(by(RecordKind::Intent, payload))?;
     let given = match step {
         RecoveryStep::Stop => machine.stop().await,
         RecoveryStep::Acknowledge => machine.acknowledge(found.done).await,
@@ -125,7 +125,7 @@ pub async fn execute_step<M: Machine>(
         Err(error) => Err(error.into()),
     };
     let told = ended.as_ref().map_or_else(ToString::to_string, describe_status);
-    journal.append(Entry { command_id: Some(intent), ..by(Kind::Outcome, json!({ "found": told })) })?;
+    journal.append(Entry { command_id: Some(intent), ..by(RecordKind::Outcome, json!({ "found": told })) })?;
     // Optional: a machine whose owner is silent can be claimed by the next client.
     let _ = machine.release().await;
     ended
@@ -149,7 +149,7 @@ async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError
 pub fn describe_status(status: &Status) -> String {
     let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
     let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
-    let result = if status.state == State::Complete { format!(", result {}", status.done) } else { String::new() };
+    let result = if status.state == MachineState::Complete { format!(", result {}", status.done) } else { String::new() };
     format!("{}{job}{fault}{result}", status.state)
 }
 

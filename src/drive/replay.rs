@@ -32,7 +32,7 @@ use super::{Computation, Task, batch_folder, create_folder, cycle_folder};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
-use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
+use crate::journal::{Artefact, JournalError, RecordKind, Reader, Record, sha256_hex};
 
 /// Folder for the repeated computations, below the run folder; removed afterwards.
 const SCRATCH: &str = "replay";
@@ -165,25 +165,25 @@ impl<'t> Replay<'t> {
         self.replayed.elapsed = self.replayed.elapsed.max(Duration::from_nanos(record.mono_ns));
         let payload = record.value();
         match record.kind {
-            Kind::Begin | Kind::End | Kind::Seal => Ok(()),
+            RecordKind::Begin | RecordKind::End | RecordKind::Seal => Ok(()),
             // Decisions that the program had not recorded when it ended were not executed.
-            Kind::Reopen => {
+            RecordKind::Reopen => {
                 self.due_commands.clear();
                 Ok(())
             }
-            Kind::Artefact => {
+            RecordKind::Artefact => {
                 self.add_recorded_file(serde_json::from_value(payload).map_err(|error| self.unreadable(&error))?);
                 Ok(())
             }
-            Kind::Outcome => {
+            RecordKind::Outcome => {
                 self.replayed.open_commands.retain(|id, _| Some(*id) != record.command_id);
                 Ok(())
             }
-            Kind::Event => self.apply_event(Duration::from_nanos(record.mono_ns), payload),
-            Kind::Intent | Kind::Note if payload["command"].is_string() => {
+            RecordKind::Event => self.apply_event(Duration::from_nanos(record.mono_ns), payload),
+            RecordKind::Intent | RecordKind::Note if payload["command"].is_string() => {
                 self.compare_command(record.command_id, payload)
             }
-            Kind::Intent | Kind::Note => {
+            RecordKind::Intent | RecordKind::Note => {
                 let told = &payload["transfer"]["coordinates"];
                 if !told.is_null() {
                     let told = serde_json::from_value(told.clone()).map_err(|error| self.unreadable(&error))?;

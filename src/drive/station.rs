@@ -21,7 +21,7 @@ use crate::cell::{
 };
 use crate::device::{
     Armed, BatchId, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement,
-    OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue, State, Status,
+    OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue, MachineState, Status,
     digest,
 };
 
@@ -223,7 +223,7 @@ pub(super) struct MachineTask<B> {
 struct ObservedState {
     connected: bool,
     link_lost: bool,
-    state: Option<State>,
+    state: Option<MachineState>,
     progress: Option<(u32, u32)>,
     progress_reported_at: Option<Instant>,
     supplies_missing: bool,
@@ -442,16 +442,16 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     fn has_foreign_job(&self, status: &Status) -> bool {
-        let at_a_job = status.state.is_moving() || matches!(status.state, State::Held | State::Complete);
+        let at_a_job = status.state.is_moving() || matches!(status.state, MachineState::Held | MachineState::Complete);
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
     /// Returns the occupation of a machine at the connection. A preparation of a client that is gone is taken back.
     async fn occupation(&mut self, status: &Status) -> Occupation {
         match status.state {
-            State::Idle => Occupation::Idle,
-            State::Aborted | State::Faulted => Occupation::ToClear,
-            State::Prepared => match self.driver.machine().stop().await {
+            MachineState::Idle => Occupation::Idle,
+            MachineState::Aborted | MachineState::Faulted => Occupation::ToClear,
+            MachineState::Prepared => match self.driver.machine().stop().await {
                 Ok(_) => Occupation::Idle,
                 Err(error) => Occupation::Busy(error.to_string()),
             },
@@ -504,7 +504,7 @@ impl<B: StationDriver> MachineTask<B> {
         let job = Job { job: self.job, cycle: number.encode(), digest };
         let prepared = async {
             // A preparation whose answer was lost is still active but unknown here, so ask the machine.
-            if self.driver.machine().status().await?.state == State::Prepared {
+            if self.driver.machine().status().await?.state == MachineState::Prepared {
                 self.driver.machine().stop().await?;
             }
             self.driver.machine().prepare(job).await
@@ -514,7 +514,7 @@ impl<B: StationDriver> MachineTask<B> {
                 let detail = intent_document(&armed);
                 self.armed = Some(armed);
                 self.cycle = cycle;
-                self.observed.state = Some(State::Prepared);
+                self.observed.state = Some(MachineState::Prepared);
                 self.report_with_detail(Event::Prepared { device: B::DEVICE, cycle }, Some(detail)).await;
             }
             Err(error) => self.report_failure(MachineRequest::Prepare, error).await,
@@ -543,7 +543,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match self.driver.machine().start(armed).await {
             Ok(started) => {
-                self.observed.state = Some(State::Execute);
+                self.observed.state = Some(MachineState::Execute);
                 self.observed.at_job = started.status.state.is_moving();
                 let detail = serde_json::json!({ "start_sequence": started.start_sequence });
                 self.report_with_detail(Event::Started { device: B::DEVICE, cycle }, Some(detail)).await;
@@ -572,12 +572,12 @@ impl<B: StationDriver> MachineTask<B> {
             Err(error) if error.is_link() => self.report_link_lost(&error).await,
             // Not in EXECUTE: the status shows if the machine holds already, has ended, or never ran.
             Err(error) => match self.driver.machine().status().await {
-                Ok(status) if status.state == State::Held => {
+                Ok(status) if status.state == MachineState::Held => {
                     self.report(Event::MachineHeld { device: B::DEVICE }).await
                 }
                 // Already on its way to HELD, by its key or a button: the next status reads see it arrive.
-                Ok(status) if status.state == State::Holding => self.report_changes(&status).await,
-                Ok(status) if status.state == State::Complete && self.observed.running => {
+                Ok(status) if status.state == MachineState::Holding => self.report_changes(&status).await,
+                Ok(status) if status.state == MachineState::Complete && self.observed.running => {
                     self.report_changes(&status).await
                 }
                 Ok(status) if !status.state.is_moving() => self.report(Event::MachineHeld { device: B::DEVICE }).await,
@@ -662,10 +662,10 @@ impl<B: StationDriver> MachineTask<B> {
             return self.report(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
         let outcome = match self.driver.machine().reconcile(&armed).await {
-            Ok(Reconciled::Running(status)) if status.state == State::Held => Reconciliation::Held,
+            Ok(Reconciled::Running(status)) if status.state == MachineState::Held => Reconciliation::Held,
             Ok(Reconciled::Running(_)) => Reconciliation::Running,
             Ok(Reconciled::Finished(status)) => {
-                if status.state == State::Complete && self.fetch_pass_record().await.is_err() {
+                if status.state == MachineState::Complete && self.fetch_pass_record().await.is_err() {
                     return;
                 }
                 self.check_early_end(&status).await;
@@ -717,13 +717,13 @@ impl<B: StationDriver> MachineTask<B> {
         let acknowledged = async {
             let status = self.driver.machine().status().await?;
             match status.state {
-                State::Complete => self.driver.machine().acknowledge(status.done).await,
+                MachineState::Complete => self.driver.machine().acknowledge(status.done).await,
                 _ => Ok(status),
             }
         };
         match acknowledged.await {
             // A result that does not exist yet is not acknowledged.
-            Ok(status) if status.state.is_moving() || status.state == State::Held => {
+            Ok(status) if status.state.is_moving() || status.state == MachineState::Held => {
                 let (device, why) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), describe_job(&status)));
                 self.report(Event::Refused { device, what: MachineRequest::Discard, why }).await;
@@ -844,26 +844,26 @@ impl<B: StationDriver> MachineTask<B> {
         self.report_absence(status).await;
         self.report_contradiction(before, status).await;
         match status.state {
-            State::Execute => {
-                if before == Some(State::Held) {
+            MachineState::Execute => {
+                if before == Some(MachineState::Held) {
                     self.report(Event::MachineResumed { device: B::DEVICE }).await;
                 }
                 self.report_progress(status).await;
             }
-            State::Held if before != Some(State::Held) => self.report(Event::MachineHeld { device: B::DEVICE }).await,
-            State::Complete => self.finish_job(status).await,
-            State::Idle if self.observed.stopping => {
+            MachineState::Held if before != Some(MachineState::Held) => self.report(Event::MachineHeld { device: B::DEVICE }).await,
+            MachineState::Complete => self.finish_job(status).await,
+            MachineState::Idle if self.observed.stopping => {
                 self.observed.stopping = false;
                 self.observed.running = false;
                 self.report_end(JobResult::Stopped).await;
             }
-            State::Idle if self.observed.clearing => {
+            MachineState::Idle if self.observed.clearing => {
                 self.observed.clearing = false;
                 let (device, boot_id) = (B::DEVICE, status.boot_id.unwrap_or_default());
                 self.report(Event::Connected { device, boot_id, simulated: false, found: Occupation::Idle }).await;
             }
-            State::Aborted => self.report_abort(before).await,
-            State::Faulted if before != Some(State::Faulted) => {
+            MachineState::Aborted => self.report_abort(before).await,
+            MachineState::Faulted if before != Some(MachineState::Faulted) => {
                 let fault = status.fault.unwrap_or(Fault::Other(0));
                 let (device, code, message) = (B::DEVICE, fault.number(), fault_message(B::DEVICE, fault));
                 self.report(Event::Fault { device, code, message }).await;
@@ -879,11 +879,11 @@ impl<B: StationDriver> MachineTask<B> {
             return;
         }
         let is_another = status.job.is_some_and(|job| job.job != self.job);
-        let at_a_job = status.state.is_moving() || matches!(status.state, State::Held | State::Complete);
+        let at_a_job = status.state.is_moving() || matches!(status.state, MachineState::Held | MachineState::Complete);
         if at_a_job && !is_another {
             (self.observed.at_job, self.observed.reads_without_job) = (true, 0);
         }
-        if !self.observed.at_job || !(matches!(status.state, State::Idle | State::Prepared) || at_a_job && is_another) {
+        if !self.observed.at_job || !(matches!(status.state, MachineState::Idle | MachineState::Prepared) || at_a_job && is_another) {
             return;
         }
         self.observed.reads_without_job += 1;
@@ -894,9 +894,9 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Reports a contradiction in the status of a machine: it reports HELD but makes progress, or took a STOP and
     /// continues.
-    async fn report_contradiction(&mut self, before: Option<State>, status: &Status) {
+    async fn report_contradiction(&mut self, before: Option<MachineState>, status: &Status) {
         let device = B::DEVICE;
-        let is_held = status.state == State::Held && before == Some(State::Held);
+        let is_held = status.state == MachineState::Held && before == Some(MachineState::Held);
         match status.progress.filter(|_| is_held) {
             Some((done, total)) => {
                 let (last, _) = self.observed.progress.replace((done, total)).unwrap_or((done, total));
@@ -912,7 +912,7 @@ impl<B: StationDriver> MachineTask<B> {
             None => self.observed.progress_rises_at_held = 0,
         }
         let is_late = self.observed.stop_accepted_at.is_some_and(|taken| taken.elapsed() > STOP_TIMEOUT);
-        if self.observed.stopping && is_late && status.state == State::Execute {
+        if self.observed.stopping && is_late && status.state == MachineState::Execute {
             self.observed.stop_accepted_at = None;
             let why = format!("it took the STOP, but is still EXECUTE {} s later", STOP_TIMEOUT.as_secs());
             self.report(Event::Refused { device, what: MachineRequest::Stop, why }).await;
@@ -1044,11 +1044,11 @@ impl<B: StationDriver> MachineTask<B> {
         self.report(Event::Ended { device: B::DEVICE, cycle: self.cycle, result }).await;
     }
 
-    async fn report_abort(&mut self, before: Option<State>) {
+    async fn report_abort(&mut self, before: Option<MachineState>) {
         if std::mem::replace(&mut self.observed.aborting, false) {
             self.observed.running = false;
             self.report(Event::AbortConfirmed { device: B::DEVICE }).await;
-        } else if before != Some(State::Aborted) && self.observed.running
+        } else if before != Some(MachineState::Aborted) && self.observed.running
             || std::mem::replace(&mut self.observed.stopping, false)
         {
             self.observed.running = false;

@@ -9,14 +9,14 @@ use crate::compensation::{
     Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MachineSimilarity, MapOptions, NextPassError,
     ParameterCorrections, ParameterEstimation, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm,
 };
-use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
+use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, PlanTarget, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{DeviationSample, Grid, Point, Pose, Vector};
 use crate::measuring::{self, ThermalExpansion, sphere_targets};
 use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
 use crate::registration::{
-    Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
+    Deviation, MapLimits, Method, RegistrationOptions, PointStatus, Registration, RegistrationError, Start, register,
 };
 use crate::surface::Nominal;
 
@@ -49,7 +49,7 @@ pub struct Task {
     /// Pose of the part in the fixture.
     pub fixture_cmm_from_model: Pose,
     /// Options of the registration. The start and the level are set for each cycle.
-    pub registration_options: Options,
+    pub registration_options: RegistrationOptions,
     /// True if a registration starts from the fixture pose.
     pub start_at_fixture: bool,
     /// Expected kind of coordinates; `None` if each result states it.
@@ -433,7 +433,7 @@ impl Task {
         &self,
         points: &[Point],
         probe_radius_mm: f64,
-    ) -> Result<(Registration, Options), RegistrationError> {
+    ) -> Result<(Registration, RegistrationOptions), RegistrationError> {
         self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
@@ -446,17 +446,17 @@ impl Task {
         points: &[Point],
         probe_radius_mm: f64,
         start_at_fixture: bool,
-    ) -> Result<(Registration, Options), RegistrationError> {
+    ) -> Result<(Registration, RegistrationOptions), RegistrationError> {
         let at_fixture = Start::Pose(self.fixture_cmm_from_model);
         let start = if start_at_fixture { at_fixture } else { Start::Search };
         // Contact points, or a level below the nominal surface: there is no offset, so the points lie on the surface.
         let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration_options.method };
-        let options = Options { probe_radius_mm, method, start, ..self.registration_options };
+        let options = RegistrationOptions { probe_radius_mm, method, start, ..self.registration_options };
         let found = register(&self.nominal, points, &options)?;
         if start_at_fixture || !found.quality.weak_directions.iter().any(|weak| weak.held) {
             return Ok((found, options));
         }
-        let options = Options { start: at_fixture, ..options };
+        let options = RegistrationOptions { start: at_fixture, ..options };
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
@@ -551,7 +551,7 @@ impl Task {
         };
         let begin = first.iter().map(|t| on_part(t));
         let rest = rest.iter().map(|t| on_part(t));
-        let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| Target {
+        let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| PlanTarget {
             index: index as u32,
             kind: what,
             point_mm: point.into(),

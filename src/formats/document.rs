@@ -9,7 +9,7 @@ use super::error::FormatError;
 use super::registration::{DeviationRow, write_column, write_deviations, write_json_atomic};
 use regrind_core::geometry::Pose;
 use regrind_core::registration::{
-    Deviation, Iteration, Loss, Method, Options, PointStatus, Registration, WeakDirection,
+    Deviation, Iteration, Loss, Method, RegistrationOptions, PointStatus, Registration, WeakDirection,
 };
 use regrind_core::surface::{DistanceModel, Side};
 
@@ -17,7 +17,7 @@ use regrind_core::surface::{DistanceModel, Side};
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct RegistrationDocument<'a> {
-    pub program: Program,
+    pub program: ProgramVersion,
     /// True if the points come from a simulated machine; absent if that is unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub simulation: Option<bool>,
@@ -62,7 +62,7 @@ pub struct RegistrationDocument<'a> {
 /// Program that wrote the file.
 #[derive(Serialize)]
 #[allow(missing_docs)]
-pub struct Program {
+pub struct ProgramVersion {
     pub name: &'static str,
     pub version: &'static str,
 }
@@ -120,7 +120,7 @@ impl<'a> RegistrationDocument<'a> {
     /// Builds the document from the result of a registration and its inputs.
     pub fn new(
         registration: &'a Registration,
-        options: &Options,
+        options: &RegistrationOptions,
         nominal: NominalInput<'a>,
         measured_file: &'a Path,
     ) -> Self {
@@ -135,7 +135,7 @@ impl<'a> RegistrationDocument<'a> {
             |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
         let names = ["x", "y", "z", "rx", "ry", "rz"];
         Self {
-            program: Program { name: "regrind", version: env!("CARGO_PKG_VERSION") },
+            program: ProgramVersion { name: "regrind", version: env!("CARGO_PKG_VERSION") },
             simulation: None,
             nominal,
             measured: MeasuredInput { file: measured_file },

@@ -82,7 +82,7 @@ pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), Jou
 
 #[cfg(test)]
 mod tests {
-    use super::super::{AuditKey, Entry, ExternalEvidence, Header, Journal, Kind, Reader, verify_against};
+    use super::super::{AuditKey, Entry, ExternalEvidence, Header, Journal, RecordKind, Reader, verify_against};
     use super::*;
     use serde_json::json;
 
@@ -106,8 +106,8 @@ mod tests {
         let mut journal = Journal::create_with(&from, header("run"), Some(key.clone())).unwrap();
         journal.store("cycle-1/points.csv", b"1,2\n", 1, 1).unwrap();
         for k in 0..300 {
-            let id = journal.intend(Entry::new(Kind::Intent, k, 1, json!({ "k": k as f64 / 7.0 }))).unwrap();
-            journal.append(Entry { command_id: Some(id), ..Entry::new(Kind::Outcome, k, 1, json!({})) }).unwrap();
+            let id = journal.intend(Entry::new(RecordKind::Intent, k, 1, json!({ "k": k as f64 / 7.0 }))).unwrap();
+            journal.append(Entry { command_id: Some(id), ..Entry::new(RecordKind::Outcome, k, 1, json!({})) }).unwrap();
         }
         let anchor = journal.close(400, 1, json!("accepted")).unwrap();
         let records: Vec<Record> = Reader::open(&from).unwrap().records(1).map(Result::unwrap).collect();

@@ -102,7 +102,7 @@ fn damage(log: &[u8]) -> Option<String> {
 mod tests {
     use serde_json::json;
 
-    use super::super::record::{Entry, Kind};
+    use super::super::record::{Entry, RecordKind};
     use super::super::write::{Header, Journal};
     use super::*;
 
@@ -121,7 +121,7 @@ mod tests {
         };
         let mut journal = Journal::create(&driven, header).unwrap();
         for k in 0..records {
-            journal.append(Entry::new(Kind::Note, k, 1, json!({ "k": k }))).unwrap();
+            journal.append(Entry::new(RecordKind::Note, k, 1, json!({ "k": k }))).unwrap();
         }
         // Copies the folder while the journal is open: the same state as after a kill.
         let folder = home.path().join("run");

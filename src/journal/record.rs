@@ -16,7 +16,7 @@ use super::error::JournalError;
 /// Kind of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Kind {
+pub enum RecordKind {
     /// First record of a run.
     Begin,
     /// The journal was opened again after a crash or a hold.
@@ -38,7 +38,7 @@ pub enum Kind {
     End,
 }
 
-impl Kind {
+impl RecordKind {
     /// All kinds.
     pub const ALL: [Self; 9] = [
         Self::Begin,
@@ -68,7 +68,7 @@ impl Kind {
     }
 }
 
-impl FromStr for Kind {
+impl FromStr for RecordKind {
     type Err = ();
 
     fn from_str(word: &str) -> Result<Self, ()> {
@@ -86,7 +86,7 @@ pub struct Entry {
     /// Place of the actor: a terminal, a computer or an address.
     pub station: String,
     /// Kind of the record.
-    pub kind: Kind,
+    pub kind: RecordKind,
     /// Number of the cycle; 0 before the first.
     pub cycle: u32,
     /// Number of the command that this record belongs to. [`super::Journal::intend`] assigns the number of an intent.
@@ -99,7 +99,7 @@ pub struct Entry {
 
 impl Entry {
     /// Returns an entry of the cell itself, with this program as its station.
-    pub fn new(kind: Kind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
+    pub fn new(kind: RecordKind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
         let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
         Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
     }
@@ -122,7 +122,7 @@ pub struct Record {
     /// Place of the actor.
     pub station: String,
     /// Kind of the record.
-    pub kind: Kind,
+    pub kind: RecordKind,
     /// Serial number of the part.
     pub part: String,
     /// Number of the cycle; 0 before the first.

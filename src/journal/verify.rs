@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::artefact::{Artefact, describe, path_within, temporary_name};
 use super::error::JournalError;
 use super::key::PublicKey;
-use super::record::{Kind, Record};
+use super::record::{RecordKind, Record};
 use super::seal::{Seal, is_signed};
 use super::{ANCHOR, DATABASE, LOCK, Reader};
 
@@ -290,26 +290,26 @@ impl<'a> VerifierState<'a> {
         if let Some(flaw) = record.successor_flaw(self.records, &self.head) {
             return wrong(&flaw);
         }
-        if (record.kind == Kind::Begin) != (due == 1) {
+        if (record.kind == RecordKind::Begin) != (due == 1) {
             return wrong("only the first record can begin a run, and it must");
         }
         // Only one seal can follow the end.
-        if self.ended.is_some_and(|end| record.kind != Kind::Seal || end < self.records) {
+        if self.ended.is_some_and(|end| record.kind != RecordKind::Seal || end < self.records) {
             return wrong("it follows the end of the run");
         }
         if serde_json::from_str::<serde::de::IgnoredAny>(&record.payload).is_err() {
             return wrong("its payload is not JSON");
         }
         match record.kind {
-            Kind::Begin | Kind::Reopen => self.check_key(record)?,
-            Kind::Intent | Kind::Outcome => self.check_command(record)?,
-            Kind::Artefact => self.check_artefact(record)?,
-            Kind::Seal => self.check_seal(record)?,
-            Kind::Event | Kind::Note | Kind::End => {}
+            RecordKind::Begin | RecordKind::Reopen => self.check_key(record)?,
+            RecordKind::Intent | RecordKind::Outcome => self.check_command(record)?,
+            RecordKind::Artefact => self.check_artefact(record)?,
+            RecordKind::Seal => self.check_seal(record)?,
+            RecordKind::Event | RecordKind::Note | RecordKind::End => {}
         }
         self.records = due;
         self.head.clone_from(&record.hash);
-        if record.kind == Kind::End {
+        if record.kind == RecordKind::End {
             self.ended = Some(due);
         }
         Ok(())
@@ -318,7 +318,7 @@ impl<'a> VerifierState<'a> {
     fn check_key(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
         let value = record.value();
-        if record.kind == Kind::Begin {
+        if record.kind == RecordKind::Begin {
             value["run"].as_str().unwrap_or_default().clone_into(&mut self.run);
         }
         self.key = match &value["key"] {
@@ -332,7 +332,7 @@ impl<'a> VerifierState<'a> {
             _ if self.trusted.is_empty() => None,
             Some(key) if self.trusted.contains(&key) => None,
             Some(key) => Some(format!("record {} names the key {key}, which is not one of the given keys", record.seq)),
-            None if record.kind == Kind::Begin => Some("the run is not signed".to_owned()),
+            None if record.kind == RecordKind::Begin => Some("the run is not signed".to_owned()),
             None => Some(format!("it was resumed at record {} without a key", record.seq)),
         };
         self.no_author = self.no_author.take().or(no_author);
@@ -381,8 +381,8 @@ impl<'a> VerifierState<'a> {
     fn check_command(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
         match (record.kind, record.command_id) {
-            (Kind::Intent, None) => return wrong("a command has no number"),
-            (Kind::Intent, Some(id)) => {
+            (RecordKind::Intent, None) => return wrong("a command has no number"),
+            (RecordKind::Intent, Some(id)) => {
                 if self.last_intent.is_some_and(|last| id <= last) {
                     return wrong("its command number was already used");
                 }
@@ -445,10 +445,10 @@ mod tests {
         let mut journal = Journal::create_with(folder, header, Some(AuditKey::new())).unwrap();
         for k in 0..48 {
             let entry = |kind| Entry { reason: "why \u{b5}".into(), ..Entry::new(kind, k, 1, json!({ "k": k })) };
-            let id = journal.intend(entry(Kind::Intent)).unwrap();
+            let id = journal.intend(entry(RecordKind::Intent)).unwrap();
             match k {
                 7 => drop(journal.store("points.csv", b"1,2\n", k, 1).unwrap()),
-                _ => drop(journal.append(Entry { command_id: Some(id), ..entry(Kind::Outcome) }).unwrap()),
+                _ => drop(journal.append(Entry { command_id: Some(id), ..entry(RecordKind::Outcome) }).unwrap()),
             }
         }
         journal.close(99, 1, json!("accepted")).unwrap();

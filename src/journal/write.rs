@@ -14,7 +14,7 @@ use super::clock::utc;
 use super::error::JournalError;
 use super::key::AuditKey;
 use super::locked_file::LockedFile;
-use super::record::{Entry, Kind, Record, Records, signed, whole};
+use super::record::{Entry, RecordKind, Record, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
 use super::{ANCHOR, DATABASE, LOCK, open, system};
@@ -126,7 +126,7 @@ impl Journal {
             "run": journal.run, "simulation": simulation, "first_command_id": first_command_id, "content": content,
             "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public),
         });
-        journal.append(Entry { actor, station, ..Entry::new(Kind::Begin, 0, 0, payload) })?;
+        journal.append(Entry { actor, station, ..Entry::new(RecordKind::Begin, 0, 0, payload) })?;
         journal.anchor()?;
         Ok(journal)
     }
@@ -176,7 +176,7 @@ impl Journal {
         journal.is_whole()?;
         let payload =
             json!({ "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public) });
-        journal.append(Entry::new(Kind::Reopen, 0, journal.tail.cycle, payload))?;
+        journal.append(Entry::new(RecordKind::Reopen, 0, journal.tail.cycle, payload))?;
         journal.anchor()?;
         Ok(journal)
     }
@@ -232,10 +232,10 @@ impl Journal {
     pub fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
         let wrong = |what| Err(JournalError::Entry { kind: entry.kind.as_str(), what });
         match (entry.kind, entry.command_id) {
-            (Kind::Intent, _) => wrong("gets its command number from `intend`"),
-            (Kind::Outcome, None) => wrong("requires the command number of its intent"),
-            (Kind::Begin, _) if self.tail.seq > 0 => wrong("must be the first"),
-            (Kind::Seal, _) => wrong("is written by the journal itself"),
+            (RecordKind::Intent, _) => wrong("gets its command number from `intend`"),
+            (RecordKind::Outcome, None) => wrong("requires the command number of its intent"),
+            (RecordKind::Begin, _) if self.tail.seq > 0 => wrong("must be the first"),
+            (RecordKind::Seal, _) => wrong("is written by the journal itself"),
             _ => self.insert(entry).map(|record| record.seq),
         }
     }
@@ -245,7 +245,7 @@ impl Journal {
     /// # Errors
     /// Those of [`Journal::append`]: then the command must not be executed.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
-        let entry = Entry { kind: Kind::Intent, ..entry };
+        let entry = Entry { kind: RecordKind::Intent, ..entry };
         let stands = self.reread_tail()?.filter(|record| record.is_of(&entry));
         if let Some(id) = stands.and_then(|record| record.command_id) {
             return Ok(id);
@@ -330,7 +330,7 @@ impl Journal {
         self.reread_tail()?;
         if !self.tail.closed {
             let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
-            self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
+            self.append(Entry::new(RecordKind::End, mono_ns, cycle, payload))?;
         }
         let anchor = self.anchor()?;
         // The run is complete: from now on, closing the database writes the log into it.
@@ -341,7 +341,7 @@ impl Journal {
     fn register(&mut self, artefact: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         if !self.artefacts.contains_key(&artefact.name) {
             let payload = json!({ "name": artefact.name, "bytes": artefact.bytes, "sha256": artefact.sha256 });
-            self.append(Entry::new(Kind::Artefact, mono_ns, cycle, payload))?;
+            self.append(Entry::new(RecordKind::Artefact, mono_ns, cycle, payload))?;
             self.artefacts.insert(artefact.name.clone(), artefact.sha256.clone());
         }
         Ok(artefact)
@@ -351,7 +351,7 @@ impl Journal {
     fn seal(&mut self) -> Result<(), JournalError> {
         let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
         let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
-        self.put(Entry::new(Kind::Seal, self.tail.mono_ns, self.tail.cycle, json!(seal)))?;
+        self.put(Entry::new(RecordKind::Seal, self.tail.mono_ns, self.tail.cycle, json!(seal)))?;
         self.seal = Some(seal);
         Ok(())
     }
@@ -398,7 +398,7 @@ impl Journal {
         if let Some(stands) = self.reread_tail()?.filter(|record| record.is_of(&entry)) {
             return Ok(stands);
         }
-        if self.tail.closed && entry.kind != Kind::Seal {
+        if self.tail.closed && entry.kind != RecordKind::Seal {
             return Err(JournalError::Closed { path: self.folder.clone() });
         }
         self.is_in_place()?;
@@ -409,9 +409,9 @@ impl Journal {
         }
         self.tail.seq = record.seq;
         self.tail.hash.clone_from(&record.hash);
-        self.tail.closed |= record.kind == Kind::End;
+        self.tail.closed |= record.kind == RecordKind::End;
         (self.tail.mono_ns, self.tail.cycle) = (record.mono_ns, record.cycle);
-        if record.kind == Kind::Intent {
+        if record.kind == RecordKind::Intent {
             self.tail.last_command_id = record.command_id;
         }
         Ok(record)
@@ -451,7 +451,7 @@ impl Journal {
         self.tail = read_tail(&self.connection, &self.folder)?;
         let stands = self.tail.hash == record.hash;
         let stands = self.doubtful.take().filter(|_| stands);
-        if let Some(record) = stands.as_ref().filter(|record| record.kind == Kind::Seal) {
+        if let Some(record) = stands.as_ref().filter(|record| record.kind == RecordKind::Seal) {
             self.seal = serde_json::from_str(&record.payload).ok();
         }
         Ok(stands)
@@ -526,7 +526,7 @@ fn boot_id() -> String {
 fn first_of(connection: &Connection, folder: &Path) -> Result<(String, String, u32), JournalError> {
     let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq: 1, what: what.to_owned() };
     let first = Records::new(connection, folder, 0).next().ok_or_else(|| broken("there is no record"))??;
-    if first.kind != Kind::Begin {
+    if first.kind != RecordKind::Begin {
         return Err(broken("it is not the beginning of a run"));
     }
     let value = first.value();

@@ -5,14 +5,14 @@ use std::fs;
 use std::path::Path;
 
 use regrind_journal::{
-    Anchor, ExternalEvidence, JournalError, Kind, PublicKey, Reader, Record, Verified, restore, restore_file,
+    Anchor, ExternalEvidence, JournalError, RecordKind, PublicKey, Reader, Record, Verified, restore, restore_file,
     verify_against,
 };
 use serde_json::Value;
 
 use super::error::{PlantError, refused};
 use super::hex::digits;
-use super::link::Link;
+use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
 /// Run in the plant.
@@ -37,7 +37,7 @@ impl PlantRun {
     ///
     /// # Errors
     /// There is no such run, or the plant cannot be reached.
-    pub async fn find(link: &Link, cell: Option<&str>, name: &str) -> Result<Self, PlantError> {
+    pub async fn find(link: &DatabaseLink, cell: Option<&str>, name: &str) -> Result<Self, PlantError> {
         let failed = refused("to find a run");
         let text = "SELECT r.id, c.name, r.name, r.records, r.head,
                 array(SELECT k.key FROM cell_key k WHERE k.cell = c.id ORDER BY k.since, k.key)
@@ -85,7 +85,7 @@ impl PlantRun {
     /// The folder is in use, a record is not one that a journal writes, or the plant cannot be reached.
     pub async fn fetch(
         &self,
-        link: &Link,
+        link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
         folder: &Path,
     ) -> Result<(), PlantError> {
@@ -104,7 +104,7 @@ impl PlantRun {
     }
 
     /// Returns the records of the run, in order.
-    async fn records(&self, link: &Link, folder: &Path) -> Result<Vec<Record>, PlantError> {
+    async fn records(&self, link: &DatabaseLink, folder: &Path) -> Result<Vec<Record>, PlantError> {
         const PAGE: i32 = 5000;
         let mut records: Vec<Record> = Vec::new();
         let mut head = "0".repeat(64);
@@ -153,7 +153,7 @@ impl PlantRun {
 /// Returns the newest seal among the records, as the anchor next to the journal had it at that time; without a seal,
 /// the end of the records.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
-    let Some(seal) = records.iter().rev().find(|record| record.kind == Kind::Seal).map(Record::value) else {
+    let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal).map(Record::value) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));
     };
     let word = |value: &Value, key: &str| value[key].as_str().map(str::to_owned);
@@ -171,7 +171,7 @@ fn last_sealed(records: &[Record]) -> Option<Anchor> {
 /// # Errors
 /// The plant cannot be reached, or the folder of large files does not exist.
 pub async fn content(
-    link: &Link,
+    link: &DatabaseLink,
     artefacts: Option<&ArtefactSettings>,
     sha256: &[u8],
 ) -> Result<Option<Vec<u8>>, PlantError> {

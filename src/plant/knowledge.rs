@@ -13,7 +13,7 @@ use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
 use super::hex::digits;
-use super::link::Link;
+use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
 /// Maximum size of a file of learned results, the same as in the layout of the database.
@@ -52,7 +52,7 @@ impl Knowledge {
     /// The plant cannot be reached, or the role is not a cell's. A fault of one result is in the answer and is reported
     /// to the plant.
     pub async fn query(
-        link: &Link,
+        link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
         (kind, simulation): (&str, bool),
     ) -> Result<Self, PlantError> {
@@ -80,7 +80,7 @@ impl Knowledge {
     /// Verifies the delivered results, and reports to the plant those that cannot be believed.
     async fn verify_results(
         &mut self,
-        link: &Link,
+        link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
         (rows, simulation): (Vec<Row>, bool),
     ) -> Result<Vec<DeliveredResult>, PlantError> {
@@ -135,7 +135,7 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
 
 /// Registers in the plant what a finished run of this cell has learned; all files of the run have arrived. Returns the
 /// reason if the plant refuses.
-pub(crate) async fn teach(link: &Link, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
+pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";
     let Some(row) = link.client().query_opt(text, &[&id, &LEARNED]).await.map_err(&failed)? else { return Ok(None) };

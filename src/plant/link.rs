@@ -18,13 +18,13 @@ const ANSWER: Duration = Duration::from_secs(120);
 const SILENCE: Duration = Duration::from_secs(30);
 
 /// Connection to the database of a plant. It closes when the last owner drops it.
-pub struct Link {
+pub struct DatabaseLink {
     client: Client,
     /// Address, for messages.
     place: String,
 }
 
-impl Link {
+impl DatabaseLink {
     /// Signs in to the database with the settings.
     ///
     /// # Errors

@@ -11,7 +11,7 @@ use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
 use super::hex::{digits, unhex};
-use super::link::Link;
+use super::link::DatabaseLink;
 use super::settings::Approver;
 
 /// Number of people who must sign a recipe.
@@ -58,7 +58,7 @@ impl PlantRecipe {
     /// # Errors
     /// The recipe exists already under this or another name, the role may not store recipes, or the plant cannot be
     /// reached.
-    pub async fn propose(&mut self, link: &Link) -> Result<String, PlantError> {
+    pub async fn propose(&mut self, link: &DatabaseLink) -> Result<String, PlantError> {
         let failed = refused("the recipe");
         let newest = "SELECT coalesce(max(version), 0) FROM recipe WHERE name = $1";
         let row = link.client().query_one(newest, &[&self.name]).await.map_err(&failed)?;
@@ -78,7 +78,7 @@ impl PlantRecipe {
     ///
     /// # Errors
     /// There is no such recipe, or the plant cannot be reached.
-    pub async fn find(link: &Link, name: &str, version: Option<i32>) -> Result<Self, PlantError> {
+    pub async fn find(link: &DatabaseLink, name: &str, version: Option<i32>) -> Result<Self, PlantError> {
         let text = "SELECT name, version, text, array(SELECT f.name FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY 1),
                 array(SELECT f.content FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name)
             FROM recipe r WHERE name = $1 AND (version = $2 OR $2 IS NULL AND withdrawn_at IS NULL) ORDER BY version DESC LIMIT 1";
@@ -101,7 +101,7 @@ impl PlantRecipe {
     ///
     /// # Errors
     /// The person or the key has signed the recipe already, the role may not sign, or the plant cannot be reached.
-    pub async fn approve(&self, link: &Link, person: &str, key: &AuditKey) -> Result<(), PlantError> {
+    pub async fn approve(&self, link: &DatabaseLink, person: &str, key: &AuditKey) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
         let (bytes, key) = (unhex(&sha256).unwrap_or_default(), key.public().to_string());
@@ -126,7 +126,7 @@ impl PlantRecipe {
     /// # Errors
     /// The recipe does not match its hash, too few people have signed it, or it was withdrawn; the plant receives a
     /// report of this. Or the plant cannot be reached.
-    pub async fn pull(link: &Link, sha256: &str, approvers: &[Approver]) -> Result<(Self, Vec<String>), PlantError> {
+    pub async fn pull(link: &DatabaseLink, sha256: &str, approvers: &[Approver]) -> Result<(Self, Vec<String>), PlantError> {
         let bytes = unhex(sha256).unwrap_or_default();
         let text = "SELECT name, version, text, names, contents, persons, keys, signatures FROM pull_recipe($1)";
         let row = link.client().query_opt(text, &[&bytes]).await.map_err(refused("a recipe"))?;

@@ -15,7 +15,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind_formats::{LEARNED, ResultFolder, write_atomic};
-use regrind_journal::{DATABASE, Kind, Reader, Record, Stamp, sha256_hex, stamp};
+use regrind_journal::{DATABASE, RecordKind, Reader, Record, Stamp, sha256_hex, stamp};
 use regrind_report::{RunResult, RunSummary, run_summary};
 use serde_json::{Value, json};
 use tokio_postgres::types::ToSql;
@@ -24,7 +24,7 @@ use super::copy::PlantRun;
 use super::error::{PlantError, refused};
 use super::hex::{digits, unhex};
 use super::knowledge::teach;
-use super::link::Link;
+use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
 /// Maximum number of records, and of bytes of text, in one batch.
@@ -82,7 +82,7 @@ impl Replicator {
     /// # Errors
     /// The plant cannot be reached, or refuses everything. A fault of one run is in the result, and the other runs
     /// continue.
-    pub async fn round(&mut self, link: &Link) -> Result<ReplicationResult, PlantError> {
+    pub async fn round(&mut self, link: &DatabaseLink) -> Result<ReplicationResult, PlantError> {
         let mut shipped = ReplicationResult::default();
         for (name, stamp) in self.unsettled() {
             match self.replicate_run(link, &name, &mut shipped).await {
@@ -117,7 +117,7 @@ impl Replicator {
     /// Replicates one run; returns true if the plant then has all of it.
     async fn replicate_run(
         &mut self,
-        link: &Link,
+        link: &DatabaseLink,
         name: &str,
         shipped: &mut ReplicationResult,
     ) -> Result<bool, PlantError> {
@@ -134,7 +134,7 @@ impl Replicator {
             there = send_records(link, name, there, &batch).await?;
         }
         let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
-        let is_over = || Ok::<_, PlantError>(matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?);
+        let is_over = || Ok::<_, PlantError>(matches!(last.kind, RecordKind::End | RecordKind::Seal) && has_end(&folder, &last)?);
         if there.records > began_with || is_over()? {
             report_run(link, there.id, &run_overview(&folder)?).await?;
         }
@@ -150,7 +150,7 @@ impl Replicator {
     /// Registers in the plant what a finished run has learned.
     async fn teach(
         &mut self,
-        link: &Link,
+        link: &DatabaseLink,
         folder: &Path,
         run: &str,
         id: i32,
@@ -168,7 +168,7 @@ impl Replicator {
     /// could not be sent.
     async fn give_files(
         &mut self,
-        link: &Link,
+        link: &DatabaseLink,
         folder: &Path,
         run: &str,
         id: i32,
@@ -196,7 +196,7 @@ impl Replicator {
     /// Sends the content of one file; returns the reason if it cannot be sent.
     async fn give_file(
         &self,
-        link: &Link,
+        link: &DatabaseLink,
         path: &Path,
         sha256: &[u8],
         bytes: u64,
@@ -247,14 +247,14 @@ fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantEr
     Ok(write_atomic(&path, content)?)
 }
 
-async fn open_run(link: &Link, name: &str) -> Result<PlantRunState, PlantError> {
+async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, PlantError> {
     let row = link.client().query_one("SELECT id, records, head FROM open_run($1)", &[&name]).await;
     let row = row.map_err(refused("to open a run"))?;
     Ok(PlantRunState { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
 /// Compares a journal with the plant's copy, and reports a difference to the plant.
-async fn compare_with_plant(link: &Link, folder: &Path, run: &str, there: &PlantRunState) -> Result<(), PlantError> {
+async fn compare_with_plant(link: &DatabaseLink, folder: &Path, run: &str, there: &PlantRunState) -> Result<(), PlantError> {
     let copy = PlantRun {
         id: there.id,
         cell: String::new(),
@@ -291,7 +291,7 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
 /// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
 /// the state.
 async fn send_records(
-    link: &Link,
+    link: &DatabaseLink,
     run: &str,
     there: PlantRunState,
     batch: &[Record],
@@ -310,19 +310,19 @@ async fn send_records(
 
 /// Returns true if the run with this last record has its end on record.
 fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
-    if last.kind == Kind::End {
+    if last.kind == RecordKind::End {
         return Ok(true);
     }
     let before = Reader::open(folder)?.records(last.seq - 1).next().transpose()?;
-    Ok(before.is_some_and(|before| before.kind == Kind::End))
+    Ok(before.is_some_and(|before| before.kind == RecordKind::End))
 }
 
-async fn complain(link: &Link, run: &str, what: &str, words: &str) -> Result<(), PlantError> {
+async fn complain(link: &DatabaseLink, run: &str, what: &str, words: &str) -> Result<(), PlantError> {
     let told = link.client().query_one("SELECT complain($1, $2, $3)", &[&run, &what, &words]).await;
     told.map(drop).map_err(refused("the report of a problem"))
 }
 
-async fn report_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> {
+async fn report_run(link: &DatabaseLink, id: i32, told: &Value) -> Result<(), PlantError> {
     let text = told.to_string();
     let asked = link.client().execute("SELECT tell_run($1, $2::text::jsonb)", &[&id, &text]).await;
     asked.map(drop).map_err(refused("the status of a run"))

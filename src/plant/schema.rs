@@ -3,7 +3,7 @@
 use tokio_postgres::Client;
 
 use super::error::{PlantError, refused};
-use super::link::Link;
+use super::link::DatabaseLink;
 
 /// All versions of the layout, each as a migration from the one before. A published migration never changes.
 const MIGRATIONS: [(i32, &str); 6] = [
@@ -26,7 +26,7 @@ const LOCK: i64 = 0x5267_7264_506c_616e;
 ///
 /// # Errors
 /// The role may not, a later program has laid out the database, or its layout was changed by hand.
-pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
+pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
     let failed = refused("its layout");
     let client = link.client_mut();
     let step = client.transaction().await.map_err(&failed)?;
@@ -129,7 +129,7 @@ impl PlantRole {
 /// # Errors
 /// The role may not make roles, or another cell's role has this name.
 pub async fn enrol_cell(
-    link: &mut Link,
+    link: &mut DatabaseLink,
     name: &str,
     role: &str,
     password: &str,
@@ -159,7 +159,7 @@ pub async fn enrol_cell(
 ///
 /// # Errors
 /// The role may not make roles.
-pub async fn enrol(link: &mut Link, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
+pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
     let failed = refused("to enrol the role");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
     make_role(&step, role, password, of.group()).await?;
@@ -190,7 +190,7 @@ async fn make_role(
 ///
 /// # Errors
 /// There is no such cell, or the role may not retire it.
-pub async fn retire_cell(link: &mut Link, name: &str) -> Result<bool, PlantError> {
+pub async fn retire_cell(link: &mut DatabaseLink, name: &str) -> Result<bool, PlantError> {
     let failed = refused("to retire the cell");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
     let text = "UPDATE regrind.cell SET retired_at = now() WHERE name = $1 AND retired_at IS NULL RETURNING format('ALTER ROLE %I NOLOGIN', role)";

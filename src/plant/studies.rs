@@ -7,7 +7,7 @@ use serde_json::Value;
 use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
-use super::link::Link;
+use super::link::DatabaseLink;
 
 /// Duration of the lease of a job. A run takes seconds; for a large part, minutes.
 const LEASE: Duration = Duration::from_secs(1800);
@@ -27,7 +27,7 @@ pub struct Study {
 
 /// Run that a worker has leased.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Job {
+pub struct LeasedRun {
     /// Id of the study.
     pub study: i32,
     /// Number of the job in the study, from 1.
@@ -44,7 +44,7 @@ impl Study {
     ///
     /// # Errors
     /// A study of that name exists, the role may not, or the plant cannot be reached.
-    pub async fn begin(&self, link: &Link, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
+    pub async fn begin(&self, link: &DatabaseLink, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
         let seeds: Vec<i64> = seeds.iter().map(|seed| seed.cast_signed()).collect();
         let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
         let contents: Vec<&[u8]> = self.files.values().map(Vec::as_slice).collect();
@@ -65,7 +65,7 @@ impl Study {
     ///
     /// # Errors
     /// The role is not a worker's, or the plant cannot be reached.
-    pub async fn read(link: &Link, job: &Job) -> Result<Self, PlantError> {
+    pub async fn read(link: &DatabaseLink, job: &LeasedRun) -> Result<Self, PlantError> {
         let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
         let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
         let (names, contents): (Vec<String>, Vec<Vec<u8>>) = (row.get(2), row.get(3));
@@ -78,12 +78,12 @@ impl Study {
     }
 }
 
-impl Job {
+impl LeasedRun {
     /// Leases the next job; `None` if there is none.
     ///
     /// # Errors
     /// The role is not a worker's, or the plant cannot be reached.
-    pub async fn lease_next(link: &Link) -> Result<Option<Self>, PlantError> {
+    pub async fn lease_next(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
         let row = link.client().query_opt(text, &[&seconds]).await.map_err(refused("a job"))?;
@@ -101,7 +101,7 @@ impl Job {
     ///
     /// # Errors
     /// The plant cannot be reached.
-    pub async fn finish(&self, link: &Link, result: &Result<Value, String>) -> Result<bool, PlantError> {
+    pub async fn finish(&self, link: &DatabaseLink, result: &Result<Value, String>) -> Result<bool, PlantError> {
         let told = match result {
             Ok(told) => told.to_string(),
             Err(why) => serde_json::json!({ "error": why }).to_string(),

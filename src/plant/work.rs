@@ -15,7 +15,7 @@ use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
 use super::hex::digits;
-use super::link::Link;
+use super::link::DatabaseLink;
 
 /// Duration of a lease.
 pub const LEASE: Duration = Duration::from_secs(300);
@@ -49,7 +49,7 @@ impl Lease {
     ///
     /// # Errors
     /// The role is not a cell's, or the plant cannot be reached.
-    pub async fn acquire(link: &Link) -> Result<Option<Self>, PlantError> {
+    pub async fn acquire(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let text = "SELECT id, serial, recipe, due::text, lease FROM take_work($1)";
         let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a part"))?;
         Ok(row.map(|row| Self {
@@ -65,7 +65,7 @@ impl Lease {
     ///
     /// # Errors
     /// The lease has ended, or the plant cannot be reached.
-    pub async fn renew(&self, link: &Link) -> Result<(), PlantError> {
+    pub async fn renew(&self, link: &DatabaseLink) -> Result<(), PlantError> {
         self.ask(link, "SELECT renew_work($1, $2, $3)", &[&self.work, &self.number, &seconds()]).await
     }
 
@@ -73,7 +73,7 @@ impl Lease {
     ///
     /// # Errors
     /// The lease has ended, another run has the part, or the recipe was withdrawn; or the plant cannot be reached.
-    pub async fn begin(&self, link: &Link, run: &str) -> Result<(), PlantError> {
+    pub async fn begin(&self, link: &DatabaseLink, run: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT begin_work($1, $2, $3)", &[&self.work, &self.number, &run]).await
     }
 
@@ -81,11 +81,11 @@ impl Lease {
     ///
     /// # Errors
     /// The lease has ended, or the plant cannot be reached.
-    pub async fn hand_back(&self, link: &Link, why: &str) -> Result<(), PlantError> {
+    pub async fn hand_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &why]).await
     }
 
-    async fn ask(&self, link: &Link, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
+    async fn ask(&self, link: &DatabaseLink, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
         answered(link, self.work, text, values).await
     }
 }
@@ -95,7 +95,7 @@ impl StartedPart {
     ///
     /// # Errors
     /// The role is not a cell's, or the plant cannot be reached.
-    pub async fn all(link: &Link) -> Result<Vec<Self>, PlantError> {
+    pub async fn all(link: &DatabaseLink) -> Result<Vec<Self>, PlantError> {
         let text =
             "SELECT id, serial, recipe, due::text, lease, run FROM work WHERE state = 'begun' ORDER BY begun_at, id";
         let rows = link.client().query(text, &[]).await.map_err(refused("the parts of this cell"))?;
@@ -116,7 +116,7 @@ impl StartedPart {
     ///
     /// # Errors
     /// The run has commanded a machine, or the plant cannot be reached.
-    pub async fn give_back(&self, link: &Link, why: &str) -> Result<(), PlantError> {
+    pub async fn give_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 
@@ -124,13 +124,13 @@ impl StartedPart {
     ///
     /// # Errors
     /// This cell has not begun the part in that run, or the plant cannot be reached.
-    pub async fn give_up(&self, link: &Link, why: &str) -> Result<(), PlantError> {
+    pub async fn give_up(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 }
 
 /// Runs a query for a step of a part. The database answers with the reason if it refuses.
-async fn answered(link: &Link, work: i64, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
+async fn answered(link: &DatabaseLink, work: i64, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
     let row = link.client().query_one(text, values).await.map_err(refused("a part"))?;
     match row.get::<_, Option<String>>(0) {
         Some(why) => Err(PlantError::Work { work, why }),

@@ -199,9 +199,9 @@ impl Recipe {
     }
 
     /// Returns the options of a registration, given the pose of the part in the cell's fixture.
-    pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::Options {
+    pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::RegistrationOptions {
         let settings = &self.registration;
-        registration::Options {
+        registration::RegistrationOptions {
             distance_model: settings.distance,
             start: match settings.start {
                 RegistrationStart::Search => Start::Search,
@@ -212,7 +212,7 @@ impl Recipe {
             loss: settings.loss,
             outlier_sigmas: settings.outlier_sigmas,
             rms_limit_mm: settings.max_rms_um.map(Micrometres::mm),
-            ..registration::Options::new(self.measure.probe_radius_mm)
+            ..registration::RegistrationOptions::new(self.measure.probe_radius_mm)
         }
     }
 

@@ -6,7 +6,7 @@
 use serde_json::Value;
 
 use regrind_cell::{Command, Device, Ending, Event};
-use regrind_journal::{Kind, Record};
+use regrind_journal::{RecordKind, Record};
 
 /// Content of a record. Values are the same as in the record.
 #[derive(Debug)]
@@ -50,17 +50,17 @@ impl RecordContent {
     pub(super) fn from_record(record: &Record) -> Self {
         let value = record.value();
         let told = match record.kind {
-            Kind::Begin => Some(Self::Begun(value.clone())),
-            Kind::Reopen => Some(Self::Reopened),
-            Kind::Artefact => Some(Self::File(value.clone())),
-            Kind::Seal => Some(Self::Seal(value.clone())),
-            Kind::Event => serde_json::from_value(value.clone()).ok().map(|event| Self::Event(Box::new(event))),
-            Kind::Outcome => {
+            RecordKind::Begin => Some(Self::Begun(value.clone())),
+            RecordKind::Reopen => Some(Self::Reopened),
+            RecordKind::Artefact => Some(Self::File(value.clone())),
+            RecordKind::Seal => Some(Self::Seal(value.clone())),
+            RecordKind::Event => serde_json::from_value(value.clone()).ok().map(|event| Self::Event(Box::new(event))),
+            RecordKind::Outcome => {
                 let event = value["event"].as_str().map(|event| event.replace('_', " "));
                 event.or_else(|| value["found"].as_str().map(str::to_owned)).map(Self::Answer)
             }
-            Kind::Intent | Kind::Note => Self::from_command_or_note(&value),
-            Kind::End => Self::from_end(&value["ending"]),
+            RecordKind::Intent | RecordKind::Note => Self::from_command_or_note(&value),
+            RecordKind::End => Self::from_end(&value["ending"]),
         };
         told.unwrap_or(Self::Unknown)
     }

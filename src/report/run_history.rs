@@ -152,7 +152,7 @@ impl RunHistory {
                 self.home = Some(home);
                 self.end = Some(record);
             }
-            RecordContent::Unknown if record.kind == regrind_journal::Kind::End => self.end = Some(record),
+            RecordContent::Unknown if record.kind == regrind_journal::RecordKind::End => self.end = Some(record),
             RecordContent::Reopened
             | RecordContent::Answer(_)
             | RecordContent::Remarks(..)

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::svg::{Anchor, INK, LARGE, Svg};
-use regrind_cell::{Row, State};
+use regrind_cell::{TransitionRow, State};
 
 const WIDTH_PX: f64 = 1300.0;
 const HEIGHT_PX: f64 = 1260.0;
@@ -137,7 +137,7 @@ struct Edge {
 type OccupiedRectangle = ([f64; 2], [f64; 2]);
 
 /// Draws the state machine as SVG from its table.
-pub fn state_picture(rows: &[Row]) -> String {
+pub fn state_picture(rows: &[TransitionRow]) -> String {
     let mut svg = Svg::new(WIDTH_PX, HEIGHT_PX);
     svg.text([20.0, 30.0], Anchor::Start, LARGE, "The cell: states");
     legend(&mut svg);
@@ -159,7 +159,7 @@ pub fn state_picture(rows: &[Row]) -> String {
 /// Events that lead from one place to another, without refused events.
 type TransitionEvents = BTreeMap<(String, String), BTreeSet<String>>;
 
-fn ways(rows: &[Row], name: impl Fn(State) -> Option<String>) -> TransitionEvents {
+fn ways(rows: &[TransitionRow], name: impl Fn(State) -> Option<String>) -> TransitionEvents {
     let mut ways = TransitionEvents::new();
     for row in rows {
         for answer in row.answers.iter().filter(|answer| !answer.is_refusal()) {

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use regrind::device::{
     Cmm, DeviceError, Interrupt, Machine, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan,
-    PreliminaryPoints, State,
+    PreliminaryPoints, MachineState,
 };
 use regrind_sim::body::Kind;
 use regrind_sim::command::State as At;
@@ -81,7 +81,7 @@ async fn poll(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, polls: usize) -> Vec
 
 async fn finish(serving: &Serving, cmm: &mut ModbusCmm, plan: &Plan) -> Result<Measurement, DeviceError> {
     work(serving, 200);
-    wait_for_state(cmm, State::Complete).await?;
+    wait_for_state(cmm, MachineState::Complete).await?;
     cmm.collect(job_of(plan, 1), &Interrupt::new()).await
 }
 
@@ -222,7 +222,7 @@ async fn read_ahead_gives_up_after_refusal() {
         // Another START is another job: reading ahead begins again.
         serving.faults().set(FaultPlan::new(1));
         cmm.stop().await.unwrap();
-        wait_for_state(&mut cmm, State::Complete).await.unwrap();
+        wait_for_state(&mut cmm, MachineState::Complete).await.unwrap();
         let done = cmm.status().await.unwrap().done;
         cmm.acknowledge(done).await.unwrap();
         let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
@@ -304,11 +304,11 @@ async fn read_ahead_one_step_per_poll() {
     assert_eq!(cmm.read_ahead(job, &flag).await, None);
     assert_eq!(read_count(&pages), 0);
     cmm.hold().await.unwrap();
-    wait_for_state(&mut cmm, State::Held).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Held).await.unwrap();
     // Reading of measured points continues during a hold, and ends after an abort.
     assert_eq!(poll(&mut cmm, &plan, 1, 1).await[0].first_index, 2 * FULL);
     cmm.abort().await.unwrap();
-    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Aborted).await.unwrap();
     let none = counted(&serving, FaultPlan::new(0), PAGE);
     assert!(poll(&mut cmm, &plan, 1, 3).await.is_empty());
     assert_eq!(read_count(&none), 0);
@@ -340,7 +340,7 @@ async fn read_ahead_1800_points_over_rtu() {
         let mut cmm = begin_job(settings, &plan).await;
         let loaded = at_first.elapsed();
         let mut came = 0;
-        while cmm.status().await.unwrap().state != State::Complete {
+        while cmm.status().await.unwrap().state != MachineState::Complete {
             let told = cmm.read_ahead(job_of(&plan, 1), &Interrupt::new()).await;
             came += told.map_or(0, |told| told.points.len());
             tokio::time::sleep(Duration::from_millis(50)).await;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use regrind::device::{
     Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine as Driver, ModbusCmm, ModbusGrinder,
-    ModbusSettings, Outcome, Plan, PointStatus, RANGES, RegisterMap, State, Status, Target, TargetKind, ValueRange,
+    ModbusSettings, Outcome, Plan, TouchStatus, RANGES, RegisterMap, MachineState, Status, PlanTarget, TargetKind, ValueRange,
     WordOrder, digest,
 };
 use regrind::geometry::Grid;
@@ -124,7 +124,7 @@ fn rtu(tcp: &[u8]) -> Vec<u8> {
 // ---- what is sent -------------------------------------------------------------------------------------------------------------------
 
 fn plan() -> Plan {
-    let target = Target { index: 70_000, kind: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
+    let target = PlanTarget { index: 70_000, kind: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: vec![target],
         probe_radius_mm: 2.0,
@@ -171,7 +171,7 @@ async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>>
     assert_eq!((status.clear_of_part, status.supplies, status.progress), (Some(true), Some(true), Some((1, 1))));
     assert_eq!((status.temperature_c, status.boot_id), (Some(20.25), Some(BOOT_ID)));
     let points = cmm.collect(job, &calm).await.unwrap().points;
-    assert_eq!((points.len(), points[0].index, points[0].status), (1, 70_000, PointStatus::Touched));
+    assert_eq!((points.len(), points[0].index, points[0].status), (1, 70_000, TouchStatus::Touched));
     assert_eq!(points[0].position_mm, [1.1, -2.3, 2.7]);
     record.lock().unwrap().clone()
 }
@@ -184,7 +184,7 @@ async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<V
     let (mut cmm, one, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
     let target = |k: u32| {
         let [x, y, z] = one.targets[0].point_mm;
-        Target { index: 70_000 + k, point_mm: [x + f64::from(k), y, z], ..one.targets[0] }
+        PlanTarget { index: 70_000 + k, point_mm: [x + f64::from(k), y, z], ..one.targets[0] }
     };
     let plan = Plan { targets: (0..8).map(target).collect(), ..one.clone() };
     let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[plan.identity()]) };
@@ -209,7 +209,7 @@ async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<V
 async fn complete(machine: &mut impl Driver) -> Status {
     for _ in 0..200 {
         let status = machine.status().await.unwrap();
-        if status.state == State::Complete {
+        if status.state == MachineState::Complete {
             return status;
         }
         tokio::time::sleep(Duration::from_millis(2)).await;

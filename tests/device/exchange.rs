@@ -13,7 +13,7 @@ use regrind::device::exchange::{
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
-    Measurement, OperatorConfirmation, Outcome, Plan, PointStatus, Reconciled, State, Target, TargetKind, digest,
+    Measurement, OperatorConfirmation, Outcome, Plan, TouchStatus, Reconciled, MachineState, PlanTarget, TargetKind, digest,
 };
 use regrind::geometry::Grid;
 use tokio::sync::oneshot;
@@ -70,7 +70,7 @@ impl Shop {
 }
 
 fn plan(count: u32) -> Plan {
-    let target = |index| Target {
+    let target = |index| PlanTarget {
         index: 10 + index,
         kind: TargetKind::Part,
         point_mm: [f64::from(index), 0.25, -1e-7],
@@ -336,8 +336,8 @@ fn result_errors_include_remedy() {
     // Targets without a row have a known result: they were not found.
     shop.put("SN_7_c2.csv", &with("index,x,y,z\n12,1,2,3\n10,4,5,6\n"));
     let found = bench.settled().answer.unwrap();
-    let status: Vec<PointStatus> = found.points.iter().map(|p| p.status).collect();
-    assert_eq!(status, [PointStatus::Touched, PointStatus::NotFound, PointStatus::Touched]);
+    let status: Vec<TouchStatus> = found.points.iter().map(|p| p.status).collect();
+    assert_eq!(status, [TouchStatus::Touched, TouchStatus::NotFound, TouchStatus::Touched]);
     assert_eq!(found.points[2].position_mm, [1.0, 2.0, 3.0]);
 }
 
@@ -560,7 +560,7 @@ async fn exchange_cmm_state_sequence() {
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     assert_eq!(answer_of(cmm.prepare(Job { digest: 1, ..job }).await), Answer::OtherJob);
     let armed = cmm.prepare(job).await.unwrap();
-    assert_eq!(cmm.status().await.unwrap().state, State::Prepared);
+    assert_eq!(cmm.status().await.unwrap().state, MachineState::Prepared);
     assert!(shop.handed().is_empty());
     assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
     // A job that was reported as not started does not start any more.
@@ -568,21 +568,21 @@ async fn exchange_cmm_state_sequence() {
     assert!(shop.handed().is_empty());
     let armed = cmm.prepare(job).await.unwrap();
     let started = cmm.start(armed.clone()).await.unwrap();
-    assert_eq!((started.status.state, shop.handed().len()), (State::Execute, 1));
+    assert_eq!((started.status.state, shop.handed().len()), (MachineState::Execute, 1));
     assert_eq!(answer_of(cmm.start(armed.clone()).await), Answer::WrongState);
     assert!(matches!(Cmm::collect(&mut cmm, job, &Interrupt::new()).await, Err(DeviceError::NoResult { .. })));
     // While held, the plan is not in the outbox; after a resume it is.
-    assert_eq!(cmm.hold().await.unwrap().state, State::Held);
+    assert_eq!(cmm.hold().await.unwrap().state, MachineState::Held);
     assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
-    assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
-    assert!(cmm.status().await.unwrap().state == State::Execute && cmm.notes()[0].contains("waiting for"));
+    assert_eq!(cmm.resume().await.unwrap().state, MachineState::Execute);
+    assert!(cmm.status().await.unwrap().state == MachineState::Execute && cmm.notes()[0].contains("waiting for"));
     shop.put("SN_7_c2.csv", &three());
     let status = cmm.status().await.unwrap();
-    assert_eq!((status.state, status.outcome, status.done), (State::Complete, Outcome::Complete, armed.start_sequence));
+    assert_eq!((status.state, status.outcome, status.done), (MachineState::Complete, Outcome::Complete, armed.start_sequence));
     let found = Cmm::collect(&mut cmm, job, &Interrupt::new()).await.unwrap();
     assert_eq!((found.points.len(), found.done), (3, status.done));
     assert_eq!(answer_of(cmm.acknowledge(status.done + 1).await), Answer::OtherResult);
-    assert_eq!(cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
+    assert_eq!(cmm.acknowledge(status.done).await.unwrap().state, MachineState::Idle);
     assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
     assert_eq!(answer_of(cmm.prepare(job).await), Answer::AlreadyBegun);
 }
@@ -611,17 +611,17 @@ async fn hold_and_resume_while_reading_file() {
     File::options().write(true).open(&path).unwrap().set_len(834 + 4 * 3000 * 3000).unwrap();
     let attributes: String = (0..200_000).map(|k| format!(" a{k}=''")).collect();
     shop.put("other.qif", &format!("<QIFDocument{attributes}/>"));
-    assert_eq!(cmm.status().await.unwrap().state, State::Execute);
+    assert_eq!(cmm.status().await.unwrap().state, MachineState::Execute);
     assert_eq!(cmm.notes(), ["reading SN_7_c2.dat, other.qif"]);
-    assert_eq!(cmm.hold().await.unwrap().state, State::Held);
-    assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
+    assert_eq!(cmm.hold().await.unwrap().state, MachineState::Held);
+    assert_eq!(cmm.resume().await.unwrap().state, MachineState::Execute);
     let started = Instant::now();
     while !cmm.notes().iter().any(|note| note.contains("not accepted")) {
         assert!(started.elapsed() < Duration::from_secs(300), "{:?}", cmm.notes());
         tokio::task::yield_now().await;
-        assert_eq!(cmm.status().await.unwrap().state, State::Execute);
+        assert_eq!(cmm.status().await.unwrap().state, MachineState::Execute);
     }
-    assert_eq!(cmm.abort().await.unwrap().state, State::Aborted);
+    assert_eq!(cmm.abort().await.unwrap().state, MachineState::Aborted);
 }
 
 #[tokio::test]
@@ -637,8 +637,8 @@ async fn restarted_client_reconciles_start() {
     cmm.start(armed.clone()).await.unwrap();
     drop(cmm);
     let mut cmm = connected(&shop).await;
-    assert_eq!(cmm.status().await.unwrap().state, State::Execute);
-    assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::Running(s) if s.state == State::Execute));
+    assert_eq!(cmm.status().await.unwrap().state, MachineState::Execute);
+    assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::Running(s) if s.state == MachineState::Execute));
     let other = regrind::device::Armed { start_sequence: 9, ..armed.clone() };
     assert!(matches!(cmm.reconcile(&other).await.unwrap(), Reconciled::Unknown { .. }));
     assert_eq!(cmm.stop().await.unwrap().outcome, Outcome::Stopped);
@@ -651,9 +651,9 @@ async fn restarted_client_reconciles_start() {
     let armed = cmm.prepare(next).await.unwrap();
     assert_eq!(armed.start_sequence, 2);
     cmm.start(armed).await.unwrap();
-    assert_eq!(cmm.abort().await.unwrap().state, State::Aborted);
+    assert_eq!(cmm.abort().await.unwrap().state, MachineState::Aborted);
     assert_eq!(shop.handed(), ["SN_7_j3_c2.stopped", "SN_7_j3_c3.aborted"]);
-    assert_eq!(cmm.clear().await.unwrap().state, State::Idle);
+    assert_eq!(cmm.clear().await.unwrap().state, MachineState::Idle);
 }
 
 #[tokio::test]
@@ -675,10 +675,10 @@ async fn exchange_grinder_by_confirmation() {
     grinder.start(armed).await.unwrap();
     assert!(matches!(grinder.confirm(started([9; 32])).await, Err(DeviceError::Mismatch { .. })));
     grinder.confirm(started(map.identity())).await.unwrap();
-    assert_eq!(grinder.status().await.unwrap().state, State::Execute);
+    assert_eq!(grinder.status().await.unwrap().state, MachineState::Execute);
     grinder.confirm(done).await.unwrap();
     let status = grinder.status().await.unwrap();
-    assert_eq!(status.state, State::Complete);
+    assert_eq!(status.state, MachineState::Complete);
     let record = Grinder::collect(&mut grinder, job, &Interrupt::new()).await.unwrap();
     assert_eq!(record.map_identity, map.identity());
     grinder.acknowledge(status.done).await.unwrap();

@@ -10,7 +10,7 @@ use std::time::Duration;
 use regrind::device::hit_lines::{HitLinesCmm, HitLinesSettings, HitSource, LineFormat, LineParser, Repeated};
 use regrind::device::{
     Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, Measurement, OperatorConfirmation, Outcome, Parity,
-    Plan, PointStatus, State, Target, TargetKind, digest,
+    Plan, TouchStatus, MachineState, PlanTarget, TargetKind, digest,
 };
 use regrind_sim::hits::faults::Fault;
 use regrind_sim::hits::print::Style;
@@ -23,7 +23,7 @@ const LONG: Duration = Duration::from_secs(600);
 fn plan(targets: u32) -> Plan {
     let point_mm = |k: u32| [100.0 + 50.0 * f64::from(k), 200.0, 298.5];
     let what = TargetKind::Part;
-    let target = |k| Target { index: 7 + k, kind: what, point_mm: point_mm(k), normal: [0.0, 0.0, 1.0] };
+    let target = |k| PlanTarget { index: 7 + k, kind: what, point_mm: point_mm(k), normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: (0..targets).map(target).collect(),
         probe_radius_mm: 1.5,
@@ -87,7 +87,7 @@ impl Bench {
         cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
         let armed = cmm.prepare(job).await.unwrap();
         let started = cmm.start(armed).await.unwrap();
-        assert_eq!((started.status.state, started.status.clear_of_part), (State::Execute, None));
+        assert_eq!((started.status.state, started.status.clear_of_part), (MachineState::Execute, None));
         Self { cmm, serving, job, folder }
     }
 
@@ -98,7 +98,7 @@ impl Bench {
     }
 
     /// Waits until this number of targets is touched, and returns the state.
-    async fn until(&mut self, touched: u32, state: State) {
+    async fn until(&mut self, touched: u32, state: MachineState) {
         loop {
             let status = self.cmm.status().await.unwrap();
             if status.state == state && status.progress.unwrap().0 == touched {
@@ -118,7 +118,7 @@ impl Bench {
         assert_eq!(kept, ["cycle-1/plan.csv", "cycle-1/hits.jsonl"]);
         assert!(kept.iter().all(|file| self.folder.path().join(file).is_file()));
         let status = self.cmm.status().await.unwrap();
-        assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete));
+        assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete));
         assert_eq!(status.clear_of_part, Some(true));
         self.cmm.collect(self.job, &Interrupt::new()).await.unwrap()
     }
@@ -151,13 +151,13 @@ async fn hit_formats_over_serial_line() {
         let (begin, rest) = line.split_at(line.len() / 2);
         bench.serving.send(begin).await;
         bench.serving.send(rest).await;
-        bench.until(1, State::Execute).await;
+        bench.until(1, MachineState::Execute).await;
         let measured = bench.done().await;
         assert_eq!(measured.points[0].position_mm, [100.0, 200.0, 300.0], "{format:?}");
-        assert_eq!((measured.points[0].index, measured.points[0].status), (7, PointStatus::Touched));
+        assert_eq!((measured.points[0].index, measured.points[0].status), (7, TouchStatus::Touched));
         assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, None));
         bench.cmm.acknowledge(measured.done).await.unwrap();
-        assert_eq!(bench.cmm.status().await.unwrap().state, State::Idle);
+        assert_eq!(bench.cmm.status().await.unwrap().state, MachineState::Idle);
     }
 }
 
@@ -180,20 +180,20 @@ async fn damaged_hit_line_is_touched_again() {
         let mut bench = Bench::on_serial(4, |_| {}).await;
         let lines = with_fault(&fault);
         bench.serving.send(&lines).await;
-        bench.until(touched, State::Holding).await;
+        bench.until(touched, MachineState::Holding).await;
         let notes = bench.notes();
         assert!(
             notes.contains(why) && notes.contains("then: regrind confirm still --machine cmm"),
             "{fault:?}: {notes}"
         );
         bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
-        bench.until(touched, State::Held).await;
+        bench.until(touched, MachineState::Held).await;
         bench.cmm.resume().await.unwrap();
         // The person looks at the remaining targets, and touches them.
         for k in [1, 2] {
             if bench.cmm.status().await.unwrap().progress.unwrap().0 < 4 && (k == 1 || touched == 2) {
                 bench.serving.send(&Style::default().line([100.0 + 50.0 * f64::from(k), 200.0, 300.0])).await;
-                bench.until(if touched == 2 { 2 + k } else { 4 }, State::Execute).await;
+                bench.until(if touched == 2 { 2 + k } else { 4 }, MachineState::Execute).await;
             }
         }
         let measured = bench.done().await;
@@ -208,7 +208,7 @@ async fn duplicate_hit_line_used_once() {
     let mut bench = Bench::on_serial(4, |_| {}).await;
     bench.serving.send(b"PROBE 1\r\n").await;
     bench.serving.send(&with_fault(&Fault::Twice)).await;
-    bench.until(4, State::Execute).await;
+    bench.until(4, MachineState::Execute).await;
     assert!(bench.notes().contains("1 lines arrived twice and were used once"), "{}", bench.notes());
     bench.done().await;
 }
@@ -217,12 +217,12 @@ async fn duplicate_hit_line_used_once() {
 async fn lost_hit_line_leaves_target_open() {
     let mut bench = Bench::on_serial(4, |_| {}).await;
     bench.serving.send(&with_fault(&Fault::Dropped)).await;
-    bench.until(3, State::Execute).await;
+    bench.until(3, MachineState::Execute).await;
     let named = OperatorConfirmation::Done { map_identity: None, file: Some("x.csv".into()) };
     assert!(bench.cmm.confirm(named).await.unwrap_err().to_string().contains("remove --file"));
     let measured = bench.done().await;
-    let status: Vec<PointStatus> = measured.points.iter().map(|point| point.status).collect();
-    assert_eq!((status[0], status[1]), (PointStatus::Touched, PointStatus::NotFound));
+    let status: Vec<TouchStatus> = measured.points.iter().map(|point| point.status).collect();
+    assert_eq!((status[0], status[1]), (TouchStatus::Touched, TouchStatus::NotFound));
 }
 
 #[tokio::test]
@@ -230,7 +230,7 @@ async fn repeated_touch_replaces_if_configured() {
     for (repeated, first) in [(Repeated::Refuse, true), (Repeated::Replace, false)] {
         let mut bench = Bench::on_serial(2, |settings| settings.repeated = repeated).await;
         bench.serving.send(b"100.000,200.000,300.000\r\n100.010,200.000,300.000\r\n150.000,200.000,300.000\r\n").await;
-        bench.until(2, if first { State::Holding } else { State::Execute }).await;
+        bench.until(2, if first { MachineState::Holding } else { MachineState::Execute }).await;
         let measured = bench.done().await;
         assert_eq!(measured.points[0].position_mm[0], if first { 100.0 } else { 100.01 });
     }
@@ -242,7 +242,7 @@ async fn hit_lines_tcp_loss_preserves_points() {
     let port = serving.local_addr().unwrap().port();
     let mut bench = Bench::new(3, serving, HitSource::Tcp { host: "127.0.0.1".into(), port }, |_| {}).await;
     bench.serving.send(b"100.000,200.000,300.000\r\n150.000,200.0").await;
-    bench.until(1, State::Execute).await;
+    bench.until(1, MachineState::Execute).await;
     bench.serving.hang_up().await;
     let lost = loop {
         if let Err(lost) = bench.cmm.status().await {
@@ -253,7 +253,7 @@ async fn hit_lines_tcp_loss_preserves_points() {
     assert!(lost.is_link(), "{lost}");
     bench.cmm.connect().await.unwrap();
     // A touch in the meantime was lost, and the state of the machine is unknown.
-    bench.until(1, State::Holding).await;
+    bench.until(1, MachineState::Holding).await;
     let notes = bench.notes();
     assert!(
         notes.contains("incomplete") && notes.contains("the connection was lost") && notes.contains("2 targets remain"),
@@ -262,7 +262,7 @@ async fn hit_lines_tcp_loss_preserves_points() {
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     bench.cmm.resume().await.unwrap();
     bench.serving.send(b"150.000,200.000,300.000\r\n200.000,200.000,300.000\r\n").await;
-    bench.until(3, State::Execute).await;
+    bench.until(3, MachineState::Execute).await;
     assert_eq!(bench.done().await.points.len(), 3);
 }
 
@@ -274,7 +274,7 @@ async fn unplugged_port_and_stale_input() {
     let line = serial(&serving);
     let mut bench = Bench::new(2, serving, line, |_| {}).await;
     bench.serving.send(b"150.000,200.000,300.000\r\n").await;
-    bench.until(1, State::Execute).await;
+    bench.until(1, MachineState::Execute).await;
     assert_eq!(bench.cmm.read_ahead(bench.job, &Interrupt::new()).await, None, "the first target is not touched");
     bench.serving = ServingHits::serial().unwrap();
     while bench.cmm.status().await.is_ok() {
@@ -286,13 +286,13 @@ async fn unplugged_port_and_stale_input() {
 #[tokio::test]
 async fn hold_stop_abort_need_operator() {
     let mut bench = Bench::on_serial(2, |_| {}).await;
-    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
+    assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;
-    bench.until(1, State::Holding).await;
+    bench.until(1, MachineState::Holding).await;
     assert!(bench.notes().contains("HOLD it at its own panel; 1 targets remain: 8"), "{}", bench.notes());
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
     let mut bench = Bench::on_serial(2, |_| {}).await;
-    assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);
+    assert_eq!(bench.cmm.abort().await.unwrap().state, MachineState::Aborting);
     assert!(bench.notes().contains("NOW"));
 }

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use regrind::compensation::ErrorMap;
 use regrind::device::{
     Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine, MachineKind, ModbusCmm,
-    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, digest,
+    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, TouchStatus, MachineState, Status, PlanTarget, TargetKind, digest,
 };
 use regrind::formats::write_error_map_x3p;
 use regrind::geometry::Grid;
@@ -101,7 +101,7 @@ async fn until_complete<M: Machine>(machine: &mut M) -> Status {
     let began = Instant::now();
     loop {
         let status = machine.status().await.unwrap();
-        if status.state == State::Complete {
+        if status.state == MachineState::Complete {
             return status;
         }
         assert!(began.elapsed() < Duration::from_secs(60), "not complete after a minute: {status:?}");
@@ -112,7 +112,7 @@ async fn until_complete<M: Machine>(machine: &mut M) -> Status {
 // ---- our drivers, their machines ----------------------------------------------------------------------------------------------------
 
 fn plan() -> Plan {
-    let target = |index: u32| Target {
+    let target = |index: u32| PlanTarget {
         index,
         kind: TargetKind::Part,
         point_mm: [f64::from(index), -0.25 * f64::from(index), 3.0],
@@ -151,7 +151,7 @@ async fn driver_measures_on_pymodbus_cmm() {
         for (target, point) in plan.targets.iter().zip(&measured.points) {
             // The machine's own known error: 0.1 um along x at every odd index.
             let x_mm = target.point_mm[0] + 1e-4 * f64::from(target.index % 2) + 2.5 * target.normal[0];
-            assert_eq!((point.index, point.status, point.position_mm[0]), (target.index, PointStatus::Touched, x_mm));
+            assert_eq!((point.index, point.status, point.position_mm[0]), (target.index, TouchStatus::Touched, x_mm));
         }
         assert_eq!(measured.points.len(), 200);
         cmm.acknowledge(measured.done).await.unwrap();
@@ -173,7 +173,7 @@ async fn pymodbus_cmm_read_ahead() {
     let armed = cmm.prepare(job).await.unwrap();
     cmm.start(armed).await.unwrap();
     let mut came = Vec::new();
-    while cmm.status().await.unwrap().state != State::Complete {
+    while cmm.status().await.unwrap().state != MachineState::Complete {
         came.extend(cmm.read_ahead(job, &calm).await.into_iter().flat_map(|told| told.points));
     }
     let measured = cmm.collect(job, &calm).await.unwrap();
@@ -203,7 +203,7 @@ async fn driver_grinds_on_pymodbus_grinder() {
     let armed = grinder.prepare(job).await.unwrap();
     grinder.start(armed).await.unwrap();
     grinder.hold().await.unwrap();
-    assert_eq!(grinder.status().await.unwrap().state, State::Held);
+    assert_eq!(grinder.status().await.unwrap().state, MachineState::Held);
     grinder.resume().await.unwrap();
     until_complete(&mut grinder).await;
     let record = grinder.collect(job, &calm).await.unwrap();
@@ -211,7 +211,7 @@ async fn driver_grinds_on_pymodbus_grinder() {
     assert_eq!(record.map_identity, map.identity());
     grinder.acknowledge(record.done).await.unwrap();
     grinder.release().await.unwrap();
-    assert_eq!(grinder.status().await.unwrap().state, State::Idle);
+    assert_eq!(grinder.status().await.unwrap().state, MachineState::Idle);
 }
 
 /// Runs the whole program against both: grind, measure, register, judge, compensate, until the part is accepted.

@@ -7,9 +7,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LineAddress, Link,
+    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LineAddress, Link,
     Machine, MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan,
-    PointStatus, Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, WordOrder, digest,
+    TouchStatus, Reconciled, RegisterMap, Signal, SignalType, MachineState, PlanTarget, TargetKind, WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
@@ -65,7 +65,7 @@ pub fn plan(points: u32) -> Plan {
     let target = |index: u32| {
         let (x, y) = (f64::from(index % 40) * 0.5, f64::from(index / 40) * 0.5);
         let length = (1.0 + 0.01 * x * x).sqrt();
-        Target {
+        PlanTarget {
             index,
             kind: if index < 5 { TargetKind::ReferenceSphere } else { TargetKind::Part },
             point_mm: [x, y, -0.05 * x * x],
@@ -101,7 +101,7 @@ pub fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
     assert_eq!(measured.points.len(), plan.targets.len(), "{hint}");
     assert_eq!(measured.plan_identity, plan.identity(), "{hint}");
     for (target, point) in plan.targets.iter().zip(&measured.points) {
-        assert_eq!((point.index, point.status), (target.index, PointStatus::Touched), "{hint}");
+        assert_eq!((point.index, point.status), (target.index, TouchStatus::Touched), "{hint}");
         let centre_mm: [f64; 3] =
             std::array::from_fn(|axis| target.point_mm[axis] + plan.probe_radius_mm * target.normal[axis]);
         assert_eq!(point.position_mm, centre_mm, "{hint}");
@@ -121,7 +121,7 @@ async fn connected(settings: ModbusSettings) -> ModbusCmm {
     cmm
 }
 
-pub async fn wait_for_state<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
+pub async fn wait_for_state<M: Machine>(machine: &mut M, state: MachineState) -> Result<(), DeviceError> {
     let began = Instant::now();
     loop {
         let status = machine.status().await?;
@@ -140,7 +140,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
     let armed = cmm.prepare(job).await?;
     let started = cmm.start(armed).await?;
     assert_eq!(started.job, job);
-    wait_for_state(cmm, State::Complete).await?;
+    wait_for_state(cmm, MachineState::Complete).await?;
     let measured = cmm.collect(job, &calm).await?;
     assert_eq!(cmm.collect(job, &calm).await?, measured);
     cmm.acknowledge(measured.done).await?;
@@ -161,7 +161,7 @@ async fn modbus_measurement_is_bit_exact() {
         assert_exact(&plan, &measured, "in order");
         assert_eq!((measured.job, measured.cycle, measured.temperature_c), (42, cycle, Some(20.5)));
     }
-    assert_eq!(cmm.status().await.unwrap().state, State::Idle);
+    assert_eq!(cmm.status().await.unwrap().state, MachineState::Idle);
     assert_eq!(began(&serving).len(), 2);
     let figures = cmm.link().statistics();
     assert_eq!((figures.opened, figures.timeouts, figures.corrupt, figures.retries), (1, 0, 0, 0));
@@ -179,7 +179,7 @@ async fn modbus_pass_ground_and_recorded() {
     let job = Job { job: 9, cycle: 3, digest: digest(&[map.identity(), pass.identity()]) };
     let armed = grinder.prepare(job).await.unwrap();
     grinder.start(armed).await.unwrap();
-    wait_for_state(&mut grinder, State::Complete).await.unwrap();
+    wait_for_state(&mut grinder, MachineState::Complete).await.unwrap();
     let record = grinder.collect(job, &calm).await.unwrap();
     assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, Some(1234.5), Some(67.8)));
     assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), Some(25.0)));
@@ -228,20 +228,20 @@ async fn hold_resume_stop_abort_clear() {
     let armed = cmm.prepare(job_of(&plan, 1)).await.unwrap();
     cmm.start(armed.clone()).await.unwrap();
     cmm.hold().await.unwrap();
-    wait_for_state(&mut cmm, State::Held).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Held).await.unwrap();
     cmm.resume().await.unwrap();
-    wait_for_state(&mut cmm, State::Execute).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Execute).await.unwrap();
     cmm.stop().await.unwrap();
-    wait_for_state(&mut cmm, State::Complete).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Complete).await.unwrap();
     let status = cmm.status().await.unwrap();
     assert_eq!((status.outcome, status.done), (Outcome::Stopped, armed.start_sequence));
     cmm.acknowledge(status.done).await.unwrap();
     let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
     cmm.start(armed).await.unwrap();
     cmm.abort().await.unwrap();
-    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Aborted).await.unwrap();
     cmm.clear().await.unwrap();
-    wait_for_state(&mut cmm, State::Idle).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Idle).await.unwrap();
     let refused = cmm.hold().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
     cmm.release().await.unwrap();
@@ -260,7 +260,7 @@ async fn second_client_refused_except_abort() {
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::NotOwner, .. })), "{refused:?}");
     second.abort().await.unwrap();
     let state = first.status().await.unwrap().state;
-    assert!(matches!(state, State::Aborting | State::Aborted), "{state}");
+    assert!(matches!(state, MachineState::Aborting | MachineState::Aborted), "{state}");
 }
 
 /// Writes a command of another client directly into the machine's registers; returns the answer.
@@ -287,11 +287,11 @@ async fn abort_despite_second_master() {
     assert!(cmm.hold().await.is_err(), "the number of an owner's HOLD counts");
     serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
     let aborting = cmm.abort().await.unwrap().state;
-    assert!(matches!(aborting, State::Aborting | State::Aborted), "{aborting}");
+    assert!(matches!(aborting, MachineState::Aborting | MachineState::Aborted), "{aborting}");
     // The second master takes the machine over: the driver sees the end of the abort anyway.
     assert_eq!(write_command(&serving, SimFrame { sequence: 0x7000_0001, ..of_first(SimCommand::Release) }), 1);
     assert_eq!(write_command(&serving, SimFrame { sequence: 0x7000_0002, ..stranger }), 1);
-    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Aborted).await.unwrap();
 }
 
 #[tokio::test]
@@ -400,7 +400,7 @@ async fn signals_scaled_and_range_checked() {
     let status = cmm.status().await.unwrap();
     let flaw = status.signals[0].problem().unwrap();
     assert_eq!(flaw, "part_temperature is 20.25 C, limits 15 to 19 C");
-    assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
+    assert_eq!((status.state, status.temperature_c), (MachineState::Idle, Some(20.25)));
     // A register that does not exist, and one that holds no number.
     let cases = [
         (
@@ -737,7 +737,7 @@ async fn restarted_machine_reconciles_unknown() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed.clone()).await.unwrap();
-    wait_for_state(&mut cmm, State::Complete).await.unwrap();
+    wait_for_state(&mut cmm, MachineState::Complete).await.unwrap();
     let found = cmm.reconcile(&armed).await.unwrap();
     assert!(matches!(found, Reconciled::Finished(_)), "{found:?}");
     serving.machine(1).unwrap().with(registers::SimulatedMachine::reboot);
@@ -854,7 +854,7 @@ async fn start_refused_after_interlock() {
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
     let refused = cmm.start(armed).await;
-    assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Start, .. })), "{refused:?}");
+    assert!(matches!(refused, Err(DeviceError::Refused { command: MachineCommand::Start, .. })), "{refused:?}");
     assert!(began(&serving).is_empty());
 }
 
@@ -866,6 +866,6 @@ async fn hold_interrupts_page_transfer() {
     let broken = cmm.load_plan(&plan(4000), &interrupt).await;
     assert!(matches!(broken, Err(DeviceError::Interrupted { .. })), "{broken:?}");
     let refused = cmm.hold().await; // it is idle, so it says no, but it says so
-    assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Hold, .. })), "{refused:?}");
+    assert!(matches!(refused, Err(DeviceError::Refused { command: MachineCommand::Hold, .. })), "{refused:?}");
     assert_eq!(pages.load(Ordering::SeqCst), 31, "pages came after the hold was ordered");
 }

@@ -9,7 +9,7 @@ use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     transition_table,
 };
-use regrind::journal::{AuditKey, Entry, Header, Journal, Kind, PublicKey, Reader, sha256_hex, verify};
+use regrind::journal::{AuditKey, Entry, Header, Journal, RecordKind, PublicKey, Reader, sha256_hex, verify};
 use regrind::report::state_picture;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -101,18 +101,18 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
     journal.store("recipe.toml", b"x = 1\n", 0, 0).unwrap();
     for (k, event) in events().into_iter().enumerate() {
         let payload = serde_json::to_value(event).unwrap();
-        journal.append(Entry::new(Kind::Event, 10 + k as u64, 1, payload)).unwrap();
+        journal.append(Entry::new(RecordKind::Event, 10 + k as u64, 1, payload)).unwrap();
     }
     // Only a command that gets an answer is an intent. The cell's other notifications are notes.
     for order in orders() {
         let payload = serde_json::to_value(&order).unwrap();
         if matches!(order, Order::StartMachine { .. }) {
-            journal.intend(Entry::new(Kind::Intent, 20, 2, payload)).unwrap();
+            journal.intend(Entry::new(RecordKind::Intent, 20, 2, payload)).unwrap();
         } else {
-            journal.append(Entry::new(Kind::Note, 20, 2, payload)).unwrap();
+            journal.append(Entry::new(RecordKind::Note, 20, 2, payload)).unwrap();
         }
     }
-    journal.append(Entry::new(Kind::Note, 30, 2, json!({ "pass_record": { "path_mm": 12.5 } }))).unwrap();
+    journal.append(Entry::new(RecordKind::Note, 30, 2, json!({ "pass_record": { "path_mm": 12.5 } }))).unwrap();
     journal.store("cycle-2/measured.csv", b"1,2,3\n", 40, 2).unwrap();
     journal.store("cycle-1/error_map.csv", MAP.as_bytes(), 40, 1).unwrap();
     let ending = Ending::Accepted { cycle: 2, reason: "in tolerance".into() };
@@ -494,7 +494,7 @@ fn audit_reports_open_run() {
         content: Value::Null,
     };
     let mut journal = Journal::create(home.path().join("runs/r"), header).unwrap();
-    journal.append(Entry::new(Kind::Note, 0, 0, json!("a word"))).unwrap();
+    journal.append(Entry::new(RecordKind::Note, 0, 0, json!("a word"))).unwrap();
     let proven = printed(home.path(), &["audit", "verify"], 4);
     assert!(proven.contains("not closed: nothing was cut off up to record 1"), "{proven}");
     assert!(printed(home.path(), &["audit", "show"], 0).ends_with("-  a word\n"));

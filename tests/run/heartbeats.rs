@@ -10,7 +10,7 @@ use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
 use regrind::cell::Ending;
 use regrind::device::{
     Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
-    Plan, PointStatus, Reconciled, Started, Status, digest,
+    Plan, TouchStatus, Reconciled, Started, Status, digest,
 };
 use regrind::drive::{Drive, Request};
 
@@ -51,7 +51,7 @@ impl Cmm for Generous {
             let proud_mm = if (t.index as usize) < FEW { 0.0 } else { 0.01 * (x / 9.0).sin() * (y / 7.0).cos() };
             let out_mm = plan.probe_radius_mm + proud_mm;
             let at_mm = std::array::from_fn(|k| t.point_mm[k] + out_mm * t.normal[k]);
-            MeasuredPoint { index: t.index, status: PointStatus::Touched, position_mm: at_mm, ..sample }
+            MeasuredPoint { index: t.index, status: TouchStatus::Touched, position_mm: at_mm, ..sample }
         });
         Ok(Measurement { points: points.collect(), plan_identity: plan.identity(), ..measured })
     }

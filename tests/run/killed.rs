@@ -13,7 +13,7 @@ use crate::rig::{CMM, GRINDER, Rig, small};
 use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::journal::{Kind, Reader, verify};
+use regrind::journal::{RecordKind, Reader, verify};
 use regrind_sim::seen::HandshakeEvent;
 
 /// Maximum number of kills of a part's program.
@@ -103,7 +103,7 @@ fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
         assert!(began.values().all(|times| *times == 1), "seed {seed}, {device}: {began:?}");
         let passes: Vec<_> = began.keys().copied().collect();
         let reader = Reader::open(folder).unwrap();
-        let intents = reader.records(0).map(Result::unwrap).filter(|r| r.kind == Kind::Intent).map(|r| r.value());
+        let intents = reader.records(0).map(Result::unwrap).filter(|r| r.kind == RecordKind::Intent).map(|r| r.value());
         let starts = intents.filter(|v| v["command"] == "start_machine" && v["device"] == device);
         let mut intended: Vec<u16> = starts.map(|v| v["cycle"].as_u64().unwrap() as u16).collect();
         intended.dedup();

@@ -9,7 +9,7 @@ use crate::rig::{PATIENCE, Ready, Rig, event, order, small, until};
 use regrind::cell::{AlarmId, Device, Ending};
 use regrind::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, Measurement, ModbusCmm,
-    ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status,
+    ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, MachineState, Status,
 };
 use regrind::drive::{Drive, Notice, Request};
 use tokio::sync::mpsc::UnboundedReceiver;
@@ -140,9 +140,9 @@ async fn vanished_job_is_not_ground_twice() {
     // For some polls after its start the machine reports that it is idle, without a job, although its work continues.
     let says = move |status: &mut Status| {
         let mut seen = count.lock().unwrap();
-        *seen += u32::from(status.state == State::Execute);
+        *seen += u32::from(status.state == MachineState::Execute);
         if *seen > 3 && *seen < 12 {
-            *status = Status { state: State::Idle, job: None, progress: Some((0, 0)), ..status.clone() };
+            *status = Status { state: MachineState::Idle, job: None, progress: Some((0, 0)), ..status.clone() };
         }
     };
     let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
@@ -185,8 +185,8 @@ async fn progress_while_held_aborts() {
     let mut rig = Rig::new(small(20, 10, 20.0)).await;
     let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
     let says = |status: &mut Status| {
-        if status.state == State::Execute {
-            status.state = State::Held;
+        if status.state == MachineState::Execute {
+            status.state = MachineState::Held;
         }
     };
     let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
@@ -204,8 +204,8 @@ async fn stop_not_executed_aborts() {
     let mut rig = Rig::new(small(20, 10, 1.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let says = |status: &mut Status| {
-        if matches!(status.state, State::Stopping | State::Complete) {
-            status.state = State::Execute;
+        if matches!(status.state, MachineState::Stopping | MachineState::Complete) {
+            status.state = MachineState::Execute;
         }
     };
     let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
@@ -224,7 +224,7 @@ async fn complete_at_40_percent_refused() {
     let mut rig = Rig::new(small(20, 10, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let says = |status: &mut Status| {
-        if status.state == State::Complete && status.outcome == Outcome::Complete {
+        if status.state == MachineState::Complete && status.outcome == Outcome::Complete {
             status.progress = Some((400, 1000));
         }
     };

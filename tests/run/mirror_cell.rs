@@ -15,7 +15,7 @@ use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
 use regrind::model::{Form, Interval, ModelError, ModelInputs, Prior, Sessions};
 use regrind::registration::{
-    MapLimits, Options, PointStatus, Registration, Start, lateral_error, map_obstacle, register,
+    MapLimits, RegistrationOptions, PointStatus, Registration, Start, lateral_error, map_obstacle, register,
 };
 use regrind::surface::{DefinedSurface, Nominal, Side};
 
@@ -98,7 +98,7 @@ fn nominal() -> Nominal {
 
 fn registered(nominal: &Nominal, cloud: &[Point], locked: [bool; 6]) -> Registration {
     let start = Start::Pose(cmm_from_model());
-    let options = Options { start, locked, outlier_sigmas: 5.0, ..Options::new(REFLECTOR_MM) };
+    let options = RegistrationOptions { start, locked, outlier_sigmas: 5.0, ..RegistrationOptions::new(REFLECTOR_MM) };
     register(nominal, cloud, &options).unwrap()
 }
 

@@ -11,7 +11,7 @@ use crate::rig::{CMM, GRINDER, Ready, Rig, event, order};
 use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, OrderSender, Request};
-use regrind::journal::{Kind, Reader, verify};
+use regrind::journal::{RecordKind, Reader, verify};
 use regrind_sim::command::CommandFrame;
 use regrind_sim::seen::HandshakeEvent;
 use serde_json::Value;
@@ -34,13 +34,13 @@ fn command_of(intent: &Value) -> Option<u16> {
     names.iter().position(|name| intent["command"] == **name).map(|k| k as u16 + 1)
 }
 
-fn records(folder: &Path, kind: Kind) -> Vec<Value> {
+fn records(folder: &Path, kind: RecordKind) -> Vec<Value> {
     let reader = Reader::open(folder).unwrap();
     reader.records(1).map(Result::unwrap).filter(|r| r.kind == kind).map(|r| r.value()).collect()
 }
 
 fn intents(folder: &Path, machine: usize) -> Vec<(u16, Value)> {
-    let of_it = records(folder, Kind::Intent).into_iter().filter(|value| value["device"] == DEVICES[machine]);
+    let of_it = records(folder, RecordKind::Intent).into_iter().filter(|value| value["device"] == DEVICES[machine]);
     of_it.filter_map(|value| Some((command_of(&value)?, value))).collect()
 }
 
@@ -174,7 +174,7 @@ async fn abort_while_journal_is_locked() {
         }
     };
     tokio::time::timeout(crate::rig::PATIENCE, aborted).await.expect("both machines hear of the abort");
-    let on_record = |folder: &Path| records(folder, Kind::Event).iter().any(|event| event["event"] == "abort");
+    let on_record = |folder: &Path| records(folder, RecordKind::Event).iter().any(|event| event["event"] == "abort");
     assert!(!on_record(&folder), "the journal cannot have it yet");
 
     other.execute_batch("ROLLBACK").unwrap();
@@ -229,7 +229,7 @@ fn all_on_record(folder: &Path, least: &[&str]) {
     let mut files = BTreeSet::new();
     files_below(folder, "", &mut files);
     files.retain(|name| !["journal.sqlite", "journal.anchor", ".lock"].contains(&name.as_str()));
-    let names = records(folder, Kind::Artefact).into_iter().map(|file| file["name"].as_str().unwrap().to_owned());
+    let names = records(folder, RecordKind::Artefact).into_iter().map(|file| file["name"].as_str().unwrap().to_owned());
     let recorded: BTreeSet<String> = names.collect();
     let unrecorded: Vec<_> = files.difference(&recorded).collect();
     assert!(unrecorded.is_empty(), "files that are not on record: {unrecorded:?}");
@@ -267,7 +267,7 @@ async fn unsaved_result_is_recomputed() {
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");
     assert!(folder.join("cycle-1/attempt-2/deviations.csv").is_file());
-    let raised = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "raise");
+    let raised = records(&folder, RecordKind::Note).into_iter().filter(|note| note["command"] == "raise");
     let alarms: Vec<_> = raised.map(|note| note["id"].clone()).collect();
     assert_eq!(alarms.first(), Some(&Value::from("journal_unwritable")), "{alarms:?}");
     // The report describes the failure in words, and that the resumption took it back.
@@ -286,7 +286,7 @@ async fn amended_verdict_leaves_first_file() {
     let (ending, folder) = run_to_its_end(ready).await;
     assert!(matches!(ending, Ending::NotAccepted { .. }), "{ending:?}");
     all_on_record(&folder, &["result.json", "cycle-1/result.json", "cycle-1/attempt-2/result.json"]);
-    let announced = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "announce");
+    let announced = records(&folder, RecordKind::Note).into_iter().filter(|note| note["command"] == "announce");
     let verdicts: Vec<_> = announced.map(|note| note["verdict"].clone()).collect();
     assert_eq!(verdicts, ["continue", "budget_spent"]);
 }

@@ -8,7 +8,7 @@ use regrind::cell::{
     Actor, AlarmId, Command, Ending, Event, Figures, GateFailure, GateResult, Judgement, Phase, State, Tolerance,
     Verdict, sample_events,
 };
-use regrind::journal::{Entry, Header, Journal, Kind, Reader};
+use regrind::journal::{Entry, Header, Journal, RecordKind, Reader};
 use regrind::report::{run_report, write_run_report};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -95,7 +95,7 @@ fn shown(folder: &Path) -> Vec<(String, String)> {
     let (code, out, errors) = run(&["audit", "show", folder.to_str().unwrap()], folder);
     assert_eq!(code, 0, "{errors}");
     let row = |line: &str| {
-        let kind = line.split_whitespace().find(|word| word.parse::<Kind>().is_ok())?.to_owned();
+        let kind = line.split_whitespace().find(|word| word.parse::<RecordKind>().is_ok())?.to_owned();
         Some((kind, line.to_owned()))
     };
     out.lines().skip(2).filter_map(row).collect()
@@ -318,24 +318,24 @@ impl RecordWriter {
         Self { home, journal, at: 0 }
     }
 
-    pub fn entry(&mut self, kind: Kind, payload: Value) -> Entry {
+    pub fn entry(&mut self, kind: RecordKind, payload: Value) -> Entry {
         self.at += 1;
         Entry::new(kind, self.at, 1, payload)
     }
 
     pub fn event(&mut self, event: Event) {
         let (actor, station) = event.origin();
-        let entry = self.entry(Kind::Event, serde_json::to_value(event).unwrap());
+        let entry = self.entry(RecordKind::Event, serde_json::to_value(event).unwrap());
         self.journal.append(Entry { actor, station, ..entry }).unwrap();
     }
 
     pub fn command(&mut self, command: Command) {
-        let entry = self.entry(Kind::Note, serde_json::to_value(command).unwrap());
+        let entry = self.entry(RecordKind::Note, serde_json::to_value(command).unwrap());
         self.journal.append(entry).unwrap();
     }
 
     pub fn note(&mut self, payload: Value) {
-        let entry = self.entry(Kind::Note, payload);
+        let entry = self.entry(RecordKind::Note, payload);
         self.journal.append(entry).unwrap();
     }
 
@@ -443,9 +443,9 @@ fn report_shows_no_raw_record() {
     ] {
         written.note(payload);
     }
-    let step = written.entry(Kind::Intent, json!({ "recover": "CLEAR", "device": "grinder", "seen": "FAULTED" }));
+    let step = written.entry(RecordKind::Intent, json!({ "recover": "CLEAR", "device": "grinder", "seen": "FAULTED" }));
     let command_id = Some(written.journal.intend(step).unwrap());
-    let found = written.entry(Kind::Outcome, json!({ "found": "IDLE" }));
+    let found = written.entry(RecordKind::Outcome, json!({ "found": "IDLE" }));
     written.journal.append(Entry { command_id, ..found }).unwrap();
     let (_home, folder) = written.ended(&aborted());
     let shown = shown(&folder);

@@ -15,7 +15,7 @@ use regrind::device::{
     ModbusCmm, ModbusGrinder, ModbusSettings,
 };
 use regrind::drive::{BlockingExecutor, BlockingWork, Drive, InterruptedRun, OrderSender, RunInputs};
-use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
+use regrind::journal::{AuditKey, Header, Journal, RecordKind, Reader, RunLock, verify};
 use regrind::setup;
 use regrind_sim::seen::HandshakeEvent;
 use regrind_sim::wire::faults::{FaultPlan, SharedFaultPlan};
@@ -449,7 +449,7 @@ fn dme_settings() -> IppdmeSettings {
 
 /// Returns true if a run has begun, by the same check as `regrind resume`.
 fn has_events(folder: &Path) -> bool {
-    Reader::open(folder).is_ok_and(|reader| reader.records(0).flatten().any(|record| record.kind == Kind::Event))
+    Reader::open(folder).is_ok_and(|reader| reader.records(0).flatten().any(|record| record.kind == RecordKind::Event))
 }
 
 /// Records the states that the cell shows.

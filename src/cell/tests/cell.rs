@@ -1395,7 +1395,7 @@ fn is_same_decision_ignores_texts() {
 }
 
 /// FNV-1a of the whole table.
-fn fingerprint(rows: &[Row]) -> u64 {
+fn fingerprint(rows: &[TransitionRow]) -> u64 {
     let fnv = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
     rows.iter().fold(0xcbf2_9ce4_8422_2325, |hash, row| format!("{row:?}").bytes().fold(hash, fnv))
 }

@@ -14,7 +14,7 @@ use std::process::{Child, Command, Stdio};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::{DatabaseSettings, Link};
+use regrind_plant::{DatabaseSettings, DatabaseLink};
 
 use super::failure::Failure;
 use super::{Outcome, check};
@@ -103,12 +103,12 @@ fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
 }
 
 /// Signs in to the database of a plant file, with any schema version.
-pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
-    Ok(Link::open(database(config)?).await?)
+pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
+    Ok(DatabaseLink::open(database(config)?).await?)
 }
 
 /// Signs in to the database of a plant file. Its schema must be the version of this program.
-pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
+pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     let link = open_any(config).await?;
     regrind_plant::check_layout(link.client()).await?;
     Ok(link)

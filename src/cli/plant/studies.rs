@@ -8,7 +8,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use regrind::formats::{ResultFolder, ScratchFolder, write_atomic};
 use regrind::recipe::Recipe;
-use regrind_plant::{Job, PlantError, Study, run_overview};
+use regrind_plant::{LeasedRun, PlantError, Study, run_overview};
 use serde_json::{Map, Value, json};
 
 use super::super::failure::Failure;
@@ -245,7 +245,7 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
                 let mut made = 0_usize;
                 loop {
                     let link = open(&config).await?;
-                    let Some(job) = Job::lease_next(&link).await? else {
+                    let Some(job) = LeasedRun::lease_next(&link).await? else {
                         if !wait {
                             return Ok::<_, Failure>(made);
                         }
@@ -273,7 +273,7 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
 }
 
 /// Runs a job in a separate process. Returns the summary of the run, together with the truth.
-fn made_of(study: &Study, job: &Job) -> Result<Value, String> {
+fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
     let scratch = ScratchFolder::at(place).map_err(|error| words(&error))?;

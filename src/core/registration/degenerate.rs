@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, SymmetricEigen};
 
 use super::deviation::{Deviation, PointStatus};
 use super::error::RegistrationError;
-use super::options::{Coordinate, Options, Start};
+use super::options::{Coordinate, RegistrationOptions, Start};
 use crate::geometry::{Point, Pose, Vector};
 
 /// Smallest width of a cloud, in distances from point to point. A narrower cloud determines nothing across.
@@ -24,7 +24,7 @@ const MAX_EXAMINED: usize = 600;
 const MIN_WIDE_RATIO: f64 = 0.2;
 
 /// Rejects a thread before any pose is tried, unless the undetermined directions are locked.
-pub(super) fn check_scan_line(measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+pub(super) fn check_scan_line(measured: &[Point], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MAX_EXAMINED)).copied().collect();
     let Some(_) = ScanLine::detect(few) else { return Ok(()) };
     let Some(thread) = ScanLine::detect(measured.to_vec()) else { return Ok(()) };
@@ -67,7 +67,7 @@ impl ScanLine {
 }
 
 /// Rejects a strip of contacts that is too narrow for its points, unless the undetermined directions are locked.
-pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result<(), RegistrationError> {
+pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let used = || deviations.iter().filter(|d| d.status == PointStatus::Inlier);
     let normal = used().map(|d| d.normal).sum::<Vector>();
     if normal.norm() == 0.0 {
@@ -110,7 +110,7 @@ fn undetermined_coordinates(line: Vector, normal: Vector) -> [Coordinate; 2] {
     [SHIFTS[normal.cross(&line).iamax()], ROTATIONS[line.iamax()]]
 }
 
-fn are_locked(needed: &[Coordinate; 2], options: &Options) -> bool {
+fn are_locked(needed: &[Coordinate; 2], options: &RegistrationOptions) -> bool {
     let held = Coordinate::locked_flags(needed);
     held.iter().zip(&options.locked).all(|(needed, locked)| !needed || *locked)
 }

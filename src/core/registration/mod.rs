@@ -45,7 +45,7 @@ pub use error::RegistrationError;
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, map_obstacle};
-pub use options::{Coordinate, Method, Options, ProbeSide, Start};
+pub use options::{Coordinate, Method, RegistrationOptions, ProbeSide, Start};
 use part::Part;
 pub use quality::{RegistrationQuality, WeakDirection};
 pub(crate) use refit::MIN_SIGMA_MM;
@@ -63,7 +63,7 @@ use start::{InitialPose, detect_mirror_image, free_rms, initial_pose, mirrored_r
 ///
 /// # Errors
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
-pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
+pub fn register(nominal: &Nominal, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     let part = Part::new(nominal, measured, options)?;
     degenerate::check_scan_line(measured, options)?;
     let mut registration =
@@ -75,7 +75,7 @@ pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Res
 }
 
 /// Estimates the pose without a test of how well it fits.
-fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
+fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.side() {
         part.check_fold(options, side)?;
     }
@@ -99,7 +99,7 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
 fn explain_by_mirror_image(
     part: &Part,
     measured: &[Point],
-    options: &Options,
+    options: &RegistrationOptions,
     error: RegistrationError,
 ) -> RegistrationError {
     use RegistrationError::{NotConverged, TooFewUsed, Undetermined, WrongSide};
@@ -120,7 +120,7 @@ fn build_registration(
     correspondences: Vec<Correspondence>,
     trace: Vec<Iteration>,
     initial: &InitialPose,
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Result<Registration, RegistrationError> {
     if let Some(fold) = problem.surface.find_fold_among(correspondences.iter().map(|t| t.facet)) {
         return Err(fold.into());
@@ -141,7 +141,7 @@ const ROUNDING_MM: f64 = 1e-12;
 
 /// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
 /// more points count than at the last accepted step.
-fn with_final_state(mut trace: Vec<Iteration>, verdict: &RegistrationQuality, options: &Options) -> Vec<Iteration> {
+fn with_final_state(mut trace: Vec<Iteration>, verdict: &RegistrationQuality, options: &RegistrationOptions) -> Vec<Iteration> {
     let RegistrationQuality { objective_mm2, inliers: used, .. } = *verdict;
     let is_told = |taken: &&Iteration| {
         let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();
@@ -165,7 +165,7 @@ fn check_fit(
     part: &Part,
     found: &Registration,
     measured: &[Point],
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Result<(), RegistrationError> {
     degenerate::check_strip(&found.deviations, options)?;
     let rms_mm = found.quality.rms_mm;

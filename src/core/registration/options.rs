@@ -97,7 +97,7 @@ impl Coordinate {
 
 /// Options of a registration.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Options {
+pub struct RegistrationOptions {
     /// Radius of the probe in millimetres.
     pub probe_radius_mm: f64,
     /// Meaning of the measured points.
@@ -125,7 +125,7 @@ pub struct Options {
     pub rms_limit_mm: Option<f64>,
 }
 
-impl Options {
+impl RegistrationOptions {
     /// Returns the defaults for a probe radius in millimetres.
     pub fn new(probe_radius_mm: f64) -> Self {
         Self {

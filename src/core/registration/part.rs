@@ -8,7 +8,7 @@ use crate::surface::{Lookup, Nominal, OffsetSurface, Side};
 use super::correspond::{ResidualModel, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
-use super::options::{Method, Options, Start};
+use super::options::{Method, RegistrationOptions, Start};
 use super::robust_loss::{Loss, ScaledLoss};
 
 /// Nominal surface, and the sizes that the limits refer to.
@@ -34,7 +34,7 @@ impl<'a> Part<'a> {
     /// # Errors
     /// A fully locked pose without a start pose, too few, non-finite, collinear or repeated points, a cloud of the
     /// wrong size, and a probe radius outside its limits.
-    pub(super) fn new(nominal: &'a Nominal, measured: &[Point], options: &Options) -> Result<Self, RegistrationError> {
+    pub(super) fn new(nominal: &'a Nominal, measured: &[Point], options: &RegistrationOptions) -> Result<Self, RegistrationError> {
         // A fully locked pose is given; only the deviations from it are wanted.
         let is_held = options.locked == [true; 6];
         if is_held && options.start == Start::Search {
@@ -73,7 +73,7 @@ impl<'a> Part<'a> {
         Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: least_share })
     }
 
-    pub(super) fn surface(&self, options: &Options, side: Side) -> OffsetSurface<'a> {
+    pub(super) fn surface(&self, options: &RegistrationOptions, side: Side) -> OffsetSurface<'a> {
         let lookup = if options.method == Method::SubtractRadius { Lookup::AlongZ } else { Lookup::ContainingFacet };
         OffsetSurface::new(self.nominal, self.offset_mm, side)
             .expect("the radius was checked")
@@ -82,14 +82,14 @@ impl<'a> Part<'a> {
     }
 
     /// Rejects a probe that does not fit into the surface.
-    pub(super) fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
+    pub(super) fn check_fold(&self, options: &RegistrationOptions, side: Side) -> Result<(), RegistrationError> {
         match self.surface(options, side).find_fold() {
             Some(fold) => Err(fold.into()),
             None => Ok(()),
         }
     }
 
-    pub(super) fn problem<'b>(&self, measured: &'b [Point], options: &Options, side: Side) -> Problem<'b>
+    pub(super) fn problem<'b>(&self, measured: &'b [Point], options: &RegistrationOptions, side: Side) -> Problem<'b>
     where
         'a: 'b,
     {
@@ -107,7 +107,7 @@ impl<'a> Part<'a> {
         }
     }
 
-    pub(super) fn rms_limit_mm(&self, options: &Options) -> f64 {
+    pub(super) fn rms_limit_mm(&self, options: &RegistrationOptions) -> f64 {
         options.rms_limit_mm.unwrap_or(0.2 + 1e-4 * self.size_mm)
     }
 }

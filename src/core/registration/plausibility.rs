@@ -4,7 +4,7 @@ use crate::geometry::Point;
 
 use super::deviation::{Deviation, PointStatus, StatusCounts};
 use super::isolated_touches::count_contradicted;
-use super::options::{Method, Options, Start};
+use super::options::{Method, RegistrationOptions, Start};
 use super::part::Part;
 use super::quality::format_length;
 use super::result::{FiguresWithOutliers, Registration};
@@ -46,7 +46,7 @@ pub(super) fn plausibility_warnings(
     part: &Part,
     found: &Registration,
     measured: &[Point],
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Vec<String> {
     let mut doubts = point_warnings(found);
     doubts.extend(nominal_noise_warning(part, found));
@@ -186,7 +186,7 @@ pub(super) fn radius_warning(
     part: &Part,
     found: &Registration,
     measured: &[Point],
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Option<String> {
     let given_mm = options.probe_radius_mm;
     if !is_radius_testable(part, found, options) {
@@ -228,11 +228,11 @@ fn refit_with_radius(
     part: &Part,
     found: &Registration,
     sample: &[Point],
-    given: &Options,
+    given: &RegistrationOptions,
     radius_mm: f64,
 ) -> Option<Registration> {
     let is_ball = radius_mm.abs() >= MIN_BALL_RADIUS_MM;
-    let options = Options {
+    let options = RegistrationOptions {
         probe_radius_mm: if is_ball { radius_mm.abs() } else { 0.0 },
         method: if is_ball { given.method } else { Method::Contact },
         start: Start::Pose(found.cmm_from_model),
@@ -251,7 +251,7 @@ fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
 
 /// Returns true if another radius is worth a fit: by the linear model it removes enough rms, and the noise leaves it
 /// well determined.
-fn is_radius_testable(part: &Part, found: &Registration, options: &Options) -> bool {
+fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationOptions) -> bool {
     /// The model is linear, and a wrong radius is far off. So this test lets through a little more than the final one.
     const MARGIN: f64 = 1.15;
     let (given_mm, rms_mm) = (options.probe_radius_mm, found.quality.rms_mm);

@@ -13,7 +13,7 @@ use super::correspond::{Correspondence, FinalProjectionX4, ProjectionReporter};
 use super::deviation::{Deviation, PointStatus};
 use super::iterate::{Descent, Problem, free_projector};
 use super::linearize::Scaling;
-use super::options::{Method, Options};
+use super::options::{Method, RegistrationOptions};
 use super::part::Part;
 use super::solve::Spectrum;
 use super::start::InitialPose;
@@ -439,7 +439,7 @@ pub(crate) struct DeviationReporter<'a> {
 }
 
 impl<'a> DeviationReporter<'a> {
-    pub(crate) fn new(part: &Part<'a>, scaling: &Scaling, verdict: &RegistrationQuality, options: &Options) -> Self {
+    pub(crate) fn new(part: &Part<'a>, scaling: &Scaling, verdict: &RegistrationQuality, options: &RegistrationOptions) -> Self {
         let to_scaled = scaling.to_twist().try_inverse().unwrap_or_default();
         Self {
             nominal: part.nominal,

@@ -7,7 +7,7 @@ use crate::geometry::{Point, PointTree, Pose};
 use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::{Descent, Iteration, Problem};
-use super::options::Options;
+use super::options::RegistrationOptions;
 use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
 use super::start::{InitialPose, sample_evenly};
 
@@ -18,7 +18,7 @@ use super::start::{InitialPose, sample_evenly};
 pub(super) fn trim_and_refit(
     problem: &Problem,
     initial: &InitialPose,
-    options: &Options,
+    options: &RegistrationOptions,
     correspondences: &mut [Correspondence],
     trace: &mut Vec<Iteration>,
 ) -> Result<Descent, RegistrationError> {
@@ -91,7 +91,7 @@ fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
     count: usize,
-    screened: Option<&Options>,
+    screened: Option<&RegistrationOptions>,
     trace: &mut Vec<Iteration>,
 ) -> Result<Pose, RegistrationError> {
     let few: Vec<Point> = sample_evenly(problem.measured, count).copied().collect();
@@ -118,7 +118,7 @@ fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Desce
 }
 
 /// Sets the scale of a robust loss to the robust sigma of the current distances.
-fn rescale_loss(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
+fn rescale_loss(problem: &mut Problem, options: &RegistrationOptions, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
         problem.residual.loss = ScaledLoss::new(options.loss, robust_distance_sigma(correspondences).1);
@@ -175,7 +175,7 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
 /// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.
 fn select_fit_points(
     problem: &Problem,
-    options: &Options,
+    options: &RegistrationOptions,
     correspondences: &mut [Correspondence],
     both_ways: bool,
 ) -> usize {

@@ -14,7 +14,7 @@ use crate::surface::{CurvatureFeature, FacetIndex, OffsetSurface, Side, fit_feat
 use super::correspond::{Correspondence, EDGE_TOLERANCE_STEPS, beyond_steps, centroid_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
-use super::options::{Options, Start};
+use super::options::{RegistrationOptions, Start};
 use super::part::Part;
 use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
 
@@ -81,7 +81,7 @@ const MAX_OFF_PART_EXCESS: f64 = 0.05;
 pub(crate) fn initial_pose(
     part: &Part,
     measured: &[Point],
-    options: &Options,
+    options: &RegistrationOptions,
 ) -> Result<InitialPose, RegistrationError> {
     let search = Search::new(part, measured, options);
     match options.start {
@@ -91,18 +91,18 @@ pub(crate) fn initial_pose(
 }
 
 /// Returns the rms in mm of the best fit of the mirrored cloud; `None` if it cannot be registered at all.
-pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
+pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
 /// Returns the rms in mm of the best fit of the cloud as measured, with nothing locked.
-pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
+pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
 }
 
 /// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
-pub(crate) fn detect_mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
+pub(crate) fn detect_mirror_image(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Option<(f64, f64)> {
     let sides = options.side.side().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
     let best = |points: &[Point]| {
         sides.iter().filter_map(|side| searched_rms(part, points, options, *side)).min_by(f64::total_cmp)
@@ -120,8 +120,8 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
 }
 
 /// Returns the rms in mm of the best fit on one side over all poses, with nothing locked.
-fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) -> Option<f64> {
-    let options = Options { side: side.into(), locked: [false; 6], ..*options };
+fn searched_rms(part: &Part, points: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
+    let options = RegistrationOptions { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
     search.refine_and_compare(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
@@ -137,7 +137,7 @@ pub(super) fn sample_evenly(points: &[Point], count: usize) -> impl Iterator<Ite
 
 struct Search<'a> {
     part: &'a Part<'a>,
-    options: &'a Options,
+    options: &'a RegistrationOptions,
     measured: &'a [Point],
     few: Vec<Point>,
     some: Vec<Point>,
@@ -145,7 +145,7 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    fn new(part: &'a Part, measured: &'a [Point], options: &'a Options) -> Self {
+    fn new(part: &'a Part, measured: &'a [Point], options: &'a RegistrationOptions) -> Self {
         let sample = |count| sample_evenly(measured, count).copied().collect();
         Self {
             part,

@@ -18,7 +18,7 @@ use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
 use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult};
-use crate::{Job, MeasuredPoint, Measurement, Plan, Target, TargetKind, hex};
+use crate::{Job, MeasuredPoint, Measurement, Plan, PlanTarget, TargetKind, hex};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
 use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
@@ -644,7 +644,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
 }
 
 /// Parses a row of `plan.csv`; returns `None` for any other row.
-fn stored_target(row: &str) -> Option<Target> {
+fn stored_target(row: &str) -> Option<PlanTarget> {
     let cells: Vec<&str> = row.split(',').collect();
     let [index, x, y, z, nx, ny, nz, what] = cells[..] else { return None };
     let what =
@@ -653,7 +653,7 @@ fn stored_target(row: &str) -> Option<Target> {
         let [x, y, z] = words.map(|word| word.parse().ok());
         Some([x?, y?, z?])
     };
-    Some(Target { index: index.parse().ok()?, kind: what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
+    Some(PlanTarget { index: index.parse().ok()?, kind: what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
 }
 
 /// Returns the plan as a CSV table, with a header that identifies it.

@@ -69,14 +69,14 @@ pub(super) fn program(plan: &Plan, about: &DmisHeader<'_>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::payload::{CarefulStart, Target, TargetKind};
+    use crate::payload::{CarefulStart, PlanTarget, TargetKind};
     use regrind_formats::result::{Content, parse_result};
 
     const PLAN: &str = "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff";
 
     fn plan() -> Plan {
         let (what, normal) = (TargetKind::Part, [0.6, 0.0, 0.8]);
-        let target = |index, point_mm| Target { index, kind: what, point_mm, normal };
+        let target = |index, point_mm| PlanTarget { index, kind: what, point_mm, normal };
         Plan {
             targets: vec![target(7, [1.5, -2.25, 3.0]), target(9, [4.0, 5.0, 6.0])],
             probe_radius_mm: 1.5,

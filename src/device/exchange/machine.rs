@@ -7,9 +7,9 @@ use tokio::time::{Instant, timeout};
 
 use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, MeasureOrder, Permit};
 use crate::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
+    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
     Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
-    State, Status, digest,
+    MachineState, Status, digest,
 };
 
 /// Machine that is reached through two folders.
@@ -30,7 +30,7 @@ struct FolderMachine<M: Exchange> {
     kind: MachineKind,
     exchange: M,
     connected: bool,
-    state: State,
+    state: MachineState,
     /// Request that would be handed over, and its digest.
     loaded: Option<(M::Request, u32)>,
     /// Job that is prepared, running or finished, and its start number.
@@ -60,7 +60,7 @@ impl<M: Exchange> ExchangeMachine<M> {
             kind,
             exchange,
             connected: false,
-            state: State::Idle,
+            state: MachineState::Idle,
             loaded: None,
             job: None,
             hand_overs: Vec::new(),
@@ -105,12 +105,12 @@ impl<M: Exchange> ExchangeMachine<M> {
 
     async fn command(
         &self,
-        command: Command,
+        command: MachineCommand,
         work: impl FnOnce(&mut FolderMachine<M>) -> DeviceResult<()> + Send + 'static,
     ) -> DeviceResult<Status> {
         self.run_blocking("a command", move |machine, _| {
             machine.check_connected("a command")?;
-            if !machine.owned && !matches!(command, Command::Claim | Command::Abort) {
+            if !machine.owned && !matches!(command, MachineCommand::Claim | MachineCommand::Abort) {
                 return Err(machine.refused(command, Answer::NotOwner));
             }
             work(machine)?;
@@ -122,12 +122,12 @@ impl<M: Exchange> ExchangeMachine<M> {
     async fn load(&self, request: M::Request, digest: u32) -> DeviceResult<()> {
         self.run_blocking("a payload", move |machine, _| {
             machine.check_connected("a payload")?;
-            if matches!(machine.state, State::Execute | State::Holding | State::Held) {
-                return Err(machine.refused(Command::Prepare, Answer::WrongState));
+            if matches!(machine.state, MachineState::Execute | MachineState::Holding | MachineState::Held) {
+                return Err(machine.refused(MachineCommand::Prepare, Answer::WrongState));
             }
             machine.loaded = Some((request, digest));
-            if machine.state == State::Prepared {
-                (machine.state, machine.job) = (State::Idle, None);
+            if machine.state == MachineState::Prepared {
+                (machine.state, machine.job) = (MachineState::Idle, None);
             }
             Ok(())
         })
@@ -138,7 +138,7 @@ impl<M: Exchange> ExchangeMachine<M> {
         self.run_blocking("a result", move |machine, _| {
             let same = machine.job.is_some_and(|(own, _)| own == job);
             match &machine.answer {
-                Some(answer) if machine.state == State::Complete && same => Ok((answer.clone(), machine.done)),
+                Some(answer) if machine.state == MachineState::Complete && same => Ok((answer.clone(), machine.done)),
                 _ => Err(DeviceError::NoResult { machine: Arc::clone(&machine.name), job, state: machine.state }),
             }
         })
@@ -155,11 +155,11 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    fn refused(&self, command: Command, answer: Answer) -> DeviceError {
+    fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state: self.state }
     }
 
-    fn failed(&self, command: Command, error: ExchangeError) -> DeviceError {
+    fn failed(&self, command: MachineCommand, error: ExchangeError) -> DeviceError {
         let machine = Arc::clone(&self.name);
         let short = |identity: &[u8; 32]| identity[..8].iter().fold(0, |sum, &b| sum << 8 | u64::from(b));
         match error {
@@ -188,13 +188,13 @@ impl<M: Exchange> FolderMachine<M> {
     /// Reads the hand-overs in the folder. At the first call, an open or held hand-over gives the job and the state of
     /// this machine.
     fn open(&mut self) -> DeviceResult<()> {
-        self.hand_overs = self.exchange.open().map_err(|error| self.failed(Command::Claim, error))?;
+        self.hand_overs = self.exchange.open().map_err(|error| self.failed(MachineCommand::Claim, error))?;
         if !self.connected
             && let Some(last) =
                 self.hand_overs.last().filter(|h| matches!(h.status, HandOverStatus::Open | HandOverStatus::Held))
         {
             self.job = Some((last.job, last.sequence));
-            self.state = if last.status == HandOverStatus::Open { State::Execute } else { State::Held };
+            self.state = if last.status == HandOverStatus::Open { MachineState::Execute } else { MachineState::Held };
         }
         self.connected = true;
         Ok(())
@@ -202,8 +202,8 @@ impl<M: Exchange> FolderMachine<M> {
 
     /// Looks for the answer, if one is awaited.
     fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
-        let Some((job, sequence)) = self.job.filter(|_| self.state == State::Execute) else { return Ok(()) };
-        let look = self.exchange.poll(now, job).map_err(|error| self.failed(Command::Start, error))?;
+        let Some((job, sequence)) = self.job.filter(|_| self.state == MachineState::Execute) else { return Ok(()) };
+        let look = self.exchange.poll(now, job).map_err(|error| self.failed(MachineCommand::Start, error))?;
         self.notes = look.notes;
         self.start_confirmed = look.start_confirmed;
         if look.answer.is_some() {
@@ -215,40 +215,40 @@ impl<M: Exchange> FolderMachine<M> {
     }
 
     fn finish(&mut self, outcome: Outcome, sequence: u32) {
-        (self.state, self.outcome, self.done) = (State::Complete, outcome, sequence);
+        (self.state, self.outcome, self.done) = (MachineState::Complete, outcome, sequence);
     }
 
     fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
-        if self.state != State::Idle {
-            return Err(self.refused(Command::Prepare, Answer::WrongState));
+        if self.state != MachineState::Idle {
+            return Err(self.refused(MachineCommand::Prepare, Answer::WrongState));
         }
         match &self.loaded {
-            None => return Err(self.refused(Command::Prepare, Answer::PayloadMissing)),
+            None => return Err(self.refused(MachineCommand::Prepare, Answer::PayloadMissing)),
             Some((_, digest)) if *digest != job.digest => {
-                return Err(self.refused(Command::Prepare, Answer::OtherJob));
+                return Err(self.refused(MachineCommand::Prepare, Answer::OtherJob));
             }
             Some(_) => {}
         }
         self.open()?;
         if self.hand_overs.iter().any(|h| (h.job.job, h.job.cycle) == (job.job, job.cycle)) {
-            return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
+            return Err(self.refused(MachineCommand::Prepare, Answer::AlreadyBegun));
         }
         let start_sequence = self.hand_overs.last().map_or(0, |h| h.sequence) + 1;
-        (self.job, self.state) = (Some((job, start_sequence)), State::Prepared);
+        (self.job, self.state) = (Some((job, start_sequence)), MachineState::Prepared);
         (self.outcome, self.answer, self.start_confirmed) = (Outcome::None, None, false);
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
     fn start(&mut self, armed: &Armed, permit: &Permit) -> DeviceResult<Started> {
         if permit.is_withdrawn() {
-            return Err(self.refused(Command::Start, Answer::DeadToken));
+            return Err(self.refused(MachineCommand::Start, Answer::DeadToken));
         }
-        if self.state != State::Prepared {
-            return Err(self.refused(Command::Start, Answer::WrongState));
+        if self.state != MachineState::Prepared {
+            return Err(self.refused(MachineCommand::Start, Answer::WrongState));
         }
         let (job, sequence) = (armed.job, armed.start_sequence);
         let Some((request, _)) = self.loaded.as_ref().filter(|_| self.job == Some((job, sequence))) else {
-            return Err(self.refused(Command::Start, Answer::OtherJob));
+            return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
         };
         if let Err(error) = self.exchange.publish(job, sequence, request, permit) {
             return self.after_failed_start(armed, error, permit);
@@ -263,21 +263,21 @@ impl<M: Exchange> FolderMachine<M> {
     /// Takes back a hand-over that appeared after it was given up. Its client may have continued without it, so it must
     /// not stay open. Its ending shows later that it was open for a moment.
     fn take_back_late(&mut self, armed: &Armed) -> DeviceResult<Started> {
-        self.mark(Command::Start, HandOverStatus::Stopped)?;
+        self.mark(MachineCommand::Start, HandOverStatus::Stopped)?;
         self.notes = self.withdrawal_notes();
         self.finish(Outcome::Stopped, armed.start_sequence);
-        Err(self.refused(Command::Start, Answer::DeadToken))
+        Err(self.refused(MachineCommand::Start, Answer::DeadToken))
     }
 
     fn started(&mut self, armed: &Armed) -> DeviceResult<Started> {
-        (self.state, self.clear_of_part) = (State::Execute, None);
+        (self.state, self.clear_of_part) = (MachineState::Execute, None);
         self.notes = vec!["handed over; waiting for the answer".to_owned()];
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
     /// Handles an error while the hand-over was published: reads from the folder if the hand-over is there.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
-        let why = self.failed(Command::Start, error);
+        let why = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {
             Ok(handed) => {
                 self.hand_overs = handed;
@@ -285,7 +285,7 @@ impl<M: Exchange> FolderMachine<M> {
                 if self.hand_overs.iter().any(ours) {
                     return if permit.is_withdrawn() { self.take_back_late(armed) } else { self.started(armed) };
                 }
-                (self.state, self.job) = (State::Idle, None);
+                (self.state, self.job) = (MachineState::Idle, None);
                 Err(why)
             }
             Err(_) => Err(DeviceError::StartUnknown {
@@ -297,7 +297,7 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    fn mark(&mut self, command: Command, standing: HandOverStatus) -> DeviceResult<()> {
+    fn mark(&mut self, command: MachineCommand, standing: HandOverStatus) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job else { return Err(self.refused(command, Answer::WrongState)) };
         self.exchange.mark(job, standing).map_err(|error| self.failed(command, error))?;
         for handed in self.hand_overs.iter_mut().filter(|h| h.sequence == sequence) {
@@ -307,50 +307,50 @@ impl<M: Exchange> FolderMachine<M> {
     }
 
     fn hold(&mut self) -> DeviceResult<()> {
-        if self.state != State::Execute {
-            return Err(self.refused(Command::Hold, Answer::WrongState));
+        if self.state != MachineState::Execute {
+            return Err(self.refused(MachineCommand::Hold, Answer::WrongState));
         }
-        self.mark(Command::Hold, HandOverStatus::Held)?;
-        self.state = State::Held;
+        self.mark(MachineCommand::Hold, HandOverStatus::Held)?;
+        self.state = MachineState::Held;
         self.notes = self.withdrawal_notes();
         Ok(())
     }
 
     fn resume(&mut self) -> DeviceResult<()> {
-        if self.state != State::Held {
-            return Err(self.refused(Command::Resume, Answer::WrongState));
+        if self.state != MachineState::Held {
+            return Err(self.refused(MachineCommand::Resume, Answer::WrongState));
         }
-        self.mark(Command::Resume, HandOverStatus::Open)?;
-        self.state = State::Execute;
+        self.mark(MachineCommand::Resume, HandOverStatus::Open)?;
+        self.state = MachineState::Execute;
         Ok(())
     }
 
     fn stop(&mut self) -> DeviceResult<()> {
         match (self.state, self.job) {
-            (State::Prepared, _) => (self.state, self.job) = (State::Idle, None),
-            (State::Execute | State::Held, Some((_, sequence))) => {
-                self.mark(Command::Stop, HandOverStatus::Stopped)?;
+            (MachineState::Prepared, _) => (self.state, self.job) = (MachineState::Idle, None),
+            (MachineState::Execute | MachineState::Held, Some((_, sequence))) => {
+                self.mark(MachineCommand::Stop, HandOverStatus::Stopped)?;
                 self.notes = self.withdrawal_notes();
                 self.finish(Outcome::Stopped, sequence);
             }
-            _ => return Err(self.refused(Command::Stop, Answer::WrongState)),
+            _ => return Err(self.refused(MachineCommand::Stop, Answer::WrongState)),
         }
         Ok(())
     }
 
     fn abort(&mut self) -> DeviceResult<()> {
-        let was = std::mem::replace(&mut self.state, State::Aborted);
+        let was = std::mem::replace(&mut self.state, MachineState::Aborted);
         let lies = |h: &&HandOver| matches!(h.status, HandOverStatus::Open | HandOverStatus::Held);
         let ours =
             self.job.filter(|(_, sequence)| self.hand_overs.iter().filter(lies).any(|h| h.sequence == *sequence));
-        if was == State::Prepared || ours.is_none() {
+        if was == MachineState::Prepared || ours.is_none() {
             return Ok(());
         }
         self.notes = self.withdrawal_notes();
         (self.outcome, self.answer) = (Outcome::Aborted, None);
         // The state becomes ABORTED even if the folder cannot be reached. The error says that the hand-over may still
         // be there.
-        self.mark(Command::Abort, HandOverStatus::Aborted)
+        self.mark(MachineCommand::Abort, HandOverStatus::Aborted)
     }
 
     fn withdrawal_notes(&self) -> Vec<String> {
@@ -369,16 +369,16 @@ impl<M: Exchange> FolderMachine<M> {
     }
 
     fn acknowledge(&mut self, done: u32) -> DeviceResult<()> {
-        if self.state != State::Complete {
-            return Err(self.refused(Command::Acknowledge, Answer::WrongState));
+        if self.state != MachineState::Complete {
+            return Err(self.refused(MachineCommand::Acknowledge, Answer::WrongState));
         }
         if done != self.done {
-            return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
+            return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
         }
         if self.outcome == Outcome::Complete {
-            self.mark(Command::Acknowledge, HandOverStatus::Closed)?;
+            self.mark(MachineCommand::Acknowledge, HandOverStatus::Closed)?;
         }
-        (self.state, self.job, self.answer) = (State::Idle, None, None);
+        (self.state, self.job, self.answer) = (MachineState::Idle, None, None);
         (self.outcome, self.done, self.start_confirmed) = (Outcome::None, 0, false);
         self.notes.clear();
         Ok(())
@@ -391,10 +391,10 @@ impl<M: Exchange> FolderMachine<M> {
         if self.kind == MachineKind::Cmm {
             return Err(DeviceError::ConfirmationNotNeeded { machine: Arc::clone(&self.name) });
         }
-        let Some((job, _)) = self.job.filter(|_| self.state == State::Execute) else {
-            return Err(self.refused(Command::Start, Answer::WrongState));
+        let Some((job, _)) = self.job.filter(|_| self.state == MachineState::Execute) else {
+            return Err(self.refused(MachineCommand::Start, Answer::WrongState));
         };
-        self.exchange.confirm(job, what, map_identity).map_err(|error| self.failed(Command::Start, error))?;
+        self.exchange.confirm(job, what, map_identity).map_err(|error| self.failed(MachineCommand::Start, error))?;
         Ok(Vec::new())
     }
 
@@ -403,8 +403,8 @@ impl<M: Exchange> FolderMachine<M> {
         let Job { job, cycle, .. } = intended.job;
         let Some(handed) = self.hand_overs.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
             // It will not be handed over later either: the prepared job is discarded.
-            if self.state == State::Prepared {
-                (self.state, self.job) = (State::Idle, None);
+            if self.state == MachineState::Prepared {
+                (self.state, self.job) = (MachineState::Idle, None);
             }
             return Ok(Reconciled::NotStarted(self.status()));
         };
@@ -417,15 +417,15 @@ impl<M: Exchange> FolderMachine<M> {
         }
         self.job = Some((handed.job, handed.sequence));
         Ok(match handed.status {
-            HandOverStatus::Open | HandOverStatus::Held if self.state == State::Complete => {
+            HandOverStatus::Open | HandOverStatus::Held if self.state == MachineState::Complete => {
                 Reconciled::Finished(self.status())
             }
             HandOverStatus::Open => {
-                self.state = State::Execute;
+                self.state = MachineState::Execute;
                 Reconciled::Running(self.status())
             }
             HandOverStatus::Held => {
-                self.state = State::Held;
+                self.state = MachineState::Held;
                 Reconciled::Running(self.status())
             }
             HandOverStatus::Stopped => {
@@ -433,11 +433,11 @@ impl<M: Exchange> FolderMachine<M> {
                 Reconciled::Finished(self.status())
             }
             HandOverStatus::Aborted => {
-                (self.state, self.outcome, self.done) = (State::Aborted, Outcome::Aborted, handed.sequence);
+                (self.state, self.outcome, self.done) = (MachineState::Aborted, Outcome::Aborted, handed.sequence);
                 Reconciled::Finished(self.status())
             }
             HandOverStatus::Closed => {
-                (self.state, self.job) = (State::Idle, None);
+                (self.state, self.job) = (MachineState::Idle, None);
                 let why = "its result was already acknowledged; look for it in the journal".to_owned();
                 Reconciled::Unknown { reason: why }
             }
@@ -486,7 +486,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
     }
 
     async fn claim(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Claim, |machine| {
+        self.command(MachineCommand::Claim, |machine| {
             machine.owned = true;
             Ok(())
         })
@@ -497,7 +497,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         self.run_blocking("PREPARE", move |machine, _| {
             machine.check_connected("PREPARE")?;
             if !machine.owned {
-                return Err(machine.refused(Command::Prepare, Answer::NotOwner));
+                return Err(machine.refused(MachineCommand::Prepare, Answer::NotOwner));
             }
             machine.prepare(job)
         })
@@ -531,27 +531,27 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
     }
 
     async fn hold(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Hold, FolderMachine::hold).await
+        self.command(MachineCommand::Hold, FolderMachine::hold).await
     }
 
     async fn resume(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Resume, FolderMachine::resume).await
+        self.command(MachineCommand::Resume, FolderMachine::resume).await
     }
 
     async fn stop(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Stop, FolderMachine::stop).await
+        self.command(MachineCommand::Stop, FolderMachine::stop).await
     }
 
     async fn abort(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Abort, FolderMachine::abort).await
+        self.command(MachineCommand::Abort, FolderMachine::abort).await
     }
 
     async fn clear(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Clear, |machine| {
-            if !matches!(machine.state, State::Aborted | State::Faulted) {
-                return Err(machine.refused(Command::Clear, Answer::WrongState));
+        self.command(MachineCommand::Clear, |machine| {
+            if !matches!(machine.state, MachineState::Aborted | MachineState::Faulted) {
+                return Err(machine.refused(MachineCommand::Clear, Answer::WrongState));
             }
-            (machine.state, machine.job, machine.outcome) = (State::Idle, None, Outcome::None);
+            (machine.state, machine.job, machine.outcome) = (MachineState::Idle, None, Outcome::None);
             machine.notes.clear();
             Ok(())
         })
@@ -559,13 +559,13 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
     }
 
     async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
-        self.command(Command::Acknowledge, move |machine| machine.acknowledge(done)).await
+        self.command(MachineCommand::Acknowledge, move |machine| machine.acknowledge(done)).await
     }
 
     async fn release(&mut self) -> DeviceResult<Status> {
-        self.command(Command::Release, |machine| {
-            if machine.state == State::Execute {
-                return Err(machine.refused(Command::Release, Answer::WrongState));
+        self.command(MachineCommand::Release, |machine| {
+            if machine.state == MachineState::Execute {
+                return Err(machine.refused(MachineCommand::Release, Answer::WrongState));
             }
             machine.owned = false;
             Ok(())

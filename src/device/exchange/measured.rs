@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use super::ExchangeError;
-use crate::{Job, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus};
+use crate::{Job, MeasuredPoint, Measurement, Plan, PlanMismatch, TouchStatus};
 use regrind_core::geometry::Point;
 use regrind_formats::FormatError;
 use regrind_formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
@@ -59,7 +59,7 @@ impl ResultRequirements<'_> {
                 ExchangeError::from(FormatError::Index { path, line, found: index.to_string(), why })
             };
             let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
-            if all[slot].status == PointStatus::Touched {
+            if all[slot].status == TouchStatus::Touched {
                 return Err(wrong("occurs twice"));
             }
             all[slot] = touched(*index, (*point).into());
@@ -96,7 +96,7 @@ pub fn check_measurement(
     least_found: f64,
     rehearsal: bool,
 ) -> Result<(), ExchangeError> {
-    let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
+    let found = measurement.points.iter().filter(|point| point.status == TouchStatus::Touched).count();
     let expected = plan.targets.len();
     // A further batch has only a few targets, of which one may be out of reach. All batches together are checked once
     // they are there.
@@ -146,11 +146,11 @@ pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> O
 }
 
 fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, position_mm: at_mm }
+    MeasuredPoint { index, status: TouchStatus::Touched, quality: 0, position_mm: at_mm }
 }
 
 fn not_found(index: u32) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, position_mm: [0.0; 3] }
+    MeasuredPoint { index, status: TouchStatus::NotFound, quality: 100, position_mm: [0.0; 3] }
 }
 
 fn numbered(points: &[Point]) -> Vec<MeasuredPoint> {

@@ -15,7 +15,7 @@ use super::format::{LineError, LineParser};
 use super::lines::ReceivedLine;
 use super::list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
-use crate::words::{Job, Outcome, State, hex};
+use crate::words::{Job, Outcome, MachineState, hex};
 use regrind_formats::JsonlAppender;
 
 /// Number of refused lines kept for a person: the last ones.
@@ -52,7 +52,7 @@ pub(super) struct RequestedMeasurement {
 #[derive(Debug)]
 pub(super) struct MeasurementSession {
     rules: LineRules,
-    pub(super) state: State,
+    pub(super) state: MachineState,
     pub(super) outcome: Outcome,
     pub(super) measurement: Option<RequestedMeasurement>,
     /// True if the probe is clear of the part, as a person confirmed or by the time in the cell file; `None` if
@@ -127,7 +127,7 @@ impl MeasurementSession {
     pub(super) fn new(judging: LineRules) -> Self {
         Self {
             rules: judging,
-            state: State::Idle,
+            state: MachineState::Idle,
             outcome: Outcome::None,
             measurement: None,
             clear_of_part: None,
@@ -202,7 +202,7 @@ impl MeasurementSession {
                 asked.last_line = Instant::now();
                 self.refuse(line, why);
             }
-            (Some(asked), State::Held) => {
+            (Some(asked), MachineState::Held) => {
                 asked.lines += 1;
                 let held =
                     "it arrived after the confirmation that the machine stands; resume, then touch that point again";
@@ -216,8 +216,8 @@ impl MeasurementSession {
         if let Some(asked) = &mut self.measurement {
             asked.refuse(line, why);
         }
-        if self.state == State::Execute {
-            self.state = State::Holding;
+        if self.state == MachineState::Execute {
+            self.state = MachineState::Holding;
         }
     }
 
@@ -228,7 +228,7 @@ impl MeasurementSession {
         }
         if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
             asked.refuse("", "the connection was lost; touches since then did not arrive: check the remaining targets");
-            self.state = if self.state == State::Execute { State::Holding } else { self.state };
+            self.state = if self.state == MachineState::Execute { MachineState::Holding } else { self.state };
         }
         self.link_error = Some(error);
     }
@@ -236,7 +236,7 @@ impl MeasurementSession {
     /// Ends a complete measurement when `clear_after` has passed since its last line: the time that the probe needs to
     /// move clear.
     pub(super) fn finish_if_clear(&mut self, clear_after: Option<Duration>) {
-        let (Some(asked), Some(clear_after), State::Execute) = (&self.measurement, clear_after, self.state) else {
+        let (Some(asked), Some(clear_after), MachineState::Execute) = (&self.measurement, clear_after, self.state) else {
             return;
         };
         if asked.list.is_complete() && asked.last_line.elapsed() >= clear_after {
@@ -246,7 +246,7 @@ impl MeasurementSession {
     }
 
     pub(super) fn finish(&mut self, outcome: Outcome) {
-        (self.state, self.outcome) = (State::Complete, outcome);
+        (self.state, self.outcome) = (MachineState::Complete, outcome);
         self.duration = self.measurement.as_ref().map_or(Duration::ZERO, |asked| asked.begun.elapsed());
     }
 
@@ -314,7 +314,7 @@ mod tests {
         let list = TargetList::new(&plan(targets), Coordinates::Centres, false, RULES);
         let job = Job { job: 7, cycle: 1, digest: 1 };
         hearing.measurement = Some(RequestedMeasurement::new((job, 1), [0; 32], list, None));
-        hearing.state = State::Execute;
+        hearing.state = MachineState::Execute;
         hearing
     }
 
@@ -331,9 +331,9 @@ mod tests {
         let mut heard = session(4);
         hear(&mut heard, "0.000,0.000,1.500");
         hear(&mut heard, "PROBE 1");
-        assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Execute, 1));
         hear(&mut heard, "5.000,0.000,1.50010.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
         let refusals = heard.refusals();
         assert!(
             refusals[0].starts_with("REFUSED line 3 of the measurement")
@@ -341,12 +341,12 @@ mod tests {
         );
         // The person who leads the probe does not know of the hold yet.
         hear(&mut heard, "15.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (State::Holding, 2));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 2));
         assert_eq!(heard.remaining_targets(), "2 targets remain: 101, 102");
         // A machine at rest touches nothing.
-        heard.state = State::Held;
+        heard.state = MachineState::Held;
         hear(&mut heard, "5.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (State::Held, 2));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Held, 2));
         assert!(heard.refusals()[1].contains("after the confirmation"));
     }
 
@@ -354,13 +354,13 @@ mod tests {
     fn session_completes_when_probe_clear() {
         let mut heard = session(1);
         heard.finish_if_clear(Some(Duration::ZERO));
-        assert_eq!(heard.state, State::Execute);
+        assert_eq!(heard.state, MachineState::Execute);
         hear(&mut heard, "0.000,0.000,1.500");
         heard.finish_if_clear(None);
         heard.finish_if_clear(Some(Duration::from_secs(3600)));
-        assert_eq!((heard.state, heard.clear_of_part), (State::Execute, None));
+        assert_eq!((heard.state, heard.clear_of_part), (MachineState::Execute, None));
         heard.finish_if_clear(Some(Duration::ZERO));
-        assert_eq!((heard.state, heard.outcome, heard.clear_of_part), (State::Complete, Outcome::Complete, Some(true)));
+        assert_eq!((heard.state, heard.outcome, heard.clear_of_part), (MachineState::Complete, Outcome::Complete, Some(true)));
     }
 
     #[test]
@@ -368,12 +368,12 @@ mod tests {
         let mut heard = session(2);
         heard.rules.parser.format = super::super::LineFormat::DecimalRotary;
         hear(&mut heard, "0.000,0.000,1.500,0.0");
-        assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Execute, 1));
         hear(&mut heard, "5.000,0.000,1.500,245.5");
-        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
         assert!(heard.refusals()[0].contains("is at 245.5°"));
         let mut heard = session(2);
-        heard.state = State::Idle;
+        heard.state = MachineState::Idle;
         heard.measurement = None;
         hear(&mut heard, "X1.0,Y2.0,Z3.0");
         let told = heard.refusals().pop().unwrap();
@@ -389,7 +389,7 @@ mod tests {
         hear(&mut heard, "0.000,0.000,1.500");
         let gone = DeviceError::Disconnected { machine: "x".into(), operation: "reading" };
         heard.link_lost(gone, Some("5.000,0.0".to_owned()));
-        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
         assert!(heard.refusals()[0].contains("incomplete") && heard.refusals()[1].contains("did not arrive"));
     }
 }

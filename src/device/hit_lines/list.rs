@@ -5,7 +5,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use crate::payload::{MeasuredPoint, Plan, PointStatus};
+use crate::payload::{MeasuredPoint, Plan, TouchStatus};
 use regrind_formats::result::Coordinates;
 
 /// Handling of a touch of a target that was touched before.
@@ -82,7 +82,7 @@ impl TargetList {
         if before.is_some_and(|(text, at)| text == line && within(at)) {
             return Ok(TouchAssignment::DuplicateLine);
         }
-        let point = |index| MeasuredPoint { index, status: PointStatus::Touched, quality: 0, position_mm: at_mm };
+        let point = |index| MeasuredPoint { index, status: TouchStatus::Touched, quality: 0, position_mm: at_mm };
         if self.is_free() {
             let index = self.points.len() as u32;
             self.points.push(Some(point(index)));
@@ -134,7 +134,7 @@ impl TargetList {
     pub(super) fn points(&self) -> Vec<MeasuredPoint> {
         let missed = |k: usize| MeasuredPoint {
             index: self.indices.get(k).copied().unwrap_or_default(),
-            status: PointStatus::NotFound,
+            status: TouchStatus::NotFound,
             quality: 100,
             position_mm: [0.0; 3],
         };
@@ -154,11 +154,11 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::payload::{Target, TargetKind};
+    use crate::payload::{PlanTarget, TargetKind};
 
     /// Plan of targets on a line along x, 5 mm apart, on a plane that faces up.
     pub(in super::super) fn plan(targets: u32) -> Plan {
-        let target = |k: u32| Target {
+        let target = |k: u32| PlanTarget {
             index: 100 + k,
             kind: TargetKind::Part,
             point_mm: [5.0 * f64::from(k), 0.0, 0.0],
@@ -194,7 +194,7 @@ pub(super) mod tests {
         assert_eq!(list.remaining().collect::<Vec<_>>(), [100]);
         let points = list.points();
         assert_eq!(points.iter().map(|p| p.index).collect::<Vec<_>>(), [100, 101, 102]);
-        assert_eq!((points[0].status, points[1].position_mm), (PointStatus::NotFound, [5.2, 0.1, 1.6]));
+        assert_eq!((points[0].status, points[1].position_mm), (TouchStatus::NotFound, [5.2, 0.1, 1.6]));
         assert_eq!(list.assign("e", [0.0, 0.0, 1.5], at(40)), Ok(TouchAssignment::First(100)));
         assert!(list.is_complete());
         // Contact coordinates do not include the radius.

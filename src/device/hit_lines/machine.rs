@@ -21,7 +21,7 @@ use crate::kept::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
 use crate::words::{
-    Answer, Armed, Command, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, State,
+    Answer, Armed, MachineCommand, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, MachineState,
     Status, digest, hex,
 };
 use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
@@ -56,7 +56,7 @@ impl HitLinesCmm {
         Ok(status_of(&hearing))
     }
 
-    fn refused(&self, command: Command, answer: Answer) -> DeviceError {
+    fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
         let state = locked(&self.session).state;
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
@@ -69,7 +69,7 @@ impl HitLinesCmm {
     ///
     /// # Errors
     /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
-    fn transition(&self, command: Command, from: &[State], to: State) -> DeviceResult<Status> {
+    fn transition(&self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         let mut hearing = locked(&self.session);
         if !from.contains(&hearing.state) {
             drop(hearing);
@@ -92,11 +92,11 @@ impl HitLinesCmm {
         let stop =
             |what: &str| vec![format!("{what} it at its own panel; {}", hearing.remaining_targets()), then("still")];
         match hearing.state {
-            State::Execute if asked.list.is_complete() => match self.settings.clear_after {
+            MachineState::Execute if asked.list.is_complete() => match self.settings.clear_after {
                 None => vec!["every target is touched; when the probe is clear of the part,".to_owned(), then("done")],
                 Some(_) => Vec::new(),
             },
-            State::Execute => {
+            MachineState::Execute => {
                 let points = match (self.settings.min_free_points, asked.list.progress().1) {
                     (Some(least), _) => format!("at least {least} points"),
                     (None, count) => {
@@ -118,10 +118,10 @@ impl HitLinesCmm {
                 }
                 prompt
             }
-            State::Holding => stop("HOLD"),
-            State::Stopping => stop("STOP"),
-            State::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
-            State::Aborting => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
+            MachineState::Holding => stop("HOLD"),
+            MachineState::Stopping => stop("STOP"),
+            MachineState::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
+            MachineState::Aborting => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
             _ => Vec::new(),
         }
     }
@@ -148,14 +148,14 @@ impl HitLinesCmm {
             (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
                 Err("its points come by the line: remove --file".to_owned())
             }
-            (OperatorConfirmation::Done { .. }, State::Execute | State::Holding | State::Held) => {
+            (OperatorConfirmation::Done { .. }, MachineState::Execute | MachineState::Holding | MachineState::Held) => {
                 self.finish_measurement(&mut hearing)
             }
-            (OperatorConfirmation::Still, State::Holding) => {
-                hearing.state = State::Held;
+            (OperatorConfirmation::Still, MachineState::Holding) => {
+                hearing.state = MachineState::Held;
                 Ok(Vec::new())
             }
-            (OperatorConfirmation::Still, State::Stopping) => {
+            (OperatorConfirmation::Still, MachineState::Stopping) => {
                 hearing.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
@@ -255,11 +255,11 @@ impl Machine for HitLinesCmm {
 
     async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         let Some(plan) = self.memory.payload_for(job) else {
-            return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
+            return Err(self.refused(MachineCommand::Prepare, Answer::PayloadMissing));
         };
         self.current_status()?;
-        if locked(&self.session).state != State::Idle {
-            return Err(self.refused(Command::Prepare, Answer::WrongState));
+        if locked(&self.session).state != MachineState::Idle {
+            return Err(self.refused(MachineCommand::Prepare, Answer::WrongState));
         }
         let (settings, owned) = (self.settings.clone(), Arc::clone(&plan));
         let written = tokio::task::spawn_blocking(move || write_list(&settings, &owned, job));
@@ -270,7 +270,7 @@ impl Machine for HitLinesCmm {
         let armed = self.memory.arm(job);
         hearing.measurement =
             Some(RequestedMeasurement::new((job, armed.start_sequence), plan.identity(), list, Some(kept)));
-        (hearing.state, hearing.outcome) = (State::Prepared, Outcome::None);
+        (hearing.state, hearing.outcome) = (MachineState::Prepared, Outcome::None);
         Ok(armed)
     }
 
@@ -280,17 +280,17 @@ impl Machine for HitLinesCmm {
         let plan = self.memory.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
         let status = {
             let mut hearing = locked(&self.session);
-            let is_prepared = hearing.state == State::Prepared;
+            let is_prepared = hearing.state == MachineState::Prepared;
             let asked =
                 hearing.measurement.as_mut().filter(|asked| (asked.job, asked.sequence) == (job, start_sequence));
             let Some(asked) = asked.filter(|_| is_prepared) else {
                 drop(hearing);
-                return Err(self.refused(Command::Start, Answer::OtherJob));
+                return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
             };
             let now = tokio::time::Instant::now();
             (asked.begun, asked.last_line) = (now, now);
             // Lines are accepted before anybody can see the list.
-            (hearing.state, hearing.clear_of_part) = (State::Execute, None);
+            (hearing.state, hearing.clear_of_part) = (MachineState::Execute, None);
             status_of(&hearing)
         };
         self.memory.last_start_sequence = start_sequence;
@@ -301,7 +301,7 @@ impl Machine for HitLinesCmm {
                 shown.await.map_err(|e| self.not_accepted(e)).and_then(|shown| shown.map_err(|e| self.not_accepted(e)));
             if let Err(error) = shown {
                 // The list was shown to nobody.
-                locked(&self.session).state = State::Prepared;
+                locked(&self.session).state = MachineState::Prepared;
                 return Err(error);
             }
         }
@@ -310,12 +310,12 @@ impl Machine for HitLinesCmm {
 
     async fn hold(&mut self) -> DeviceResult<Status> {
         self.current_status()?;
-        self.transition(Command::Hold, &[State::Execute], State::Holding)
+        self.transition(MachineCommand::Hold, &[MachineState::Execute], MachineState::Holding)
     }
 
     async fn resume(&mut self) -> DeviceResult<Status> {
         self.current_status()?;
-        self.transition(Command::Resume, &[State::Held], State::Execute)
+        self.transition(MachineCommand::Resume, &[MachineState::Held], MachineState::Execute)
     }
 
     async fn stop(&mut self) -> DeviceResult<Status> {
@@ -324,22 +324,22 @@ impl Machine for HitLinesCmm {
             let mut hearing = locked(&self.session);
             let list = TargetList::new(&no_plan(), self.settings.coordinates, false, self.settings.touch_rules());
             hearing.measurement = Some(RequestedMeasurement::new((job, sequence), [0; 32], list, None));
-            hearing.state = State::Stopping;
+            hearing.state = MachineState::Stopping;
             return Ok(status_of(&hearing));
         }
         let state = locked(&self.session).state;
         match state {
-            State::Prepared => {
+            MachineState::Prepared => {
                 locked(&self.session).forget();
-                self.transition(Command::Stop, &[State::Prepared], State::Idle)
+                self.transition(MachineCommand::Stop, &[MachineState::Prepared], MachineState::Idle)
             }
             // A person has confirmed that it does not move.
-            State::Held => {
+            MachineState::Held => {
                 let mut hearing = locked(&self.session);
                 hearing.finish(Outcome::Stopped);
                 Ok(status_of(&hearing))
             }
-            _ => self.transition(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
+            _ => self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping),
         }
     }
 
@@ -347,23 +347,23 @@ impl Machine for HitLinesCmm {
         let untold = self.memory.unresolved.take();
         let mut hearing = locked(&self.session);
         let may_move = hearing.state.is_moving() || untold.is_some();
-        hearing.state = if may_move { State::Aborting } else { State::Aborted };
+        hearing.state = if may_move { MachineState::Aborting } else { MachineState::Aborted };
         hearing.outcome = Outcome::Aborted;
         Ok(status_of(&hearing))
     }
 
     async fn clear(&mut self) -> DeviceResult<Status> {
-        if locked(&self.session).state == State::Aborted {
+        if locked(&self.session).state == MachineState::Aborted {
             locked(&self.session).forget();
         }
-        self.transition(Command::Clear, &[State::Aborted], State::Idle)
+        self.transition(MachineCommand::Clear, &[MachineState::Aborted], MachineState::Idle)
     }
 
     async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         if locked(&self.session).measurement.as_ref().is_none_or(|asked| asked.sequence != done) {
-            return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
+            return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
         }
-        self.transition(Command::Acknowledge, &[State::Complete], State::Idle)?;
+        self.transition(MachineCommand::Acknowledge, &[MachineState::Complete], MachineState::Idle)?;
         let mut hearing = locked(&self.session);
         hearing.forget();
         Ok(status_of(&hearing))
@@ -382,8 +382,8 @@ impl Machine for HitLinesCmm {
         let ours = hearing.measurement.as_ref().map(|asked| (asked.job, asked.sequence))
             == Some((intended.job, intended.start_sequence));
         Ok(match hearing.state {
-            State::Complete | State::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
-            state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(status_of(&hearing)),
+            MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
+            state if ours && (state.is_moving() || state == MachineState::Held) => Reconciled::Running(status_of(&hearing)),
             _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }
@@ -424,7 +424,7 @@ impl Cmm for HitLinesCmm {
 
     async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
         let hearing = locked(&self.session);
-        let complete = hearing.state == State::Complete && hearing.outcome == Outcome::Complete;
+        let complete = hearing.state == MachineState::Complete && hearing.outcome == Outcome::Complete;
         let Some(asked) = hearing.measurement.as_ref().filter(|asked| asked.job == job && complete) else {
             return Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: hearing.state });
         };

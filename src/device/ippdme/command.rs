@@ -10,14 +10,14 @@ pub const MAX_LINE_LENGTH: usize = 65_536;
 
 /// Command without its tag.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Command {
+pub struct DmeCommand {
     /// Name of the command, for example `PtMeas`.
     pub name: String,
     /// Arguments in its parentheses.
     pub arguments: Vec<Item>,
 }
 
-impl Command {
+impl DmeCommand {
     /// Creates a command from its name and arguments.
     pub fn new(name: &str, arguments: Vec<Item>) -> Self {
         Self { name: name.to_owned(), arguments }
@@ -77,7 +77,7 @@ impl Command {
     }
 }
 
-impl fmt::Display for Command {
+impl fmt::Display for DmeCommand {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}({})", self.name, list(&self.arguments))
     }

@@ -1,7 +1,7 @@
 //! Grammar of the arguments of each command. A server refuses other arguments by error number; a client that follows
 //! the grammar is not refused for its arguments.
 
-use super::command::Command;
+use super::command::DmeCommand;
 use super::text::{Item, SyntaxError, Tag, arguments, bad};
 
 const PART_AXES: &[&str] = &["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C"];
@@ -123,7 +123,7 @@ pub(super) fn is_known(name: &str) -> bool {
 ///
 /// # Errors
 /// Returns the error with which a server refuses the arguments.
-pub(super) fn check(command: &Command) -> Result<(), SyntaxError> {
+pub(super) fn check(command: &DmeCommand) -> Result<(), SyntaxError> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
         return Err(SyntaxError { number: 507, reason: "an unknown command" });
     };

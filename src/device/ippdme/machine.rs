@@ -21,7 +21,7 @@ use crate::machine::{Cmm, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, PreliminaryPoints};
 use crate::words::{
-    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, State, Status, digest,
+    Answer, Armed, MachineCommand, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, MachineState, Status, digest,
 };
 use crate::{Connector, LineAddress};
 use regrind_formats::result::Coordinates;
@@ -83,7 +83,7 @@ impl IppdmeCmm {
         let state = locked(&self.shared).state;
         let moved = state.is_moving() || self.memory.unresolved.is_some();
         // An abort that nobody has confirmed is sent again.
-        let aborted = self.aborts.borrow().saturating_sub(u64::from(state == State::Aborting));
+        let aborted = self.aborts.borrow().saturating_sub(u64::from(state == MachineState::Aborting));
         let line = LineAddress::Tcp { host: self.settings.host.clone(), port: self.settings.port };
         let (machine, aborts) = (Arc::clone(&self.name), self.aborts.subscribe());
         let mut session =
@@ -200,7 +200,7 @@ impl IppdmeCmm {
         }
     }
 
-    fn refused(&self, command: Command, answer: Answer) -> DeviceError {
+    fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
         let state = locked(&self.shared).state;
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
@@ -209,7 +209,7 @@ impl IppdmeCmm {
     ///
     /// # Errors
     /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
-    fn transition(&self, command: Command, from: &[State], to: State) -> DeviceResult<Status> {
+    fn transition(&self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         self.current_status()?;
         let mut shared = locked(&self.shared);
         if !from.contains(&shared.state) {
@@ -292,15 +292,15 @@ impl Machine for IppdmeCmm {
 
     async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         let Some(work) = self.memory.payload_for(job) else {
-            return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
+            return Err(self.refused(MachineCommand::Prepare, Answer::PayloadMissing));
         };
         self.check_alive().await?;
-        self.transition(Command::Prepare, &[State::Idle], State::Prepared)?;
+        self.transition(MachineCommand::Prepare, &[MachineState::Idle], MachineState::Prepared)?;
         let armed = self.memory.arm(job);
         let mut shared = locked(&self.shared);
         let points = vec![None; work.plan.targets.len()];
         *shared = SharedState {
-            state: State::Prepared,
+            state: MachineState::Prepared,
             job: Some((job, armed.start_sequence)),
             clear_of_part: shared.clear_of_part,
             notes: std::mem::take(&mut shared.notes),
@@ -318,33 +318,33 @@ impl Machine for IppdmeCmm {
         self.current_status()?;
         let ours = locked(&self.shared).job == Some((job, start_sequence));
         let Some((work, _)) = self.work.clone().filter(|_| ours) else {
-            return Err(self.refused(Command::Start, Answer::OtherJob));
+            return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
         };
         self.job_request.send_replace(JobRequest::Continue);
         locked(&self.shared).last_status_request = Instant::now();
-        let status = self.transition(Command::Start, &[State::Prepared], State::Execute)?;
+        let status = self.transition(MachineCommand::Start, &[MachineState::Prepared], MachineState::Execute)?;
         self.memory.last_start_sequence = start_sequence;
         if let Err(error) = self.order(WorkerOrder::Run(work)).await {
             // The task did not take the order: nothing was sent.
-            locked(&self.shared).state = State::Prepared;
+            locked(&self.shared).state = MachineState::Prepared;
             return Err(error);
         }
         Ok(Started { job, start_sequence, status })
     }
 
     async fn hold(&mut self) -> DeviceResult<Status> {
-        let status = self.transition(Command::Hold, &[State::Execute], State::Holding)?;
+        let status = self.transition(MachineCommand::Hold, &[MachineState::Execute], MachineState::Holding)?;
         self.job_request.send_replace(JobRequest::Hold);
         Ok(status)
     }
 
     async fn resume(&mut self) -> DeviceResult<Status> {
         let Some((work, _)) = self.work.clone() else {
-            return Err(self.refused(Command::Resume, Answer::WrongState));
+            return Err(self.refused(MachineCommand::Resume, Answer::WrongState));
         };
         self.job_request.send_replace(JobRequest::Continue);
         locked(&self.shared).last_status_request = Instant::now();
-        let status = self.transition(Command::Resume, &[State::Held], State::Execute)?;
+        let status = self.transition(MachineCommand::Resume, &[MachineState::Held], MachineState::Execute)?;
         locked(&self.shared).stop_reason = None;
         self.order(WorkerOrder::Run(work)).await?;
         Ok(status)
@@ -355,21 +355,21 @@ impl Machine for IppdmeCmm {
             // The session is open, so the machine is stopped.
             self.current_status()?;
             let mut shared = locked(&self.shared);
-            (shared.job, shared.state, shared.outcome) = (Some(untold), State::Complete, Outcome::Stopped);
+            (shared.job, shared.state, shared.outcome) = (Some(untold), MachineState::Complete, Outcome::Stopped);
             return Ok(self.status_of(&shared));
         }
         let state = locked(&self.shared).state;
         match state {
-            State::Prepared => {
+            MachineState::Prepared => {
                 self.forget();
-                self.transition(Command::Stop, &[State::Prepared], State::Idle)
+                self.transition(MachineCommand::Stop, &[MachineState::Prepared], MachineState::Idle)
             }
-            State::Held => {
+            MachineState::Held => {
                 locked(&self.shared).outcome = Outcome::Stopped;
-                self.transition(Command::Stop, &[State::Held], State::Complete)
+                self.transition(MachineCommand::Stop, &[MachineState::Held], MachineState::Complete)
             }
             _ => {
-                let status = self.transition(Command::Stop, &[State::Execute, State::Holding], State::Stopping)?;
+                let status = self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping)?;
                 self.job_request.send_replace(JobRequest::Stop);
                 Ok(status)
             }
@@ -381,7 +381,7 @@ impl Machine for IppdmeCmm {
         {
             let mut shared = locked(&self.shared);
             shared.job = shared.job.or(untold);
-            (shared.state, shared.outcome) = (State::Aborting, Outcome::Aborted);
+            (shared.state, shared.outcome) = (MachineState::Aborting, Outcome::Aborted);
         }
         // The owner of the session sends it at once, whatever it waits for.
         self.aborts.send_modify(|ordered| *ordered += 1);
@@ -395,22 +395,22 @@ impl Machine for IppdmeCmm {
 
     async fn clear(&mut self) -> DeviceResult<Status> {
         let state = locked(&self.shared).state;
-        if !matches!(state, State::Aborted | State::Faulted) {
-            return Err(self.refused(Command::Clear, Answer::WrongState));
+        if !matches!(state, MachineState::Aborted | MachineState::Faulted) {
+            return Err(self.refused(MachineCommand::Clear, Answer::WrongState));
         }
         let (answer, cleared) = oneshot::channel();
         self.order(WorkerOrder::Clear(answer)).await?;
         cleared.await.unwrap_or_else(|_| self.current_status().map(drop))?;
         self.forget();
         locked(&self.shared).fault = Fault::None;
-        self.transition(Command::Clear, &[State::Aborted, State::Faulted], State::Idle)
+        self.transition(MachineCommand::Clear, &[MachineState::Aborted, MachineState::Faulted], MachineState::Idle)
     }
 
     async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         if locked(&self.shared).job.is_none_or(|(_, sequence)| sequence != done) {
-            return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
+            return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
         }
-        self.transition(Command::Acknowledge, &[State::Complete], State::Idle)?;
+        self.transition(MachineCommand::Acknowledge, &[MachineState::Complete], MachineState::Idle)?;
         self.forget();
         self.current_status()
     }
@@ -428,15 +428,15 @@ impl Machine for IppdmeCmm {
         let mut shared = locked(&self.shared);
         if shared.job == key {
             return Ok(match shared.state {
-                State::Prepared => Reconciled::NotStarted(self.status_of(&shared)),
-                State::Complete | State::Aborted | State::Faulted => Reconciled::Finished(self.status_of(&shared)),
+                MachineState::Prepared => Reconciled::NotStarted(self.status_of(&shared)),
+                MachineState::Complete | MachineState::Aborted | MachineState::Faulted => Reconciled::Finished(self.status_of(&shared)),
                 _ => Reconciled::Running(self.status_of(&shared)),
             });
         }
-        if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == State::Idle {
+        if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == MachineState::Idle {
             let gone =
                 "the server stores no job: the machine has stopped, and the touches of the interrupted run are lost";
-            (shared.job, shared.state, shared.outcome) = (key, State::Complete, Outcome::Failed);
+            (shared.job, shared.state, shared.outcome) = (key, MachineState::Complete, Outcome::Failed);
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
@@ -478,7 +478,7 @@ impl Cmm for IppdmeCmm {
 
     async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
         let shared = locked(&self.shared);
-        let complete = shared.state == State::Complete && shared.outcome == Outcome::Complete;
+        let complete = shared.state == MachineState::Complete && shared.outcome == Outcome::Complete;
         let own = shared.job.filter(|(own, _)| *own == job && complete);
         let points: Option<Vec<MeasuredPoint>> = shared.points.iter().copied().collect();
         match (own, points, &self.work) {

@@ -22,9 +22,9 @@ mod settings;
 mod text;
 mod work;
 
-pub use command::{Command, MAX_LINE_LENGTH};
+pub use command::{DmeCommand, MAX_LINE_LENGTH};
 pub use machine::IppdmeCmm;
-pub use response::{Response, ResponseContent, ServerError, value, values};
+pub use response::{DmeResponse, ResponseContent, ServerError, value, values};
 pub use session::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
 pub use text::{Item, SyntaxError, Tag, number};

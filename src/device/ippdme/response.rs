@@ -7,7 +7,7 @@ use super::text::{Item, Reader, Strictness, SyntaxError, Tag};
 
 /// Line from a server.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Response {
+pub struct DmeResponse {
     /// Tag of the command that it answers.
     pub tag: Tag,
     /// Content of the line.
@@ -55,7 +55,7 @@ impl fmt::Display for ServerError {
     }
 }
 
-impl Response {
+impl DmeResponse {
     /// Parses a line without its line end.
     ///
     /// # Errors
@@ -134,16 +134,16 @@ mod tests {
     use super::*;
 
     fn said(line: &str) -> ResponseContent {
-        Response::read(line).unwrap().content
+        DmeResponse::read(line).unwrap().content
     }
 
     #[test]
     fn response_parses_four_kinds() {
         assert_eq!(said("00001 &"), ResponseContent::Acknowledged);
         assert_eq!(said("00001 % "), ResponseContent::Complete);
-        assert_eq!(Response::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNSOLICITED);
+        assert_eq!(DmeResponse::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNSOLICITED);
         for nothing in ["", "00001", "00001 ?", "0001 &", "00001 & more", "00001 # X(1) Y(2)", "00001 ! Error(x)"] {
-            assert!(Response::read(nothing).is_err(), "{nothing}");
+            assert!(DmeResponse::read(nothing).is_err(), "{nothing}");
         }
     }
 
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn response_refuses_deep_nesting() {
-        assert!(Response::read(&format!("00001 # {}", "A(".repeat(30_000))).is_err());
+        assert!(DmeResponse::read(&format!("00001 # {}", "A(".repeat(30_000))).is_err());
     }
 
     proptest::proptest! {
@@ -174,10 +174,10 @@ mod tests {
         /// command.
         #[test]
         fn response_parse_never_panics(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
-            let _ = Response::read(&line);
-            if let Ok((tag, command)) = crate::ippdme::Command::read(&line) {
+            let _ = DmeResponse::read(&line);
+            if let Ok((tag, command)) = crate::ippdme::DmeCommand::read(&line) {
                 let written = command.line(tag);
-                let again = crate::ippdme::Command::read(written.trim_end());
+                let again = crate::ippdme::DmeCommand::read(written.trim_end());
                 proptest::prop_assert_eq!(again, Ok((tag, command)));
             }
         }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::settings::Scanning;
 use crate::error::DeviceError;
-use crate::payload::{Plan, Target, TargetKind};
+use crate::payload::{Plan, PlanTarget, TargetKind};
 
 /// Maximum number of targets that are reordered. More targets are touched in the plan's order: the search for a better
 /// order would take longer than it saves.
@@ -115,17 +115,17 @@ fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
 }
 
 /// Returns the position of the probe's centre at which it turns into the normal of the target.
-pub(super) fn approach(target: &Target, plan: &Plan) -> [f64; 3] {
+pub(super) fn approach(target: &PlanTarget, plan: &Plan) -> [f64; 3] {
     point_on_normal(target, plan.approach_mm + plan.probe_radius_mm)
 }
 
 /// Returns the point on the normal of a target at a distance of `mm` from the surface.
-pub(super) fn point_on_normal(target: &Target, mm: f64) -> [f64; 3] {
+pub(super) fn point_on_normal(target: &PlanTarget, mm: f64) -> [f64; 3] {
     std::array::from_fn(|k| target.point_mm[k] + mm * target.normal[k])
 }
 
 fn check(
-    target: &Target,
+    target: &PlanTarget,
     plan: &Plan,
     clearance_mm: f64,
     volume_mm: &[[f64; 3]; 2],
@@ -390,7 +390,7 @@ mod tests {
     use crate::payload::CarefulStart;
 
     fn plan(points: impl Iterator<Item = [f64; 3]>) -> Plan {
-        let target = |(index, point_mm)| Target {
+        let target = |(index, point_mm)| PlanTarget {
             index: index as u32,
             kind: TargetKind::Part,
             point_mm,

@@ -15,7 +15,7 @@ use super::session::Failure;
 use super::text::Item;
 use super::work::{MISS_ERRORS, RoutedPlan, Worker, distance, locked};
 use crate::error::DeviceError;
-use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
+use crate::payload::{MeasuredPoint, Plan, TouchStatus, PlanTarget};
 
 /// Radius of curvature sent for a straight curve, in mm.
 const STRAIGHT_MM: f64 = 1e4;
@@ -78,7 +78,7 @@ impl Worker {
     fn decode_scan(
         &self,
         work: &RoutedPlan,
-        targets: &[Target],
+        targets: &[PlanTarget],
         data: &[Vec<Item>],
     ) -> Result<Vec<MeasuredPoint>, Failure> {
         let mut lines: Vec<&Vec<Item>> = data.iter().collect();
@@ -104,7 +104,7 @@ impl Worker {
         let points = targets.iter().zip(places(first)).zip(numbers.chunks_exact(width));
         Ok(points
             .map(|((target, at_mm), said)| {
-                let (index, status) = (target.index, PointStatus::Touched);
+                let (index, status) = (target.index, TouchStatus::Touched);
                 MeasuredPoint { index, status, quality: quality(said), position_mm: at_mm }
             })
             .collect())
@@ -112,7 +112,7 @@ impl Worker {
 
     /// Checks every point of a row against its target: no farther away than the probe may search, and sideways no
     /// farther than half of the distance to the nearest neighbour in the row.
-    fn check_row(&self, work: &RoutedPlan, targets: &[Target], places: &[[f64; 3]]) -> Result<(), Failure> {
+    fn check_row(&self, work: &RoutedPlan, targets: &[PlanTarget], places: &[[f64; 3]]) -> Result<(), Failure> {
         for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
             self.check_touch_position(work, target, *at_mm)?;
             let near = [k.checked_sub(1), Some(k + 1)].into_iter().flatten().filter_map(|k| targets.get(k));
@@ -136,7 +136,7 @@ fn is_missed(error: &ServerError) -> bool {
 
 /// Returns the arguments for a scan of the curve through these targets: open, with the normal of each target, all on
 /// the surface.
-fn curve(targets: &[Target]) -> Vec<Item> {
+fn curve(targets: &[PlanTarget]) -> Vec<Item> {
     let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
     let mut format = ["X", "Y", "Z", "IJK"].map(Item::property_query).to_vec();
     format.push(Item::Name("tag".to_owned()));
@@ -146,7 +146,7 @@ fn curve(targets: &[Target]) -> Vec<Item> {
 }
 
 /// Returns the distance of a place from the normal of a target, in mm.
-fn lateral_distance_mm(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
+fn lateral_distance_mm(target: &PlanTarget, plan: &Plan, at_mm: [f64; 3]) -> f64 {
     let centre = point_on_normal(target, plan.probe_radius_mm);
     let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);
     let along_mm: f64 = (0..3).map(|k| off[k] * target.normal[k]).sum();

@@ -13,8 +13,8 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::command::{Command, MAX_LINE_LENGTH};
-use super::response::{Response, ResponseContent, ServerError, value};
+use super::command::{DmeCommand, MAX_LINE_LENGTH};
+use super::response::{DmeResponse, ResponseContent, ServerError, value};
 use super::text::{Item, Tag};
 use crate::error::DeviceError;
 use crate::{Connector, LineAddress};
@@ -98,7 +98,7 @@ impl CommandReply {
 /// Progress of a command.
 struct Pending<'a> {
     tag: Tag,
-    command: &'a Command,
+    command: &'a DmeCommand,
     acknowledged: bool,
     answer: CommandReply,
     error: Option<ServerError>,
@@ -192,7 +192,7 @@ impl Session {
         if self.is_abort_ordered() {
             return Err(self.abort().await);
         }
-        let command = Command::new(name, arguments);
+        let command = DmeCommand::new(name, arguments);
         let tag = if command.is_event() { self.next_event() } else { self.next_command() };
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let mut pending =
@@ -218,7 +218,7 @@ impl Session {
                 }
                 // This answer is awaited in parallel with the answer to the command.
                 let (tag, limit) = (self.next_event(), Instant::now() + self.limits.answer);
-                self.write(&Command::new("GetErrStatusE", Vec::new()), tag).await.map_err(Failure::Link)?;
+                self.write(&DmeCommand::new("GetErrStatusE", Vec::new()), tag).await.map_err(Failure::Link)?;
                 (asked_alive, alive_at) = (Some((tag, limit)), limit);
                 continue;
             };
@@ -268,7 +268,7 @@ impl Session {
     }
 
     /// Processes a line of another tag: a message of the server itself, or a late line of a finished command.
-    fn process_other_line(&mut self, response: Response) -> Result<(), Failure> {
+    fn process_other_line(&mut self, response: DmeResponse) -> Result<(), Failure> {
         match (response.tag, response.content) {
             (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
             (Tag::UNSOLICITED, ResponseContent::Error(error)) => {
@@ -301,20 +301,20 @@ impl Session {
         Tag::Event(self.last_event)
     }
 
-    async fn write(&mut self, command: &Command, tag: Tag) -> Result<(), DeviceError> {
+    async fn write(&mut self, command: &DmeCommand, tag: Tag) -> Result<(), DeviceError> {
         let line = command.line(tag);
         let written = timeout(self.limits.answer, self.stream.write_all(line.as_bytes())).await;
         written.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|_| self.disconnected("writing"))
     }
 
-    fn parse_response(&mut self, line: std::io::Result<String>) -> Result<Response, Failure> {
+    fn parse_response(&mut self, line: std::io::Result<String>) -> Result<DmeResponse, Failure> {
         let line = line.map_err(|e| match e.kind() {
             std::io::ErrorKind::InvalidData => {
                 Failure::Link(self.unreadable(String::new(), "a line that does not end, or is not ASCII"))
             }
             _ => Failure::Link(self.disconnected("reading")),
         })?;
-        Response::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.reason)))
+        DmeResponse::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.reason)))
     }
 
     // ---- the end of everything ------------------------------------------------------------------------------------------------------
@@ -351,7 +351,7 @@ impl Session {
     /// Sends the abort and waits for its end. With `may_refuse`, an error answer is accepted: a server without a
     /// session may have nothing to abort.
     async fn send_abort(&mut self, may_refuse: bool) -> Result<(), Failure> {
-        let (command, tag) = (Command::new("AbortE", Vec::new()), self.next_event());
+        let (command, tag) = (DmeCommand::new("AbortE", Vec::new()), self.next_event());
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let over = Instant::now() + self.limits.abort;
         // Nothing else is sent before the abort is over. Lines of the aborted commands are ignored.
@@ -402,7 +402,7 @@ impl Session {
         self.notes.iter().cloned().collect()
     }
 
-    fn timed_out(&self, command: &Command, limit: Duration) -> DeviceError {
+    fn timed_out(&self, command: &DmeCommand, limit: Duration) -> DeviceError {
         let what = super::static_command_name(&command.name);
         DeviceError::TimedOut { machine: Arc::clone(&self.machine), operation: what, limit }
     }

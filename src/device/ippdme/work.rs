@@ -13,8 +13,8 @@ use super::session::{CommandReply, Failure, Session};
 use super::settings::IppdmeSettings;
 use super::text::Item;
 use crate::error::DeviceError;
-use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
-use crate::words::{Fault, Job, Outcome, State};
+use crate::payload::{MeasuredPoint, Plan, TouchStatus, PlanTarget};
+use crate::words::{Fault, Job, Outcome, MachineState};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.
@@ -53,7 +53,7 @@ pub(super) enum WorkerOrder {
 /// State that the task and the machine's driver share.
 #[derive(Debug)]
 pub(super) struct SharedState {
-    pub(super) state: State,
+    pub(super) state: MachineState,
     pub(super) job: Option<(Job, u32)>,
     pub(super) outcome: Outcome,
     pub(super) fault: Fault,
@@ -74,7 +74,7 @@ pub(super) struct SharedState {
 impl SharedState {
     pub(super) fn new() -> Self {
         Self {
-            state: State::Idle,
+            state: MachineState::Idle,
             job: None,
             outcome: Outcome::None,
             fault: Fault::None,
@@ -93,9 +93,9 @@ impl SharedState {
     /// moves.
     pub(super) fn come_to_rest(&mut self) {
         (self.state, self.outcome) = match self.state {
-            State::Aborting => (State::Aborted, Outcome::Aborted),
-            State::Stopping => (State::Complete, Outcome::Stopped),
-            State::Execute | State::Holding => (State::Held, Outcome::None),
+            MachineState::Aborting => (MachineState::Aborted, Outcome::Aborted),
+            MachineState::Stopping => (MachineState::Complete, Outcome::Stopped),
+            MachineState::Execute | MachineState::Holding => (MachineState::Held, Outcome::None),
             other => (other, self.outcome),
         };
     }
@@ -178,7 +178,7 @@ impl Worker {
         shared.clear_of_part = None;
         match failure {
             Failure::Aborted => {
-                (shared.state, shared.outcome) = (State::Aborted, Outcome::Aborted);
+                (shared.state, shared.outcome) = (MachineState::Aborted, Outcome::Aborted);
                 return false;
             }
             Failure::Link(_) => {
@@ -188,9 +188,9 @@ impl Worker {
             Failure::Refused(error) => shared.fault = fault(error.number),
             Failure::Implausible(_) => shared.fault = Fault::Tool,
         }
-        let of_job = shared.state.is_moving() || shared.state == State::Held;
+        let of_job = shared.state.is_moving() || shared.state == MachineState::Held;
         shared.outcome = if of_job { Outcome::Failed } else { shared.outcome };
-        (shared.state, shared.stop_reason) = (State::Faulted, Some(why.to_string()));
+        (shared.state, shared.stop_reason) = (MachineState::Faulted, Some(why.to_string()));
         false
     }
 
@@ -230,7 +230,7 @@ impl Worker {
                 self.set_speeds(work, k).await?;
                 let point = self.touch(work, &work.plan.targets[k]).await?;
                 locked(&self.shared).points[k] = Some(point);
-                unreached += u32::from(point.status == PointStatus::NotReached);
+                unreached += u32::from(point.status == TouchStatus::NotReached);
                 if unreached >= MAX_UNREACHED {
                     return self.fail_unreachable(work, unreached).await;
                 }
@@ -239,15 +239,15 @@ impl Worker {
         self.rise(work).await?;
         let wish = *self.job_request.borrow();
         let mut shared = locked(&self.shared);
-        if shared.state == State::Aborting {
+        if shared.state == MachineState::Aborting {
             return Ok(()); // The abort is next.
         }
         shared.clear_of_part = Some(true);
         (shared.state, shared.outcome) = match wish {
-            _ if shared.points.iter().all(Option::is_some) => (State::Complete, Outcome::Complete),
-            JobRequest::Stop => (State::Complete, Outcome::Stopped),
+            _ if shared.points.iter().all(Option::is_some) => (MachineState::Complete, Outcome::Complete),
+            JobRequest::Stop => (MachineState::Complete, Outcome::Stopped),
             // Held, or resumed at the last moment.
-            JobRequest::Hold | JobRequest::Continue => (State::Held, Outcome::None),
+            JobRequest::Hold | JobRequest::Continue => (MachineState::Held, Outcome::None),
         };
         Ok(())
     }
@@ -263,8 +263,8 @@ impl Worker {
     /// machine does that loses its client.
     fn current_request(&self) -> JobRequest {
         let mut shared = locked(&self.shared);
-        if shared.state == State::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
-            shared.state = State::Holding;
+        if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
+            shared.state = MachineState::Holding;
             shared.stop_reason = Some("no status request arrived for too long, and it holds by itself".to_owned());
             return JobRequest::Hold;
         }
@@ -396,8 +396,8 @@ impl Worker {
     // ---- motion -----------------------------------------------------------------------------------------------------------------------
 
     /// Touches one target, with up to `retries` retries after a miss.
-    async fn touch(&mut self, work: &RoutedPlan, target: &Target) -> Result<MeasuredPoint, Failure> {
-        let mut missed = PointStatus::NotFound;
+    async fn touch(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<MeasuredPoint, Failure> {
+        let mut missed = TouchStatus::NotFound;
         for _ in 0..=self.settings.retries {
             self.move_above(work, target).await?;
             let [x, y, z] = target.point_mm;
@@ -425,7 +425,7 @@ impl Worker {
     }
 
     /// Returns the measured point in the answer to a touch, if it is plausible for this target.
-    fn point(&mut self, work: &RoutedPlan, target: &Target, answer: &CommandReply) -> Result<MeasuredPoint, Failure> {
+    fn point(&mut self, work: &RoutedPlan, target: &PlanTarget, answer: &CommandReply) -> Result<MeasuredPoint, Failure> {
         let missing = || Failure::Implausible(self.missing_value("PtMeas", "X, Y and Z, each once"));
         let mut at_mm = [0.0; 3];
         for (at, name) in at_mm.iter_mut().zip(["X", "Y", "Z"]) {
@@ -437,14 +437,14 @@ impl Worker {
         self.check_touch_position(work, target, at_mm)?;
         let quality = answer.value("Q").map_or(0, |quality| quality.clamp(0.0, 100.0) as u16);
         self.position_mm = Some(approach(target, &work.plan));
-        Ok(MeasuredPoint { index: target.index, status: PointStatus::Touched, quality, position_mm: at_mm })
+        Ok(MeasuredPoint { index: target.index, status: TouchStatus::Touched, quality, position_mm: at_mm })
     }
 
     /// Checks that a point lies within approach + search + probe tolerance of the position to which the probe was sent.
     pub(super) fn check_touch_position(
         &self,
         work: &RoutedPlan,
-        target: &Target,
+        target: &PlanTarget,
         at_mm: [f64; 3],
     ) -> Result<(), Failure> {
         let plan = &work.plan;
@@ -459,7 +459,7 @@ impl Worker {
     }
 
     /// Travels at the clearance height to above a target, then down to the point where the probe turns into the normal.
-    pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &Target) -> Result<(), Failure> {
+    pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
         self.go_to([x, y, work.route.clearance_mm]).await?;
@@ -543,8 +543,8 @@ fn missed_by(answer: &CommandReply) -> Option<u16> {
     numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())
 }
 
-fn status_of(number: u16) -> PointStatus {
-    if number == 1001 { PointStatus::NotReached } else { PointStatus::NotFound }
+fn status_of(number: u16) -> TouchStatus {
+    if number == 1001 { TouchStatus::NotReached } else { TouchStatus::NotFound }
 }
 
 pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {

@@ -6,10 +6,10 @@ use std::time::Duration;
 use tokio::time::{Instant, sleep};
 
 use super::link::{Link, LinkFault};
-use super::protocol::{Get, Mode, Reply, Request, Set};
+use super::protocol::{Get, ControllerMode, RshReply, RshRequest, Set};
 use super::settings::LinuxcncSettings;
 use crate::error::{DeviceError, DeviceResult};
-use crate::words::{Answer, Command, State};
+use crate::words::{Answer, MachineCommand, MachineState};
 use crate::{Connector, LineAddress};
 
 /// Interval between two queries while waiting for something.
@@ -34,7 +34,7 @@ pub(super) struct ControllerState {
     pub(super) stop_circuit_open: bool,
     /// True if the drives are on.
     pub(super) drives_on: bool,
-    pub(super) mode: Mode,
+    pub(super) mode: ControllerMode,
     pub(super) homed: bool,
     pub(super) interpreter: Interpreter,
     /// Program that is open.
@@ -74,19 +74,19 @@ impl Controller {
         let line = LineAddress::Tcp { host: host.clone(), port: *port };
         let link = Link::open(&line, self.connector.as_mut(), *answer_timeout).await;
         let link = link.map_err(|fault| self.fault(fault, "a connection"))?;
-        let hello = Request::Hello { password: connect_password.clone() };
+        let hello = RshRequest::Hello { password: connect_password.clone() };
         let server = match link.ask(hello, *answer_timeout).answer().await {
-            Ok(Reply::Value(server)) => server,
+            Ok(RshReply::Value(server)) => server,
             Ok(_) => return Err(DeviceError::Password { machine: self.machine(), key: "connect_password" }),
             Err(LinkFault::NotProtocol | LinkFault::TimedOut) => {
                 return Err(self.not_linuxcnc("hello", "no valid answer"));
             }
             Err(fault) => return Err(self.fault(fault, "hello")),
         };
-        link.send_unanswered(Request::EchoOff);
-        let verbose = link.ask(Request::Set(Set::Verbose), *answer_timeout).answer().await;
+        link.send_unanswered(RshRequest::EchoOff);
+        let verbose = link.ask(RshRequest::Set(Set::Verbose), *answer_timeout).answer().await;
         match verbose.map_err(|fault| self.fault(fault, "set verbose"))? {
-            Reply::Acknowledged => {}
+            RshReply::Acknowledged => {}
             other => return Err(self.not_linuxcnc("set verbose", &format!("{other:?}"))),
         }
         (self.link, self.link_error) = (Some(link), None);
@@ -126,7 +126,7 @@ impl Controller {
             Get::AbsActPos,
         ];
         let link = self.link("its status")?;
-        let asked = WHAT.map(|what| (what, link.ask(Request::Get(what), self.settings.answer_timeout)));
+        let asked = WHAT.map(|what| (what, link.ask(RshRequest::Get(what), self.settings.answer_timeout)));
         let mut told = Vec::with_capacity(WHAT.len());
         for (what, asked) in asked {
             let answer = asked.answer().await;
@@ -156,7 +156,7 @@ impl Controller {
             has_control: switch("get enable", enable)?,
             stop_circuit_open: switch("get estop", estop)?,
             drives_on: switch("get machine", machine)?,
-            mode: Mode::from_name(mode).ok_or_else(|| self.not_linuxcnc("get mode", mode))?,
+            mode: ControllerMode::from_name(mode).ok_or_else(|| self.not_linuxcnc("get mode", mode))?,
             homed: homed.len() == self.settings.joints && homed.iter().all(|joint| *joint == "YES"),
             interpreter,
             program: Some(program.clone()).filter(|program| program != "NONE"),
@@ -179,14 +179,14 @@ impl Controller {
     }
 
     pub(super) async fn get(&mut self, what: Get) -> DeviceResult<String> {
-        let asked = self.link("a question")?.ask(Request::Get(what), self.settings.answer_timeout);
+        let asked = self.link("a question")?.ask(RshRequest::Get(what), self.settings.answer_timeout);
         let answer = asked.answer().await;
         self.value(what, answer)
     }
 
-    fn value(&mut self, what: Get, answer: Result<Reply, LinkFault>) -> DeviceResult<String> {
+    fn value(&mut self, what: Get, answer: Result<RshReply, LinkFault>) -> DeviceResult<String> {
         match answer {
-            Ok(Reply::Value(value)) => Ok(value),
+            Ok(RshReply::Value(value)) => Ok(value),
             Ok(other) => Err(self.not_linuxcnc("a question", &format!("{other:?} to {what:?}"))),
             Err(fault) => Err(self.broken(fault, "its status")),
         }
@@ -194,35 +194,35 @@ impl Controller {
 
     /// Sends an order after the pending requests. An acknowledgement means that the order was received, not that it
     /// succeeded.
-    pub(super) async fn order(&mut self, set: Set, command: Command) -> DeviceResult<()> {
-        let asked = self.link("an order")?.ask(Request::Set(set), self.settings.answer_timeout);
+    pub(super) async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<()> {
+        let asked = self.link("an order")?.ask(RshRequest::Set(set), self.settings.answer_timeout);
         let answer = asked.answer().await;
         self.check_acknowledged(answer, command).await
     }
 
-    async fn check_acknowledged(&mut self, answer: Result<Reply, LinkFault>, command: Command) -> DeviceResult<()> {
+    async fn check_acknowledged(&mut self, answer: Result<RshReply, LinkFault>, command: MachineCommand) -> DeviceResult<()> {
         match answer {
-            Ok(Reply::Acknowledged) => Ok(()),
+            Ok(RshReply::Acknowledged) => Ok(()),
             Ok(_) => Err(self.denied(command).await?),
             Err(fault) => Err(self.broken(fault, "an order")),
         }
     }
 
     /// Returns the reason why an order was refused; without control every order is refused.
-    async fn denied(&mut self, command: Command) -> DeviceResult<DeviceError> {
+    async fn denied(&mut self, command: MachineCommand) -> DeviceResult<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
             return Ok(self.control_taken());
         }
         let machine = self.machine();
-        Ok(DeviceError::Refused { machine, command, answer: Answer::WrongState, state: State::Idle })
+        Ok(DeviceError::Refused { machine, command, answer: Answer::WrongState, state: MachineState::Idle })
     }
 
     /// Takes control of the controller.
     pub(super) async fn take_control(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
-        let asked = self.link("control")?.ask(Request::Set(enable), self.settings.answer_timeout);
+        let asked = self.link("control")?.ask(RshRequest::Set(enable), self.settings.answer_timeout);
         match asked.answer().await {
-            Ok(Reply::Acknowledged) => self.has_control = true,
+            Ok(RshReply::Acknowledged) => self.has_control = true,
             Ok(_) => return Err(DeviceError::Password { machine: self.machine(), key: "control_password" }),
             Err(fault) => return Err(self.broken(fault, "control")),
         }
@@ -234,24 +234,24 @@ impl Controller {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let within = self.settings.answer_timeout;
         let link = self.link("an abort")?;
-        let (taken, aborted) = (link.ask(Request::Set(enable), within), link.ask(Request::Set(Set::Abort), within));
-        if let Ok(Reply::Refused) = taken.answer().await {
+        let (taken, aborted) = (link.ask(RshRequest::Set(enable), within), link.ask(RshRequest::Set(Set::Abort), within));
+        if let Ok(RshReply::Refused) = taken.answer().await {
             return Err(DeviceError::Password { machine: self.machine(), key: "control_password" });
         }
         self.has_control = true;
         let answer = aborted.answer().await;
-        self.check_acknowledged(answer, Command::Abort).await
+        self.check_acknowledged(answer, MachineCommand::Abort).await
     }
 
     /// Switches to a mode and waits until the controller reports that mode and an idle interpreter.
-    pub(super) async fn enter(&mut self, mode: Mode, command: Command) -> DeviceResult<()> {
+    pub(super) async fn enter(&mut self, mode: ControllerMode, command: MachineCommand) -> DeviceResult<()> {
         self.order(Set::Mode(mode), command).await?;
         self.wait_until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
     }
 
     /// Opens a program and checks that it is then the open one. A failed open is acknowledged too, and leaves the
     /// previous program open.
-    pub(super) async fn open(&mut self, path: &str, command: Command) -> DeviceResult<()> {
+    pub(super) async fn open(&mut self, path: &str, command: MachineCommand) -> DeviceResult<()> {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
         let opened =
@@ -300,7 +300,7 @@ impl Controller {
     /// Releases control and closes the connection.
     pub(super) async fn disconnect(&mut self) {
         if self.has_control && self.link.is_some() {
-            let _ = self.order(Set::Disable, Command::Release).await;
+            let _ = self.order(Set::Disable, MachineCommand::Release).await;
         }
         (self.link, self.has_control) = (None, false);
     }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
 
-use super::program::{PROGRAM, Program, ProgramInputs, ProgramRecord, RECORD, name_begins};
+use super::program::{PROGRAM, FramedProgram, ProgramInputs, ProgramRecord, RECORD, name_begins};
 
 /// File name of the program that a run writes with every correction.
 const PASS_PROGRAM_FILE: &str = "toolpath.ngc";
@@ -32,7 +32,7 @@ impl Folders {
     ///
     /// # Errors
     /// Returns a text if there is no program, or if the newest is not of this map or must not be run.
-    pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
+    pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<FramedProgram, String> {
         let cycles = std::fs::read_dir(&self.run).map_err(|error| path_error(&self.run, &error))?;
         let cycles =
             cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(PASS_PROGRAM_FILE))));
@@ -43,15 +43,15 @@ impl Folders {
         self.framed(cycle, &file, map, rounds)
     }
 
-    fn framed(&self, cycle: u32, file: &Path, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
+    fn framed(&self, cycle: u32, file: &Path, map: &[u8; 32], rounds: u32) -> Result<FramedProgram, String> {
         let pass = read_bytes(file).map_err(|error| error.to_string())?;
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let order = ProgramInputs { run: &run, cycle, pass: &pass, map, rounds, folder: &self.remote };
-        Program::frame(order).map_err(|why| format!("{}: {why}", file.display()))
+        FramedProgram::frame(order).map_err(|why| format!("{}: {why}", file.display()))
     }
 
     /// Writes a program into the folder that the controller sees, and reads it back.
-    pub(super) fn put(&self, program: &Program) -> Result<(), String> {
+    pub(super) fn put(&self, program: &FramedProgram) -> Result<(), String> {
         let file = self.local.join(&program.name).with_extension(PROGRAM);
         let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
         if lies_there(&file) {
@@ -79,7 +79,7 @@ impl Folders {
     }
 
     /// Returns the program of this run whose record has this token: one prepared before this process started.
-    pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<Program>, String> {
+    pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<FramedProgram>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);
         for entry in std::fs::read_dir(&self.local).map_err(|error| path_error(&self.local, &error))?.flatten() {
@@ -89,7 +89,7 @@ impl Folders {
             if self.record(name)?.is_some_and(|record| record.token == Some(token)) {
                 let file = file.with_extension(PROGRAM);
                 let text = std::fs::read(&file).map_err(|error| path_error(&file, &error))?;
-                return Ok(Program::read(name, cycle, text));
+                return Ok(FramedProgram::read(name, cycle, text));
             }
         }
         Ok(None)

@@ -8,7 +8,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::protocol::{LineMatch, LineSplitter, PendingRequests, Reply, Request};
+use super::protocol::{LineMatch, LineSplitter, PendingRequests, RshReply, RshRequest};
 use crate::{Connector, LineAddress, LineStream};
 
 /// Reason why there is no answer.
@@ -34,19 +34,19 @@ pub(super) struct Link {
 
 #[derive(Debug)]
 struct QueuedRequest {
-    request: Request,
+    request: RshRequest,
     line: String,
     timeout: Duration,
-    reply: oneshot::Sender<Result<Reply, LinkFault>>,
+    reply: oneshot::Sender<Result<RshReply, LinkFault>>,
 }
 
 /// Pending answer.
 #[derive(Debug)]
-pub(super) struct PendingReply(Result<oneshot::Receiver<Result<Reply, LinkFault>>, LinkFault>);
+pub(super) struct PendingReply(Result<oneshot::Receiver<Result<RshReply, LinkFault>>, LinkFault>);
 
 impl PendingReply {
     /// Waits for the answer.
-    pub(super) async fn answer(self) -> Result<Reply, LinkFault> {
+    pub(super) async fn answer(self) -> Result<RshReply, LinkFault> {
         // The sender was dropped: the task has ended.
         self.0?.await.unwrap_or(Err(LinkFault::Disconnected))
     }
@@ -70,7 +70,7 @@ impl Link {
     }
 
     /// Sends a request after the earlier ones, answered or not.
-    pub(super) fn ask(&self, request: Request, within: Duration) -> PendingReply {
+    pub(super) fn ask(&self, request: RshRequest, within: Duration) -> PendingReply {
         let Some(line) = request.line() else { return PendingReply(Err(LinkFault::Unsendable)) };
         let (reply, answer) = oneshot::channel();
         match self.requests.send(QueuedRequest { request, line, timeout: within, reply }) {
@@ -80,13 +80,13 @@ impl Link {
     }
 
     /// Sends a request that has no answer.
-    pub(super) fn send_unanswered(&self, request: Request) {
+    pub(super) fn send_unanswered(&self, request: RshRequest) {
         drop(self.ask(request, Duration::ZERO));
     }
 }
 
 /// Receiver of a pending answer, and its deadline.
-type Waiter = (oneshot::Sender<Result<Reply, LinkFault>>, Instant);
+type Waiter = (oneshot::Sender<Result<RshReply, LinkFault>>, Instant);
 
 struct ConnectionTask {
     stream: Box<dyn LineStream>,
@@ -134,7 +134,7 @@ impl ConnectionTask {
 
     async fn send(&mut self, question: QueuedRequest) -> Result<(), LinkFault> {
         let QueuedRequest { request, line, timeout: within, reply } = question;
-        let echo = request == Request::EchoOff;
+        let echo = request == RshRequest::EchoOff;
         if reply.is_closed() && !echo {
             return Ok(()); // whoever asked has gone; what was never sent need not be
         }

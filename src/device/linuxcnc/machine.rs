@@ -23,8 +23,8 @@ use tokio::time::{Instant, timeout};
 
 use super::controller::{Controller, Interpreter};
 use super::folder::Folders;
-use super::program::{PROGRAM, Program, ProgramRecord, path};
-use super::protocol::{Mode, Set};
+use super::program::{PROGRAM, FramedProgram, ProgramRecord, path};
+use super::protocol::{ControllerMode, Set};
 use super::settings::LinuxcncSettings;
 use super::work::{ActiveJob, Stage};
 use crate::Connector;
@@ -33,8 +33,8 @@ use crate::machine::{Grinder, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use crate::words::{
-    Answer, Armed, Command, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started,
-    State, Status, digest,
+    Answer, Armed, MachineCommand, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started,
+    MachineState, Status, digest,
 };
 use looking::standing_fault;
 use reconciling::unknown;
@@ -55,7 +55,7 @@ pub struct LinuxcncGrinder {
     /// True if another client has taken control. Only an abort takes control back.
     control_lost: bool,
     /// Loaded program, and the digest of its payload.
-    loaded: Option<(Arc<Program>, u32)>,
+    loaded: Option<(Arc<FramedProgram>, u32)>,
     job: Option<ActiveJob>,
     /// True if aborted when no job had begun: CLEAR is needed all the same.
     aborted: bool,
@@ -69,7 +69,7 @@ pub struct LinuxcncGrinder {
     /// Line and position seen last, and since when.
     last_motion: Option<(u32, String, Instant)>,
     /// State at the last status query.
-    last_state: Option<State>,
+    last_state: Option<MachineState>,
     notes: Vec<String>,
     /// Random generator of the preparation tokens.
     rng: StdRng,
@@ -160,13 +160,13 @@ impl Machine for LinuxcncGrinder {
 
     async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         let Some((program, loaded)) = self.loaded.clone() else {
-            return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
+            return Err(self.refused(MachineCommand::Prepare, Answer::PayloadMissing));
         };
         if loaded != job.digest || program.cycle + 1 != job.batch_id().cycle {
-            return Err(self.refused(Command::Prepare, Answer::OtherJob));
+            return Err(self.refused(MachineCommand::Prepare, Answer::OtherJob));
         }
         if self.aborted || !matches!(self.stage(), None | Some(Stage::Prepared)) {
-            return Err(self.refused(Command::Prepare, Answer::WrongState));
+            return Err(self.refused(MachineCommand::Prepare, Answer::WrongState));
         }
         self.job = None;
         self.prepare_program(job, program).await
@@ -175,8 +175,8 @@ impl Machine for LinuxcncGrinder {
     async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
         let (seen, status) = self.read_status().await?;
         let is_prepared = self.job_for(&armed).is_some_and(|work| work.stage == Stage::Prepared);
-        if !is_prepared || status.state != State::Prepared || seen.mode != Mode::Auto {
-            return Err(self.refused(Command::Start, Answer::DeadToken));
+        if !is_prepared || status.state != MachineState::Prepared || seen.mode != ControllerMode::Auto {
+            return Err(self.refused(MachineCommand::Start, Answer::DeadToken));
         }
         let Armed { job, start_sequence, .. } = armed;
         // From here on the job may have begun, even if this call fails.
@@ -200,22 +200,22 @@ impl Machine for LinuxcncGrinder {
     async fn hold(&mut self) -> DeviceResult<Status> {
         // An idle controller would be paused without a program. If the program was seen running, the order is sent at
         // once.
-        if self.last_state != Some(State::Execute) {
+        if self.last_state != Some(MachineState::Execute) {
             self.read_status().await?;
         }
-        if self.last_state != Some(State::Execute) || self.stage() != Some(Stage::Begun) {
-            return Err(self.refused(Command::Hold, Answer::WrongState));
+        if self.last_state != Some(MachineState::Execute) || self.stage() != Some(Stage::Begun) {
+            return Err(self.refused(MachineCommand::Hold, Answer::WrongState));
         }
-        let status = self.order(Set::Pause, Command::Hold).await?;
+        let status = self.order(Set::Pause, MachineCommand::Hold).await?;
         self.abort_if_ended(status).await
     }
 
     async fn resume(&mut self) -> DeviceResult<Status> {
         self.read_status().await?;
-        if self.last_state != Some(State::Held) || self.stage() != Some(Stage::Begun) {
-            return Err(self.refused(Command::Resume, Answer::WrongState));
+        if self.last_state != Some(MachineState::Held) || self.stage() != Some(Stage::Begun) {
+            return Err(self.refused(MachineCommand::Resume, Answer::WrongState));
         }
-        self.order(Set::Resume, Command::Resume).await
+        self.order(Set::Resume, MachineCommand::Resume).await
     }
 
     async fn stop(&mut self) -> DeviceResult<Status> {
@@ -226,11 +226,11 @@ impl Machine for LinuxcncGrinder {
             }
             Some(Stage::Begun) => {
                 self.set_requested_outcome(Outcome::Stopped);
-                self.order(Set::Abort, Command::Stop).await
+                self.order(Set::Abort, MachineCommand::Stop).await
             }
             _ => {
                 self.read_status().await?;
-                Err(self.refused(Command::Stop, Answer::WrongState))
+                Err(self.refused(MachineCommand::Stop, Answer::WrongState))
             }
         }
     }
@@ -259,7 +259,7 @@ impl Machine for LinuxcncGrinder {
         self.control_lost = false;
         match self.job.as_mut().map(|work| &mut work.stage) {
             Some(Stage::Begun) => {}
-            Some(Stage::Ended(state, _)) => *state = State::Aborted,
+            Some(Stage::Ended(state, _)) => *state = MachineState::Aborted,
             Some(Stage::Prepared) | None => (self.job, self.aborted) = (None, true),
         }
         self.status().await
@@ -267,8 +267,8 @@ impl Machine for LinuxcncGrinder {
 
     async fn clear(&mut self) -> DeviceResult<Status> {
         let (seen, status) = self.read_status().await?;
-        if !matches!(status.state, State::Aborted | State::Faulted) {
-            return Err(self.refused(Command::Clear, Answer::WrongState));
+        if !matches!(status.state, MachineState::Aborted | MachineState::Faulted) {
+            return Err(self.refused(MachineCommand::Clear, Answer::WrongState));
         }
         if let Some(fault) = standing_fault(&seen) {
             return Err(DeviceError::Faulted { machine: self.machine(), state: status.state, fault });
@@ -280,11 +280,11 @@ impl Machine for LinuxcncGrinder {
 
     async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         match &self.job {
-            Some(ActiveJob { stage: Stage::Ended(State::Complete, _), sequence, .. }) if *sequence == done => {}
-            Some(ActiveJob { stage: Stage::Ended(State::Complete, _), .. }) => {
-                return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
+            Some(ActiveJob { stage: Stage::Ended(MachineState::Complete, _), sequence, .. }) if *sequence == done => {}
+            Some(ActiveJob { stage: Stage::Ended(MachineState::Complete, _), .. }) => {
+                return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
             }
-            _ => return Err(self.refused(Command::Acknowledge, Answer::WrongState)),
+            _ => return Err(self.refused(MachineCommand::Acknowledge, Answer::WrongState)),
         }
         self.job = None;
         self.status().await
@@ -330,8 +330,8 @@ impl Machine for LinuxcncGrinder {
             {
                 return Err(not_taken("that map is not the one of its program"));
             }
-            OperatorConfirmation::Done { .. } => Stage::Ended(State::Complete, Outcome::Complete),
-            OperatorConfirmation::Still => Stage::Ended(State::Complete, Outcome::Stopped),
+            OperatorConfirmation::Done { .. } => Stage::Ended(MachineState::Complete, Outcome::Complete),
+            OperatorConfirmation::Still => Stage::Ended(MachineState::Complete, Outcome::Stopped),
         };
         if let Some(work) = &mut self.job {
             work.stage = ended;
@@ -356,14 +356,14 @@ impl Grinder for LinuxcncGrinder {
         let (seen, _) = self.read_status().await?;
         self.check_ready(&seen)?;
         let path = self.path(&program);
-        self.controller.open(&path, Command::Prepare).await?;
+        self.controller.open(&path, MachineCommand::Prepare).await?;
         self.loaded = Some((Arc::new(program), digest(&[identity, pass.identity()])));
         Ok(())
     }
 
     async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<PassRecord> {
         let no_result =
-            DeviceError::NoResult { machine: self.machine(), job, state: self.last_state.unwrap_or(State::Idle) };
+            DeviceError::NoResult { machine: self.machine(), job, state: self.last_state.unwrap_or(MachineState::Idle) };
         let work = self.job.as_ref().filter(|work| work.job == job).ok_or_else(|| no_result.clone())?;
         let (Stage::Ended(_, outcome), Some(program)) = (work.stage, &work.program) else { return Err(no_result) };
         Ok(PassRecord {
@@ -378,8 +378,8 @@ impl LinuxcncGrinder {
         self.controller.machine()
     }
 
-    fn refused(&self, command: Command, answer: Answer) -> DeviceError {
-        let state = self.last_state.unwrap_or(State::Idle);
+    fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
+        let state = self.last_state.unwrap_or(MachineState::Idle);
         DeviceError::Refused { machine: self.machine(), command, answer, state }
     }
 
@@ -406,7 +406,7 @@ impl LinuxcncGrinder {
     }
 
     /// Sends an order to a running or held job.
-    async fn order(&mut self, set: Set, command: Command) -> DeviceResult<Status> {
+    async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<Status> {
         match self.controller.order(set, command).await {
             Ok(()) => {}
             Err(DeviceError::Refused { answer, .. }) => {
@@ -426,7 +426,7 @@ impl LinuxcncGrinder {
         if !matches!(self.job.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
             return Ok(status);
         }
-        self.order(Set::Abort, Command::Hold).await
+        self.order(Set::Abort, MachineCommand::Hold).await
     }
 
     /// Runs work in the folders on a thread for blocking work.
@@ -452,7 +452,7 @@ impl LinuxcncGrinder {
         Ok(work.own_record(self.in_folders(move |folders| folders.record(&name)).await?))
     }
 
-    fn path(&self, program: &Program) -> String {
+    fn path(&self, program: &FramedProgram) -> String {
         path(&self.folders.remote, &program.name, PROGRAM)
     }
 }

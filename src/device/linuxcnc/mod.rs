@@ -22,6 +22,6 @@ mod settings;
 mod work;
 
 pub use machine::LinuxcncGrinder;
-pub use program::{Program, ProgramInputs, ProgramRecord};
-pub use protocol::{Get, LineMatch, LineSplitter, Mode, PendingRequests, Reply, Request, Set};
+pub use program::{FramedProgram, ProgramInputs, ProgramRecord};
+pub use protocol::{Get, LineMatch, LineSplitter, ControllerMode, PendingRequests, RshReply, RshRequest, Set};
 pub use settings::{LinuxcncSettings, LinuxcncWire};

@@ -17,7 +17,7 @@ const MAX_RUN_LENGTH: usize = 60;
 
 /// Program in its frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Program {
+pub struct FramedProgram {
     /// Name that identifies run, cycle and content, without an extension.
     pub name: String,
     /// Cycle whose correction the program grinds; it is the pass of the next cycle.
@@ -49,7 +49,7 @@ pub struct ProgramInputs<'a> {
     pub folder: &'a str,
 }
 
-impl Program {
+impl FramedProgram {
     /// Builds the program of a pass in its frame.
     ///
     /// # Errors
@@ -221,10 +221,10 @@ mod tests {
         format!("(part: x)\n(map: sha256 {})\nG21 G90\n{mode}\nG0 Z5\nG1 X1 Y2 F600\n{end}", hex(&MAP))
     }
 
-    fn frame(pass: &str, rounds: u32) -> Result<Program, String> {
+    fn frame(pass: &str, rounds: u32) -> Result<FramedProgram, String> {
         let order =
             ProgramInputs { run: "A part/1", cycle: 2, pass: pass.as_bytes(), map: &MAP, rounds, folder: "/srv/nc/" };
-        Program::frame(order)
+        FramedProgram::frame(order)
     }
 
     #[test]
@@ -248,9 +248,9 @@ mod tests {
     fn framed_program_round_trip() {
         for rounds in [1, 2, 30] {
             let framed = frame(&pass("G61", "M2\n"), rounds).unwrap();
-            assert_eq!(Program::read(&framed.name, 2, framed.text.clone()), Some(framed));
+            assert_eq!(FramedProgram::read(&framed.name, 2, framed.text.clone()), Some(framed));
         }
-        assert_eq!(Program::read("x", 1, b"M2\n".to_vec()), None);
+        assert_eq!(FramedProgram::read("x", 1, b"M2\n".to_vec()), None);
     }
 
     #[test]

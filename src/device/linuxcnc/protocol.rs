@@ -50,13 +50,13 @@ impl Get {
 /// Mode of the controller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
-pub enum Mode {
+pub enum ControllerMode {
     Manual,
     Auto,
     Mdi,
 }
 
-impl Mode {
+impl ControllerMode {
     fn word(self) -> &'static str {
         match self {
             Self::Manual => "manual",
@@ -82,7 +82,7 @@ pub enum Set {
     },
     /// Releases control.
     Disable,
-    Mode(Mode),
+    Mode(ControllerMode),
     Mdi(String),
     Open(String),
     Run,
@@ -120,7 +120,7 @@ impl fmt::Debug for Set {
 /// Line to the controller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
-pub enum Request {
+pub enum RshRequest {
     Hello { password: String },
     EchoOff,
     Get(Get),
@@ -129,7 +129,7 @@ pub enum Request {
 
 /// Content of an answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Reply {
+pub enum RshReply {
     /// Requested value.
     Value(String),
     /// Acknowledged. This does not mean that it succeeded.
@@ -138,7 +138,7 @@ pub enum Reply {
     Refused,
 }
 
-impl Request {
+impl RshRequest {
     /// Returns the line with its line end; `None` if the request is not one plain line.
     pub fn line(&self) -> Option<String> {
         let line = match self {
@@ -155,13 +155,13 @@ impl Request {
     }
 
     /// Returns the reply if a line answers this request.
-    pub fn answer(&self, line: &str) -> Option<Reply> {
+    pub fn answer(&self, line: &str) -> Option<RshReply> {
         match self {
             Self::Hello { .. } => said(line, "hello"),
             // The answer is the echo of the request itself.
             Self::EchoOff => None,
             Self::Get(get) => match (after(line, get.word()), after(line, "get")) {
-                (Some(value), _) => Some(Reply::Value(value.to_owned())),
+                (Some(value), _) => Some(RshReply::Value(value.to_owned())),
                 (_, Some(rest)) => refused(rest, get.word()),
                 _ => None,
             },
@@ -169,7 +169,7 @@ impl Request {
                 let rest = after(line, "set")?;
                 let (word, _) = set.words();
                 match after(rest, word) {
-                    Some(rest) if rest.eq_ignore_ascii_case("ack") => Some(Reply::Acknowledged),
+                    Some(rest) if rest.eq_ignore_ascii_case("ack") => Some(RshReply::Acknowledged),
                     _ => refused(rest, word),
                 }
             }
@@ -185,18 +185,18 @@ fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
 }
 
 /// Parses `HELLO ACK name version` or `HELLO NAK`.
-fn said(line: &str, word: &str) -> Option<Reply> {
+fn said(line: &str, word: &str) -> Option<RshReply> {
     let rest = after(line, word)?;
     match after(rest, "ack") {
-        Some(value) => Some(Reply::Value(value.to_owned())),
-        None => rest.eq_ignore_ascii_case("nak").then_some(Reply::Refused),
+        Some(value) => Some(RshReply::Value(value.to_owned())),
+        None => rest.eq_ignore_ascii_case("nak").then_some(RshReply::Refused),
     }
 }
 
 /// Parses `X NAK` or `NAK` alone. A server answers `NAK` alone if it refuses before it evaluates the word.
-fn refused(rest: &str, word: &str) -> Option<Reply> {
+fn refused(rest: &str, word: &str) -> Option<RshReply> {
     let rest = after(rest, word).unwrap_or(rest);
-    rest.eq_ignore_ascii_case("nak").then_some(Reply::Refused)
+    rest.eq_ignore_ascii_case("nak").then_some(RshReply::Refused)
 }
 
 /// Splitter of a byte stream into lines. An incomplete line waits for its rest. CR or LF ends a line; empty lines are
@@ -227,7 +227,7 @@ impl LineSplitter {
 /// Pending requests in order, each with an attached value.
 #[derive(Debug)]
 pub struct PendingRequests<T> {
-    requests: VecDeque<(Request, T)>,
+    requests: VecDeque<(RshRequest, T)>,
     unmatched: u32,
 }
 
@@ -235,7 +235,7 @@ pub struct PendingRequests<T> {
 #[derive(Debug, PartialEq)]
 pub enum LineMatch<T> {
     /// Answer to the oldest pending request.
-    Answer(T, Reply),
+    Answer(T, RshReply),
     /// Line of no pending request.
     Unmatched,
     /// Line of no pending request, one of more than `MAX_UNMATCHED` in a row: this is not the protocol.
@@ -250,7 +250,7 @@ impl<T> Default for PendingRequests<T> {
 
 impl<T> PendingRequests<T> {
     /// Adds a request that was sent.
-    pub fn push(&mut self, request: Request, kept: T) {
+    pub fn push(&mut self, request: RshRequest, kept: T) {
         self.requests.push_back((request, kept));
     }
 
@@ -307,49 +307,49 @@ mod tests {
         ("set abort\r\n", "SET ABORT ACK\n\r"),
     ];
 
-    fn requests() -> Vec<Request> {
+    fn requests() -> Vec<RshRequest> {
         let password = String::from;
         let path = "/srv/regrind/Part-c1.ngc".to_owned();
         vec![
-            Request::Hello { password: password("EMC") },
-            Request::EchoOff,
-            Request::Set(Set::Verbose),
-            Request::Get(Get::Inifile),
-            Request::Set(Set::Run),
-            Request::Set(Set::Enable { password: password("EMCTOO") }),
-            Request::Get(Get::Enable),
-            Request::Set(Set::Mode(Mode::Auto)),
-            Request::Get(Get::Mode),
-            Request::Set(Set::Open(path)),
-            Request::Get(Get::Program),
-            Request::Get(Get::Error),
-            Request::Get(Get::Error),
-            Request::Get(Get::ProgramStatus),
-            Request::Get(Get::ProgramLine),
-            Request::Get(Get::JointHomed),
-            Request::Set(Set::Abort),
+            RshRequest::Hello { password: password("EMC") },
+            RshRequest::EchoOff,
+            RshRequest::Set(Set::Verbose),
+            RshRequest::Get(Get::Inifile),
+            RshRequest::Set(Set::Run),
+            RshRequest::Set(Set::Enable { password: password("EMCTOO") }),
+            RshRequest::Get(Get::Enable),
+            RshRequest::Set(Set::Mode(ControllerMode::Auto)),
+            RshRequest::Get(Get::Mode),
+            RshRequest::Set(Set::Open(path)),
+            RshRequest::Get(Get::Program),
+            RshRequest::Get(Get::Error),
+            RshRequest::Get(Get::Error),
+            RshRequest::Get(Get::ProgramStatus),
+            RshRequest::Get(Get::ProgramLine),
+            RshRequest::Get(Get::JointHomed),
+            RshRequest::Set(Set::Abort),
         ]
     }
 
-    fn replies() -> Vec<Reply> {
-        let value = |text: &str| Reply::Value(text.to_owned());
+    fn replies() -> Vec<RshReply> {
+        let value = |text: &str| RshReply::Value(text.to_owned());
         vec![
             value("EMCNETSVR 1.1"),
-            Reply::Acknowledged,
+            RshReply::Acknowledged,
             value("/home/cnc/Grinder A/grinder.ini"),
-            Reply::Refused,
-            Reply::Acknowledged,
+            RshReply::Refused,
+            RshReply::Acknowledged,
             value("ON"),
-            Reply::Acknowledged,
+            RshReply::Acknowledged,
             value("AUTO"),
-            Reply::Acknowledged,
+            RshReply::Acknowledged,
             value("/srv/regrind/Part-c1.ngc"),
             value("Linear move on line 3 would exceed X's positive limit"),
             value("OK"),
             value("RUNNING"),
             value("528"),
             value("YES YES YES NO NO NO"),
-            Reply::Acknowledged,
+            RshReply::Acknowledged,
         ]
     }
 
@@ -364,7 +364,7 @@ mod tests {
         let all: String = SESSION.map(|(_, answer)| answer).concat();
         for size in [1, 2, 3, 7, 16, 1000] {
             let (mut lines, mut waiting, mut found) = (LineSplitter::default(), PendingRequests::default(), Vec::new());
-            for request in requests().into_iter().filter(|request| *request != Request::EchoOff) {
+            for request in requests().into_iter().filter(|request| *request != RshRequest::EchoOff) {
                 waiting.push(request, ());
             }
             for bytes in all.as_bytes().chunks(size) {
@@ -383,27 +383,27 @@ mod tests {
 
     #[test]
     fn unrelated_line_is_no_answer() {
-        let run = Request::Set(Set::Run);
-        assert_eq!(run.answer("SET NAK"), Some(Reply::Refused));
-        assert_eq!(run.answer("set run ack"), Some(Reply::Acknowledged));
+        let run = RshRequest::Set(Set::Run);
+        assert_eq!(run.answer("SET NAK"), Some(RshReply::Refused));
+        assert_eq!(run.answer("set run ack"), Some(RshReply::Acknowledged));
         for line in
             ["SET OPEN ACK", "SET RUNNING ACK", "SET RUN", "SET ACK", "RUN ACK", "\u{fffd}", "", "SET RUN ACK ACK"]
         {
             assert_eq!(run.answer(line), None, "{line}");
         }
-        let line = Request::Get(Get::Program);
-        assert_eq!(line.answer("GET PROGRAM NAK"), Some(Reply::Refused));
-        assert_eq!(line.answer("GET NAK"), Some(Reply::Refused));
+        let line = RshRequest::Get(Get::Program);
+        assert_eq!(line.answer("GET PROGRAM NAK"), Some(RshReply::Refused));
+        assert_eq!(line.answer("GET NAK"), Some(RshReply::Refused));
         // One word is the beginning of the other.
         assert_eq!(line.answer("PROGRAM_LINE 3"), None);
         assert_eq!(line.answer("GET PROGRAM_LINE NAK"), None);
-        assert_eq!(Request::Hello { password: "x".into() }.answer("HELLO NAK"), Some(Reply::Refused));
+        assert_eq!(RshRequest::Hello { password: "x".into() }.answer("HELLO NAK"), Some(RshReply::Refused));
     }
 
     #[test]
     fn request_line_refuses_injection() {
         for path in ["/a\r\nset run", "/a\nb", "/\u{e4}", &"x".repeat(5000)] {
-            assert_eq!(Request::Set(Set::Open(path.to_owned())).line(), None, "{path}");
+            assert_eq!(RshRequest::Set(Set::Open(path.to_owned())).line(), None, "{path}");
         }
         assert!(!format!("{:?}", Set::Enable { password: "SECRET".into() }).contains("SECRET"));
     }
@@ -411,7 +411,7 @@ mod tests {
     #[test]
     fn line_flood_is_not_protocol() {
         let mut waiting = PendingRequests::default();
-        waiting.push(Request::Get(Get::Mode), ());
+        waiting.push(RshRequest::Get(Get::Mode), ());
         let told: Vec<_> = (0..102).map(|_| waiting.match_line("ERROR what")).collect();
         assert_eq!((&told[0], &told[101]), (&LineMatch::Unmatched, &LineMatch::NotProtocol));
         assert!(LineSplitter::default().push(&[b'x'; 5000]).is_none());

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::controller::{ControllerState, Interpreter};
-use super::program::{Program, ProgramRecord};
-use crate::words::{Fault, Job, Outcome, State};
+use super::program::{FramedProgram, ProgramRecord};
+use crate::words::{Fault, Job, Outcome, MachineState};
 
 /// Prepared job and everything known about it.
 #[derive(Clone, Debug)]
@@ -19,7 +19,7 @@ pub(super) struct ActiveJob {
     /// Token with which its record was opened.
     pub(super) token: u32,
     /// Program of the job; `None` if a program prepared earlier is not found any more.
-    pub(super) program: Option<Arc<Program>>,
+    pub(super) program: Option<Arc<FramedProgram>>,
     /// Path of the program at the controller.
     pub(super) path: String,
     pub(super) stage: Stage,
@@ -39,18 +39,18 @@ pub(super) enum Stage {
     /// START was sent, or possibly sent.
     Begun,
     /// The job is over.
-    Ended(State, Outcome),
+    Ended(MachineState, Outcome),
 }
 
 /// Verdict on a job at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// The job is in this state and can continue.
-    InState(State),
+    InState(MachineState),
     /// The job is over.
-    Ended(State, Outcome, Fault),
+    Ended(MachineState, Outcome, Fault),
     /// The controller runs a program that is not ours.
-    Foreign(State),
+    Foreign(MachineState),
     /// The controller is idle, and nothing shows how the job ended.
     Unresolved,
 }
@@ -76,25 +76,25 @@ impl ActiveJob {
         match seen.interpreter {
             // A pause after the end of the program holds nothing.
             Interpreter::Running | Interpreter::Paused if is_ours && record.ended == 0 => match seen.interpreter {
-                _ if aborts => Verdict::InState(State::Aborting),
-                _ if self.requested_outcome == Some(Outcome::Stopped) => Verdict::InState(State::Stopping),
-                Interpreter::Paused => Verdict::InState(State::Held),
-                _ => Verdict::InState(State::Execute),
+                _ if aborts => Verdict::InState(MachineState::Aborting),
+                _ if self.requested_outcome == Some(Outcome::Stopped) => Verdict::InState(MachineState::Stopping),
+                Interpreter::Paused => Verdict::InState(MachineState::Held),
+                _ => Verdict::InState(MachineState::Execute),
             },
-            Interpreter::Running if is_ours => Verdict::InState(State::Execute),
-            Interpreter::Running => Verdict::Foreign(State::Execute),
-            Interpreter::Paused if !is_ours => Verdict::Foreign(State::Held),
-            _ if record.ended > 0 && aborts => Verdict::Ended(State::Aborted, Outcome::Complete, Fault::None),
-            _ if record.ended > 0 => Verdict::Ended(State::Complete, Outcome::Complete, Fault::None),
-            _ if still < settles && self.requested_outcome.is_none() => Verdict::InState(State::Execute),
-            _ if aborts => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
-            _ if self.requested_outcome.is_some() => Verdict::Ended(State::Complete, Outcome::Stopped, Fault::None),
+            Interpreter::Running if is_ours => Verdict::InState(MachineState::Execute),
+            Interpreter::Running => Verdict::Foreign(MachineState::Execute),
+            Interpreter::Paused if !is_ours => Verdict::Foreign(MachineState::Held),
+            _ if record.ended > 0 && aborts => Verdict::Ended(MachineState::Aborted, Outcome::Complete, Fault::None),
+            _ if record.ended > 0 => Verdict::Ended(MachineState::Complete, Outcome::Complete, Fault::None),
+            _ if still < settles && self.requested_outcome.is_none() => Verdict::InState(MachineState::Execute),
+            _ if aborts => Verdict::Ended(MachineState::Aborted, Outcome::Aborted, Fault::None),
+            _ if self.requested_outcome.is_some() => Verdict::Ended(MachineState::Complete, Outcome::Stopped, Fault::None),
             _ if record.begun == 0 => Verdict::Unresolved,
-            _ if seen.stop_circuit_open => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::StopCircuit),
-            _ if !seen.drives_on => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::Supplies),
-            _ if !self.errors.is_empty() => Verdict::Ended(State::Faulted, Outcome::Failed, self.fault()),
+            _ if seen.stop_circuit_open => Verdict::Ended(MachineState::Faulted, Outcome::Failed, Fault::StopCircuit),
+            _ if !seen.drives_on => Verdict::Ended(MachineState::Faulted, Outcome::Failed, Fault::Supplies),
+            _ if !self.errors.is_empty() => Verdict::Ended(MachineState::Faulted, Outcome::Failed, self.fault()),
             // Somebody has aborted it at the machine.
-            _ => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
+            _ => Verdict::Ended(MachineState::Aborted, Outcome::Aborted, Fault::None),
         }
     }
 
@@ -122,7 +122,7 @@ impl ActiveJob {
 
 #[cfg(test)]
 mod tests {
-    use super::super::protocol::Mode;
+    use super::super::protocol::ControllerMode;
     use super::*;
 
     fn work() -> ActiveJob {
@@ -144,7 +144,7 @@ mod tests {
             has_control: true,
             stop_circuit_open: false,
             drives_on: true,
-            mode: Mode::Auto,
+            mode: ControllerMode::Auto,
             homed: true,
             interpreter,
             program: Some(program.into()),
@@ -167,8 +167,8 @@ mod tests {
     #[test]
     fn judge_complete_only_by_record() {
         let (work, idle) = (work(), seen(Interpreter::Idle, "/nc/p.ngc"));
-        let complete = Verdict::Ended(State::Complete, Outcome::Complete, Fault::None);
-        let aborted = Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None);
+        let complete = Verdict::Ended(MachineState::Complete, Outcome::Complete, Fault::None);
+        let aborted = Verdict::Ended(MachineState::Aborted, Outcome::Aborted, Fault::None);
         assert_eq!(judged(&work, &idle, record(1, 1)), complete);
         assert_eq!(judged(&work, &idle, record(1, 0)), aborted);
         assert_eq!(judged(&work, &idle, record(0, 0)), Verdict::Unresolved);
@@ -179,14 +179,14 @@ mod tests {
             Verdict::Unresolved
         );
         // The record may become visible late.
-        assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::InState(State::Execute));
+        assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::InState(MachineState::Execute));
     }
 
     #[test]
     fn judge_reports_fault_cause() {
         let mut work = work();
         let idle = seen(Interpreter::Idle, "/nc/p.ngc");
-        let failed = |fault| Verdict::Ended(State::Faulted, Outcome::Failed, fault);
+        let failed = |fault| Verdict::Ended(MachineState::Faulted, Outcome::Failed, fault);
         assert_eq!(
             judged(&work, &ControllerState { stop_circuit_open: true, drives_on: false, ..idle.clone() }, record(1, 0)),
             failed(Fault::StopCircuit)
@@ -209,7 +209,7 @@ mod tests {
     fn judge_requested_outcome() {
         let (running, idle) = (seen(Interpreter::Running, "/nc/p.ngc"), seen(Interpreter::Idle, "/nc/p.ngc"));
         for (wanted, on_the_way, state) in
-            [(Outcome::Aborted, State::Aborting, State::Aborted), (Outcome::Stopped, State::Stopping, State::Complete)]
+            [(Outcome::Aborted, MachineState::Aborting, MachineState::Aborted), (Outcome::Stopped, MachineState::Stopping, MachineState::Complete)]
         {
             let work = ActiveJob { requested_outcome: Some(wanted), ..work() };
             assert_eq!(judged(&work, &running, record(1, 0)), Verdict::InState(on_the_way));
@@ -223,17 +223,17 @@ mod tests {
     fn judge_foreign_program() {
         let work = work();
         let of = |interpreter| judged(&work, &seen(interpreter, "/nc/other.ngc"), record(0, 0));
-        assert_eq!(of(Interpreter::Running), Verdict::Foreign(State::Execute));
-        assert_eq!(of(Interpreter::Paused), Verdict::Foreign(State::Held));
+        assert_eq!(of(Interpreter::Running), Verdict::Foreign(MachineState::Execute));
+        assert_eq!(of(Interpreter::Paused), Verdict::Foreign(MachineState::Held));
         let paused = seen(Interpreter::Paused, "/nc/p.ngc");
-        assert_eq!(judged(&work, &paused, record(1, 0)), Verdict::InState(State::Held));
+        assert_eq!(judged(&work, &paused, record(1, 0)), Verdict::InState(MachineState::Held));
     }
 
     #[test]
     fn progress_counts_spark_out_rounds() {
         let mut work = work();
         let (name, text) = ("p".to_owned(), Vec::new());
-        let program = Program { name, cycle: 1, text, lines: (6, 100), rounds: 2, map: [0; 32] };
+        let program = FramedProgram { name, cycle: 1, text, lines: (6, 100), rounds: 2, map: [0; 32] };
         work.program = Some(Arc::new(program));
         let told: Vec<_> = [0, 6, 56, 50, 106, 6, 56, 106, 20].map(|line| work.progress(line).unwrap().0).into();
         assert_eq!(told, [0, 0, 500, 440, 1000, 1000, 1500, 2000, 1140]);

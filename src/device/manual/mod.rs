@@ -22,9 +22,9 @@ use super::exchange::{
     ExchangeError, ResultRequirements, assemble_measurement, check_measurement, contradiction, file_word, plan_csv,
 };
 use super::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
+    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
     Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
-    State, Status, digest, hex,
+    MachineState, Status, digest, hex,
 };
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::{FormatError, ResultFolder, write_atomic};
@@ -64,7 +64,7 @@ pub struct ManualMachine {
     kind: MachineKind,
     settings: ManualSettings,
     connected: bool,
-    state: State,
+    state: MachineState,
     /// Loaded work and its digest.
     task: Option<(ManualTask, u32)>,
     /// Requested job, and its start sequence number.
@@ -92,7 +92,7 @@ impl ManualMachine {
             kind,
             settings,
             connected: false,
-            state: State::Idle,
+            state: MachineState::Idle,
             task: None,
             job: None,
             unresolved: None,
@@ -116,7 +116,7 @@ impl ManualMachine {
         }
     }
 
-    fn refused(&self, command: Command, answer: Answer) -> DeviceError {
+    fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state: self.state }
     }
 
@@ -128,7 +128,7 @@ impl ManualMachine {
     ///
     /// # Errors
     /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
-    fn transition(&mut self, command: Command, from: &[State], to: State) -> DeviceResult<Status> {
+    fn transition(&mut self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         if !from.contains(&self.state) {
             return Err(self.refused(command, Answer::WrongState));
         }
@@ -137,7 +137,7 @@ impl ManualMachine {
     }
 
     fn finish(&mut self, outcome: Outcome) {
-        (self.state, self.outcome) = (State::Complete, outcome);
+        (self.state, self.outcome) = (MachineState::Complete, outcome);
     }
 
     // ---- what a person is asked ---------------------------------------------------------------------------------------------------
@@ -150,11 +150,11 @@ impl ManualMachine {
         let still =
             |what: &str| vec![format!("{what} it at its own panel"), confirm(&format!("still --machine {name}"))];
         match (self.state, &self.task) {
-            (State::Execute, Some((ManualTask::Measure(plan), _))) => self.prompt_to_measure(job, plan, &confirm),
-            (State::Execute, Some((ManualTask::Grind(pass, map), _))) => self.prompt_to_grind(job, pass, map, &confirm),
-            (State::Holding, _) => still("HOLD"),
-            (State::Stopping, _) => still("STOP"),
-            (State::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
+            (MachineState::Execute, Some((ManualTask::Measure(plan), _))) => self.prompt_to_measure(job, plan, &confirm),
+            (MachineState::Execute, Some((ManualTask::Grind(pass, map), _))) => self.prompt_to_grind(job, pass, map, &confirm),
+            (MachineState::Holding, _) => still("HOLD"),
+            (MachineState::Stopping, _) => still("STOP"),
+            (MachineState::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
             _ => Vec::new(),
         }
     }
@@ -216,12 +216,12 @@ impl ManualMachine {
             OperatorConfirmation::Started { .. } if is_cmm => {
                 Err(self.not_accepted("a measurement has no start to confirm; measure, and confirm done"))
             }
-            OperatorConfirmation::Started { .. } if self.state == State::Execute => {
+            OperatorConfirmation::Started { .. } if self.state == MachineState::Execute => {
                 self.started_at.get_or_insert_with(Instant::now);
                 Ok(Vec::new())
             }
             OperatorConfirmation::Done { file, .. }
-                if matches!(self.state, State::Execute | State::Holding | State::Held) =>
+                if matches!(self.state, MachineState::Execute | MachineState::Holding | MachineState::Held) =>
             {
                 let kept = match file {
                     Some(file) if is_cmm => self.accept_file(file).await?,
@@ -237,11 +237,11 @@ impl ManualMachine {
                 self.finish(Outcome::Complete);
                 Ok(kept)
             }
-            OperatorConfirmation::Still if self.state == State::Holding => {
-                self.state = State::Held;
+            OperatorConfirmation::Still if self.state == MachineState::Holding => {
+                self.state = MachineState::Held;
                 Ok(Vec::new())
             }
-            OperatorConfirmation::Still if self.state == State::Stopping => {
+            OperatorConfirmation::Still if self.state == MachineState::Stopping => {
                 self.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
@@ -381,12 +381,12 @@ impl Machine for ManualMachine {
         // The cell continues only after a person has confirmed that the job is over.
         self.unresolved = None;
         let is_loaded = self.task.as_ref().is_some_and(|(_, digest)| *digest == job.digest);
-        if self.state != State::Idle || !is_loaded {
+        if self.state != MachineState::Idle || !is_loaded {
             let answer = if is_loaded { Answer::WrongState } else { Answer::PayloadMissing };
-            return Err(self.refused(Command::Prepare, answer));
+            return Err(self.refused(MachineCommand::Prepare, answer));
         }
         if self.requested_jobs.contains(&(job.job, job.cycle)) {
-            return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
+            return Err(self.refused(MachineCommand::Prepare, Answer::AlreadyBegun));
         }
         if let Some((ManualTask::Measure(plan), _)) = &self.task {
             let (settings, plan, folder) = (self.settings.clone(), Arc::clone(plan), self.cycle_folder(job));
@@ -394,39 +394,39 @@ impl Machine for ManualMachine {
             written.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
         }
         let start_sequence = self.requested_jobs.len() as u32 + 1;
-        (self.job, self.state, self.outcome) = (Some((job, start_sequence)), State::Prepared, Outcome::None);
+        (self.job, self.state, self.outcome) = (Some((job, start_sequence)), MachineState::Prepared, Outcome::None);
         (self.started_at, self.duration_s, self.measurement) = (None, None, None);
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
     async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
         let Armed { job, start_sequence, .. } = armed;
-        if self.state != State::Prepared || self.job != Some((job, start_sequence)) {
-            return Err(self.refused(Command::Start, Answer::OtherJob));
+        if self.state != MachineState::Prepared || self.job != Some((job, start_sequence)) {
+            return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
         }
         self.requested_jobs.push((job.job, job.cycle));
-        (self.state, self.clear_of_part) = (State::Execute, None);
+        (self.state, self.clear_of_part) = (MachineState::Execute, None);
         Ok(Started { job, start_sequence, status: self.current_status() })
     }
 
     async fn hold(&mut self) -> DeviceResult<Status> {
-        self.transition(Command::Hold, &[State::Execute], State::Holding)
+        self.transition(MachineCommand::Hold, &[MachineState::Execute], MachineState::Holding)
     }
 
     async fn resume(&mut self) -> DeviceResult<Status> {
-        self.transition(Command::Resume, &[State::Held], State::Execute)
+        self.transition(MachineCommand::Resume, &[MachineState::Held], MachineState::Execute)
     }
 
     async fn stop(&mut self) -> DeviceResult<Status> {
         if let Some(untold) = self.unresolved.take() {
-            (self.job, self.state) = (Some(untold), State::Stopping);
+            (self.job, self.state) = (Some(untold), MachineState::Stopping);
             return Ok(self.current_status());
         }
         match self.state {
-            State::Prepared => (self.state, self.job) = (State::Idle, None),
+            MachineState::Prepared => (self.state, self.job) = (MachineState::Idle, None),
             // A person has confirmed that it does not move.
-            State::Held => self.finish(Outcome::Stopped),
-            _ => return self.transition(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
+            MachineState::Held => self.finish(Outcome::Stopped),
+            _ => return self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping),
         }
         Ok(self.current_status())
     }
@@ -435,21 +435,21 @@ impl Machine for ManualMachine {
         let untold = self.unresolved.take();
         let may_move = self.state.is_moving() || untold.is_some();
         self.job = self.job.or(untold);
-        self.state = if may_move { State::Aborting } else { State::Aborted };
+        self.state = if may_move { MachineState::Aborting } else { MachineState::Aborted };
         self.outcome = Outcome::Aborted;
         Ok(self.current_status())
     }
 
     async fn clear(&mut self) -> DeviceResult<Status> {
         (self.job, self.outcome) = (None, Outcome::None);
-        self.transition(Command::Clear, &[State::Aborted], State::Idle)
+        self.transition(MachineCommand::Clear, &[MachineState::Aborted], MachineState::Idle)
     }
 
     async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         if self.job.is_none_or(|(_, sequence)| sequence != done) {
-            return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
+            return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
         }
-        let status = self.transition(Command::Acknowledge, &[State::Complete], State::Idle)?;
+        let status = self.transition(MachineCommand::Acknowledge, &[MachineState::Complete], MachineState::Idle)?;
         (self.job, self.outcome) = (None, Outcome::None);
         Ok(status)
     }
@@ -461,8 +461,8 @@ impl Machine for ManualMachine {
     async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         let ours = self.job == Some((intended.job, intended.start_sequence));
         Ok(match self.state {
-            State::Complete | State::Aborted if ours => Reconciled::Finished(self.current_status()),
-            state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(self.current_status()),
+            MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(self.current_status()),
+            state if ours && (state.is_moving() || state == MachineState::Held) => Reconciled::Running(self.current_status()),
             _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }
@@ -550,10 +550,10 @@ mod tests {
         // It may be moving: a person must confirm that it does not, and nobody has confirmed an abort.
         let mut machine = resumed_machine();
         machine.connect().await.unwrap();
-        assert_eq!(machine.stop().await.unwrap().state, State::Stopping);
+        assert_eq!(machine.stop().await.unwrap().state, MachineState::Stopping);
         machine.confirm(OperatorConfirmation::Still).await.unwrap();
         let status = machine.status().await.unwrap();
-        assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Stopped));
-        assert_eq!(resumed_machine().abort().await.unwrap().state, State::Aborting);
+        assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Stopped));
+        assert_eq!(resumed_machine().abort().await.unwrap().state, MachineState::Aborting);
     }
 }

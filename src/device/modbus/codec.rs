@@ -6,7 +6,7 @@
 use sha2::{Digest, Sha256};
 
 use super::settings::WordOrder;
-use crate::{CarefulStart, Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use crate::{CarefulStart, MachineCommand, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, TouchStatus};
 use regrind_core::geometry::Grid;
 
 impl WordOrder {
@@ -156,7 +156,7 @@ pub(super) fn crc16(bytes: &[u8]) -> u16 {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct CommandFrame {
     pub(super) sequence: u32,
-    pub(super) command: Command,
+    pub(super) command: MachineCommand,
     pub(super) job: Option<Job>,
     pub(super) owner: u32,
     pub(super) epoch: u32,
@@ -372,9 +372,9 @@ pub(super) fn point_registers(format: u16) -> Option<usize> {
 pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordError> {
     let index = record.u32(0);
     let status = match record.u16(2) {
-        1 => PointStatus::Touched,
-        2 => PointStatus::NotFound,
-        3 => PointStatus::NotReached,
+        1 => TouchStatus::Touched,
+        2 => TouchStatus::NotFound,
+        3 => TouchStatus::NotReached,
         other => return Err(RecordError::Unlisted { field: "the status of a point", found: u32::from(other) }),
     };
     let at_mm = match format {
@@ -416,7 +416,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::{Target, TargetKind};
+    use crate::{PlanTarget, TargetKind};
 
     #[test]
     fn codec_word_and_byte_order() {
@@ -447,7 +447,7 @@ mod tests {
     fn command_frame_layout() {
         let frame = CommandFrame {
             sequence: 0x0001_0002,
-            command: Command::Start,
+            command: MachineCommand::Start,
             job: Some(Job { job: 7, cycle: 2, digest: 0xdead_beef }),
             owner: 0x11,
             epoch: 3,
@@ -466,7 +466,7 @@ mod tests {
 
     fn plan() -> Plan {
         let target =
-            Target { index: 9, kind: TargetKind::ReferenceSphere, point_mm: [1.0, -2.0, 0.5], normal: [0.0, 0.0, 1.0] };
+            PlanTarget { index: 9, kind: TargetKind::ReferenceSphere, point_mm: [1.0, -2.0, 0.5], normal: [0.0, 0.0, 1.0] };
         Plan {
             targets: vec![target],
             probe_radius_mm: 2.0,
@@ -560,12 +560,12 @@ mod tests {
         let words = writer.finish();
         let read = decode_point(Registers::new(&words, WordOrder::Little), 1, 1.0).unwrap();
         assert_eq!(read.index, 70_000);
-        assert_eq!((read.status, read.quality, read.position_mm), (PointStatus::Touched, 5, [1.5, -2.5, 3.5]));
+        assert_eq!((read.status, read.quality, read.position_mm), (TouchStatus::Touched, 5, [1.5, -2.5, 3.5]));
         let mut writer = Writer::new(WordOrder::Big);
         writer.u32(1).u16(2).u16(100).u32(10).u32((-20_i32).cast_unsigned()).u32(0);
         let words = writer.finish();
         let read = decode_point(Registers::new(&words, WordOrder::Big), 2, 0.5).unwrap();
-        assert_eq!((read.status, read.position_mm), (PointStatus::NotFound, [5.0, -10.0, 0.0]));
+        assert_eq!((read.status, read.position_mm), (TouchStatus::NotFound, [5.0, -10.0, 0.0]));
         assert_eq!((point_registers(1), point_registers(2), point_registers(3)), (Some(16), Some(10), None));
     }
 

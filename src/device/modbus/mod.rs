@@ -29,9 +29,9 @@ use tokio::time::{Instant, sleep};
 
 use super::range;
 use super::{
-    Answer, Armed, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
+    Answer, Armed, Cmm, MachineCommand, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue,
-    Started, State, Status, digest,
+    Started, MachineState, Status, digest,
 };
 use ahead::{ReadAhead, ReadAheadFailures};
 #[cfg(fuzzing)]
@@ -278,7 +278,7 @@ impl ModbusMachine {
     /// Returns an error if another client has taken the machine: its further actions are not ours to report. An abort
     /// is allowed for every client.
     fn check_owner(&self, status: &StatusBlock) -> Result<(), DeviceError> {
-        let aborts = matches!(status.state, State::Aborting | State::Aborted);
+        let aborts = matches!(status.state, MachineState::Aborting | MachineState::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
             return Ok(());
         }
@@ -311,12 +311,12 @@ impl ModbusMachine {
         self.sequence
     }
 
-    fn frame(&mut self, command: Command) -> CommandFrame {
+    fn frame(&mut self, command: MachineCommand) -> CommandFrame {
         let sequence = self.next_sequence();
         CommandFrame { sequence, command, job: None, owner: self.owner, epoch: self.epoch, token: 0, argument: 0 }
     }
 
-    async fn run_command(&mut self, command: Command) -> Result<StatusBlock, DeviceError> {
+    async fn run_command(&mut self, command: MachineCommand) -> Result<StatusBlock, DeviceError> {
         let frame = self.frame(command);
         self.send_command(frame).await
     }
@@ -376,9 +376,9 @@ impl ModbusMachine {
         for kind in self.loaded.keys().copied().collect::<Vec<_>>() {
             self.compare_slot(kind).await?;
         }
-        let frame = CommandFrame { job: Some(job), ..self.frame(Command::Prepare) };
+        let frame = CommandFrame { job: Some(job), ..self.frame(MachineCommand::Prepare) };
         self.send_command(frame).await?;
-        let status = self.wait_until(|status| status.state == State::Prepared && status.token != 0).await?;
+        let status = self.wait_until(|status| status.state == MachineState::Prepared && status.token != 0).await?;
         self.check_job(job, &status)?;
         Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
     }
@@ -435,8 +435,8 @@ impl ModbusMachine {
         // clear refusal.
         let before = self.read_status_block().await?;
         let taken = before.begun_by == start_sequence || before.acknowledged == start_sequence;
-        if !taken && (before.state != State::Prepared || before.token != token) {
-            let (command, answer, state) = (Command::Start, Answer::DeadToken, before.state);
+        if !taken && (before.state != MachineState::Prepared || before.token != token) {
+            let (command, answer, state) = (MachineCommand::Start, Answer::DeadToken, before.state);
             return Err(DeviceError::Refused { machine: self.machine(), command, answer, state });
         }
         self.last_start = Some(start_sequence);
@@ -444,7 +444,7 @@ impl ModbusMachine {
         let (owner, epoch) = (self.owner, self.epoch);
         let frame = CommandFrame {
             sequence: start_sequence,
-            command: Command::Start,
+            command: MachineCommand::Start,
             job: Some(job),
             owner,
             epoch,
@@ -472,14 +472,14 @@ impl ModbusMachine {
     }
 
     async fn claim(&mut self) -> Result<StatusBlock, DeviceError> {
-        let status = self.run_command(Command::Claim).await?;
+        let status = self.run_command(MachineCommand::Claim).await?;
         self.owned = true;
         Ok(status)
     }
 
     async fn release(&mut self) -> Result<StatusBlock, DeviceError> {
         self.owned = false;
-        self.run_command(Command::Release).await
+        self.run_command(MachineCommand::Release).await
     }
 
     /// Ends the job at once, whatever the state of the connection and whatever sequence number another client has
@@ -490,14 +490,14 @@ impl ModbusMachine {
         if self.unit.identity().is_none() {
             self.unit.connect_within(Duration::ZERO).await?;
         }
-        match self.run_command(Command::Abort).await {
+        match self.run_command(MachineCommand::Abort).await {
             // Another client has used higher numbers. The state of the machine decides; if it does not abort, an abort
             // justifies a number above theirs.
             Err(DeviceError::NotAcknowledged { acknowledged, .. }) => match self.read_status_block().await? {
-                status if matches!(status.state, State::Aborting | State::Aborted) => Ok(status),
+                status if matches!(status.state, MachineState::Aborting | MachineState::Aborted) => Ok(status),
                 _ => {
                     self.sequence = self.sequence.max(acknowledged);
-                    self.run_command(Command::Abort).await
+                    self.run_command(MachineCommand::Abort).await
                 }
             },
             answer => answer,
@@ -505,7 +505,7 @@ impl ModbusMachine {
     }
 
     async fn acknowledge(&mut self, done: u32) -> Result<StatusBlock, DeviceError> {
-        let frame = CommandFrame { argument: done, ..self.frame(Command::Acknowledge) };
+        let frame = CommandFrame { argument: done, ..self.frame(MachineCommand::Acknowledge) };
         self.send_command(frame).await
     }
 
@@ -580,7 +580,7 @@ impl ModbusMachine {
         match self.unit.write("inbox header", address, header.words()).await {
             Err(DeviceError::Exception { code: 3, .. }) => {
                 let state = self.read_status_block().await?.state;
-                let busy = matches!(state, State::Execute | State::Holding | State::Held);
+                let busy = matches!(state, MachineState::Execute | MachineState::Holding | MachineState::Held);
                 let answer = if busy { Answer::WrongState } else { Answer::OutsideLimits };
                 Err(DeviceError::PayloadRefused { machine: self.machine(), payload: P::NAME, answer })
             }
@@ -687,7 +687,7 @@ impl ModbusMachine {
         let mut tries = 0;
         loop {
             let status = self.read_status_block().await?;
-            if status.state != State::Complete || status.done == 0 {
+            if status.state != MachineState::Complete || status.done == 0 {
                 return Err(DeviceError::NoResult { machine: self.machine(), job, state: status.state });
             }
             self.check_job(job, &status)?;
@@ -857,7 +857,7 @@ impl ModbusMachine {
 /// Status block of docs/modbus.md, as far as it is used, all of one moment.
 #[derive(Debug, Clone, PartialEq)]
 struct StatusBlock {
-    state: State,
+    state: MachineState,
     /// True in automatic mode, false in manual mode.
     automatic: bool,
     /// Bits from bit 0: guards closed, clear of the part, part clamped, supplies present.
@@ -948,10 +948,10 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
             Some(held) if held != job => unknown(format!("START {start_sequence} began {held} instead of {job}")),
             _ if status.done == start_sequence => Some(Reconciled::Finished(status.into())),
             _ => match status.state {
-                State::Execute | State::Holding | State::Held | State::Stopping | State::Aborting => {
+                MachineState::Execute | MachineState::Holding | MachineState::Held | MachineState::Stopping | MachineState::Aborting => {
                     Some(Reconciled::Running(status.into()))
                 }
-                State::Aborted | State::Faulted => Some(Reconciled::Finished(status.into())),
+                MachineState::Aborted | MachineState::Faulted => Some(Reconciled::Finished(status.into())),
                 state => unknown(format!(
                     "the machine accepted START {start_sequence}, but it is {state} and has no result of it"
                 )),
@@ -960,24 +960,24 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     }
     let begun = status.last_begun == (job.job, job.cycle);
     match status.state {
-        State::Idle | State::Prepared if !begun => None,
+        MachineState::Idle | MachineState::Prepared if !begun => None,
         _ if begun => unknown(format!("{job} was begun by START {}, not by {start_sequence}", status.begun_by)),
         state => unknown(format!("the machine is {state} with another job, begun by START {}", status.begun_by)),
     }
 }
 
-fn decode_state(number: u16) -> Option<State> {
-    const STATES: [State; 10] = [
-        State::Idle,
-        State::Prepared,
-        State::Execute,
-        State::Holding,
-        State::Held,
-        State::Stopping,
-        State::Complete,
-        State::Aborting,
-        State::Aborted,
-        State::Faulted,
+fn decode_state(number: u16) -> Option<MachineState> {
+    const STATES: [MachineState; 10] = [
+        MachineState::Idle,
+        MachineState::Prepared,
+        MachineState::Execute,
+        MachineState::Holding,
+        MachineState::Held,
+        MachineState::Stopping,
+        MachineState::Complete,
+        MachineState::Aborting,
+        MachineState::Aborted,
+        MachineState::Faulted,
     ];
     STATES.get(usize::from(number).checked_sub(1)?).copied()
 }

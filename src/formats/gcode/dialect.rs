@@ -264,17 +264,17 @@ impl Default for ArcWords {
 #[serde(default, deny_unknown_fields)]
 pub struct Modes {
     /// For `path_mode = "blend"`; `{tolerance_mm}` is the maximum rounding of corners.
-    pub blend: Option<Mode>,
+    pub blend: Option<PathModeText>,
     /// For `path_mode = "exact-path"`.
-    pub exact_path: Option<Mode>,
+    pub exact_path: Option<PathModeText>,
     /// For `path_mode = "exact-stop"`.
-    pub exact_stop: Option<Mode>,
+    pub exact_stop: Option<PathModeText>,
 }
 
 /// Lines that select a path mode.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Mode {
+pub struct PathModeText {
     /// Lines before the moves.
     #[schemars(length(min = 1, max = 16), inner(length(min = 1, max = 200)), extend("x-required" = true))]
     pub begin: Vec<String>,
@@ -336,7 +336,7 @@ impl Default for Frame {
 
 /// Fault of a key of a dialect: the key, the value found, the allowed values and the remedy.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Fault {
+pub struct DialectProblem {
     /// The key as a path.
     pub key: String,
     /// Value found.
@@ -514,7 +514,7 @@ impl Dialect {
         }
     }
 
-    fn check_tolerance(&self, mode: &Mode, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
+    fn check_tolerance(&self, mode: &PathModeText, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
         let says = mode.begin.iter().any(|line| line.contains(TOLERANCE));
         let (dialect, limit_um) = (self.dialect.name.clone(), 1e3 * exactness.tolerance_mm);
         match exactness.controller_mm {
@@ -557,10 +557,10 @@ impl Dialect {
     }
 
     /// Returns the faults of the dialect that its schema does not detect.
-    pub fn faults(&self) -> Vec<Fault> {
+    pub fn faults(&self) -> Vec<DialectProblem> {
         let mut faults = Vec::new();
         let mut fault = |key: &str, found: String, allowed, remedy| {
-            faults.push(Fault { key: key.to_owned(), found, allowed, remedy });
+            faults.push(DialectProblem { key: key.to_owned(), found, allowed, remedy });
         };
         if let Some(blocks) =
             self.blocks.as_ref().filter(|blocks| blocks.first.saturating_add(blocks.step) > blocks.last)

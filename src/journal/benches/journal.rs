@@ -17,7 +17,7 @@ use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use regrind_journal::{AuditKey, Entry, Journal, Kind, Reader, verify};
+use regrind_journal::{AuditKey, Entry, Journal, RecordKind, Reader, verify};
 use serde_json::json;
 
 fn main() {
@@ -37,7 +37,7 @@ fn commits(count: u64) {
     let (mut times, mut disk_times) = (Vec::new(), Vec::new());
     for k in 0..count {
         let payload = json!({ "done": k, "event": "progressed", "total": count, "words": "of the path" });
-        let entry = Entry::new(Kind::Event, k, 1, payload);
+        let entry = Entry::new(RecordKind::Event, k, 1, payload);
         times.push(timed(|| journal.append(entry).unwrap()).1);
         disk_times.push(timed(|| disk.write_all(&[0; 512]).and_then(|()| disk.sync_data()).unwrap()).1);
     }

@@ -4,7 +4,7 @@
 use maud::{Markup, html};
 
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::super::{Row, ToSql};
 use super::words::{ago, encoded, range, shown};
 
@@ -78,7 +78,7 @@ impl DisplayState {
 }
 
 /// Reads the states of the cells, those that need attention first.
-pub(super) async fn read(link: &Link) -> Result<Vec<CellSummary>, PlantError> {
+pub(super) async fn read(link: &DatabaseLink) -> Result<Vec<CellSummary>, PlantError> {
     let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
             coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
             left_most_s, alarms, coalesce(next, '')

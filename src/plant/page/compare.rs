@@ -9,7 +9,7 @@ use regrind_page::Session;
 
 use super::super::ToSql;
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::rank::{ENOUGH, holm, rank_sum};
 use super::selection::{Selection, SelectionQuery, mark};
 use super::words::{encoded, interval, share, shown, um};
@@ -74,7 +74,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
 }
 
 /// Reads the parts of one cell more than the page shows.
-async fn read(link: &Link, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
+async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
     let (condition, values) = selection.condition();
     let n = values.len();
     // Reads one cell at a time, each from the end of its own index.

@@ -10,7 +10,7 @@ use serde::Deserialize;
 
 use super::super::Row;
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::bars::{Count, Day, bars};
 use super::selection::{is_simulated, mark, today};
 use super::words::{encoded, interval, share, shown};
@@ -71,7 +71,7 @@ struct Counted {
 }
 
 impl Counted {
-    async fn read(link: &Link, simulated: bool) -> Result<Self, PlantError> {
+    async fn read(link: &DatabaseLink, simulated: bool) -> Result<Self, PlantError> {
         let first = today().checked_sub((DAYS - 1).days()).unwrap_or_default();
         // One query for all three: `grouping` shows whether a row is a sum by day, by recipe or by cell; the other
         // columns are null in it.
@@ -139,7 +139,7 @@ fn yields(what: &str, kind: &str, counts: &[(String, Count)]) -> Markup {
     }
 }
 
-async fn queue(link: &Link) -> Result<Markup, PlantError> {
+async fn queue(link: &DatabaseLink) -> Result<Markup, PlantError> {
     let text = "SELECT serial, recipe, version, coalesce(for_cell, 'any'), coalesce(to_char(due, 'YYYY-MM-DD'), ''), state, coalesce(cell, ''),
             coalesce(to_char(leased_until, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, ''), due < (now() AT TIME ZONE 'UTC')::date
         FROM work_now ORDER BY due NULLS LAST, id LIMIT $1";
@@ -173,7 +173,7 @@ async fn queue(link: &Link) -> Result<Markup, PlantError> {
     })
 }
 
-async fn incidents(link: &Link) -> Result<Markup, PlantError> {
+async fn incidents(link: &DatabaseLink) -> Result<Markup, PlantError> {
     let text = "SELECT to_char(at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(cell, by), coalesce(run, ''), what, words FROM incident_told
         ORDER BY at DESC LIMIT $1";
     let rows = link.query(text, &[&INCIDENTS]).await?;

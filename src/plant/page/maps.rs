@@ -12,7 +12,7 @@ use regrind_report::HeatMap;
 use tokio::task::spawn_blocking;
 
 use super::super::copy::content;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::selection::mark;
 use super::words::{shown, um};
 use super::{PageContent, PageError, Shared, page};
@@ -88,7 +88,7 @@ async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<PageContent, PageE
     Ok(PageContent { title: "Maps".into(), again_s: None, main })
 }
 
-async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, PageError> {
+async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
         WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
     let rows = link.query(text, &[&asked.run, &asked.cycle]).await?;
@@ -109,7 +109,7 @@ async fn read(plant: &Shared, link: &Link, asked: MapRequest) -> Result<Map, Pag
 }
 
 /// Returns the entry of a run that has no map, for display next to runs that have one.
-async fn without(link: &Link, asked: MapRequest) -> Result<Map, PageError> {
+async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;
     let missing = || PageError::NotHere(format!("the plant has no run {} that made a part", asked.run));
@@ -131,7 +131,7 @@ async fn without(link: &Link, asked: MapRequest) -> Result<Map, PageError> {
 /// Reads a map from the files of a run; in words, why there is none.
 async fn samples(
     plant: &Shared,
-    link: &Link,
+    link: &DatabaseLink,
     run: i32,
     name: &str,
 ) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {

@@ -8,7 +8,7 @@ use regrind_page::Session;
 use serde::Deserialize;
 
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::super::{Row, ToSql};
 use super::words::{encoded, shown, um};
 use super::{PageContent, PageError, Shared, page};
@@ -62,7 +62,7 @@ const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 
 
 /// Reads one row more than a page shows, in the order of an index. The database sorts nothing, however many serial
 /// numbers match.
-async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
+async fn read(link: &DatabaseLink, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
     let most = MAX_ROWS as i64 + 1;
     let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);
     let last = format!("{serial}{LAST}");

@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 use super::super::error::{PlantError, refused};
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::super::schema::check_layout;
 use super::super::settings::DatabaseSettings;
 
@@ -22,12 +22,12 @@ const RULES: &str = "SET statement_timeout = '5s'; SET default_transaction_read_
 pub(super) struct Pool {
     database: DatabaseSettings,
     places: Semaphore,
-    idle: Mutex<Vec<Link>>,
+    idle: Mutex<Vec<DatabaseLink>>,
 }
 
 /// Connection that returns to the pool when it is dropped, if it is still usable.
 pub(super) struct Lease<'p> {
-    link: Option<Link>,
+    link: Option<DatabaseLink>,
     pool: &'p Pool,
     _place: SemaphorePermit<'p>,
 }
@@ -55,13 +55,13 @@ impl Pool {
         Ok(lease(self.open().await?))
     }
 
-    fn kept(&self) -> Option<Link> {
+    fn kept(&self) -> Option<DatabaseLink> {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop()
     }
 
     /// Opens a new connection and checks that the layout of the database is the one this program knows.
-    pub(super) async fn open(&self) -> Result<Link, PlantError> {
-        let link = Link::open(&self.database).await?;
+    pub(super) async fn open(&self) -> Result<DatabaseLink, PlantError> {
+        let link = DatabaseLink::open(&self.database).await?;
         check_layout(link.client()).await?;
         link.client().batch_execute(RULES).await.map_err(refused("to keep to reading"))?;
         Ok(link)
@@ -69,9 +69,9 @@ impl Pool {
 }
 
 impl Deref for Lease<'_> {
-    type Target = Link;
+    type Target = DatabaseLink;
 
-    fn deref(&self) -> &Link {
+    fn deref(&self) -> &DatabaseLink {
         match &self.link {
             Some(link) => link,
             None => unreachable!("it is given back when this is dropped, and not before"),

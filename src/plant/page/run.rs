@@ -15,7 +15,7 @@ use serde::Deserialize;
 
 use super::super::Row;
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::proof::{Proof, proven};
 use super::selection::mark;
 use super::words::{encoded, shown, um};
@@ -38,7 +38,7 @@ impl Run {
     const COLUMNS: &str = "id, cell, run, head, serial, part_name, recipe, recipe_sha256, operator, simulation, to_char(began, 'YYYY-MM-DD HH24:MI:SS'),
         to_char(ended, 'YYYY-MM-DD HH24:MI:SS'), result, verdict, grinder, cmm, wheel, probe, alarms, records, pv_limit_um, rms_limit_um";
 
-    async fn read(link: &Link, id: i32) -> Result<Self, PageError> {
+    async fn read(link: &DatabaseLink, id: i32) -> Result<Self, PageError> {
         let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
         let mut rows = link.query(&text, &[&id]).await?;
         let row =
@@ -189,7 +189,7 @@ fn made_of_it(run: &Run, proof: &Proof) -> Markup {
     }
 }
 
-async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
+async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
     let text = "SELECT cycle, pv_um, pv_u_um, rms_um, rms_u_um, verdict, reason, expected_pv_um, pv_limit_um, rms_limit_um FROM cycle_figure
         WHERE run_id = $1 ORDER BY cycle LIMIT 1000";
     let rows = link.query(text, &[&id]).await?;
@@ -218,7 +218,7 @@ async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
 }
 
 /// Returns the cycles that have an error map.
-async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
+async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     let rows = link
         .query("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
         .await?;

@@ -7,7 +7,7 @@ use maud::{Markup, html};
 use serde::Deserialize;
 
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::PageError;
 use super::words::{encoded, shown};
 
@@ -59,7 +59,7 @@ pub(super) struct Selection {
 impl Selection {
     /// Builds the selection from an address. Defaults: real parts if there are any, the recipe of the newest part, and
     /// the last days.
-    pub(super) async fn from_query(link: &Link, asked: &SelectionQuery) -> Result<Self, PageError> {
+    pub(super) async fn from_query(link: &DatabaseLink, asked: &SelectionQuery) -> Result<Self, PageError> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
             Some(recipe) => recipe.clone(),
@@ -112,7 +112,7 @@ impl Selection {
     }
 
     /// Renders the form that sets the selection.
-    pub(super) async fn form(&self, link: &Link, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
+    pub(super) async fn form(&self, link: &DatabaseLink, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
         let rows = link.query("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
         let chosen = |(kind, word): &(&str, &str), name: &String| {
@@ -154,7 +154,7 @@ impl Selection {
 pub(super) const ALL_KINDS: [&str; 6] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0, KINDS[4].0, KINDS[5].0];
 
 /// Returns true if the selection is of simulated parts: as requested, or by default if no real part exists.
-pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, PlantError> {
+pub(super) async fn is_simulated(link: &DatabaseLink, asked: &str) -> Result<bool, PlantError> {
     match asked {
         "real" => Ok(false),
         "simulated" => Ok(true),
@@ -165,7 +165,7 @@ pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, Plant
     }
 }
 
-async fn newest_recipe(link: &Link, simulated: bool) -> Result<String, PlantError> {
+async fn newest_recipe(link: &DatabaseLink, simulated: bool) -> Result<String, PlantError> {
     let world = if simulated { "simulation" } else { "NOT simulation" };
     let text = format!("SELECT recipe FROM part_run WHERE {world} AND recipe IS NOT NULL ORDER BY began DESC LIMIT 1");
     let rows = link.query(&text, &[]).await?;

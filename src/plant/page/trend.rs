@@ -7,7 +7,7 @@ use maud::{Markup, html};
 use regrind_page::Session;
 
 use super::super::error::PlantError;
-use super::super::link::Link;
+use super::super::link::DatabaseLink;
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
 use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
 use super::words::{shown, um};
@@ -55,7 +55,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
 }
 
 /// Reads the newest parts of a selection, in order from the oldest to the newest.
-pub(super) async fn parts(link: &Link, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
+pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
     // The two views have different names for the id of the run.
     let (view, id) = if selection.first { ("cycle_figure", "run_id") } else { ("part_run", "id") };

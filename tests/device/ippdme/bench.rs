@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use regrind::device::Interrupt;
 use regrind::device::ippdme::Limits;
 use regrind::device::{
-    Armed, Cmm, DeviceError, Identified, IppdmeCmm, IppdmeSettings, Job, Machine, Measurement, Plan, PointStatus,
-    State, Status, Target, TargetKind, digest,
+    Armed, Cmm, DeviceError, Identified, IppdmeCmm, IppdmeSettings, Job, Machine, Measurement, Plan, TouchStatus,
+    MachineState, Status, PlanTarget, TargetKind, digest,
 };
 use regrind_sim::dme::Server;
 use regrind_sim::dme::faults::CommandFaults;
@@ -92,7 +92,7 @@ impl Bench {
             let k = (index * 7) % count;
             let (x, y) = (f64::from(k % 5) * 6.0 - 12.0, f64::from(k / 5) * 6.0 - 6.0);
             let (point_mm, normal) = self.world.nominal(x, y);
-            Target { index: 10 + index, kind: TargetKind::Part, point_mm, normal }
+            PlanTarget { index: 10 + index, kind: TargetKind::Part, point_mm, normal }
         };
         Plan {
             targets: (0..count).map(target).collect(),
@@ -116,7 +116,7 @@ impl Bench {
         assert_eq!(measurement.points.len(), plan.targets.len());
         for (point, target) in measurement.points.iter().zip(&plan.targets) {
             assert_eq!(point.index, target.index, "points come in the order of the plan");
-            if point.status != PointStatus::Touched {
+            if point.status != TouchStatus::Touched {
                 continue;
             }
             let along: f64 = (0..3).map(|k| (point.position_mm[k] - target.point_mm[k]) * target.normal[k]).sum();
@@ -162,6 +162,6 @@ pub async fn until_points(cmm: &mut IppdmeCmm, count: u32) {
     until(cmm, |status| status.progress.is_some_and(|(done, _)| done >= count)).await.unwrap();
 }
 
-pub fn has_state(status: &Status, state: State) -> bool {
+pub fn has_state(status: &Status, state: MachineState) -> bool {
     status.state == state
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use regrind::device::{
-    Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, Outcome, Reconciled, State, Status,
+    Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, Outcome, Reconciled, MachineState, Status,
 };
 use regrind_sim::dme::faults::Fault;
 
@@ -38,7 +38,7 @@ async fn run_with_fault(
 /// Asserts that the job finished anyway, with true points.
 async fn assert_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let status = ended.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let plan = bench.plan(8);
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.assert_on_part(&plan, &measurement);
@@ -55,12 +55,12 @@ async fn assert_resumed(bench: &mut Bench, ended: Result<Status, DeviceError>) {
         if bench.cmm.connect().await.is_err() {
             continue;
         }
-        if until_still(&mut bench.cmm).await.is_ok_and(|status| status.state == State::Held) {
+        if until_still(&mut bench.cmm).await.is_ok_and(|status| status.state == MachineState::Held) {
             bench.cmm.resume().await.unwrap();
         }
         match until_still(&mut bench.cmm).await {
-            Ok(status) if status.state == State::Complete => return assert_measured(bench, Ok(status)).await,
-            Ok(status) if status.state == State::Idle => {
+            Ok(status) if status.state == MachineState::Complete => return assert_measured(bench, Ok(status)).await,
+            Ok(status) if status.state == MachineState::Idle => {
                 super::bench::begin(&mut bench.cmm, &plan).await.unwrap();
             }
             _ => {}
@@ -137,7 +137,7 @@ async fn disconnect_in_job_preserves_points() {
     let armed = regrind::device::Armed { job: job(&plan), start_sequence: 1, token: 0, boot_id: 0 };
     let Reconciled::Running(status) = bench.cmm.reconcile(&armed).await.unwrap() else { panic!() };
     // The third touch was made, but its end was not reported.
-    assert_eq!((status.state, status.progress, status.clear_of_part), (State::Held, Some((2, 8)), None));
+    assert_eq!((status.state, status.progress, status.clear_of_part), (MachineState::Held, Some((2, 8)), None));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
     assert_measured(&mut bench, ended).await;
@@ -153,10 +153,10 @@ async fn session_start_error_cleared() {
 async fn emergency_stop_in_job_faults() {
     let (mut bench, ended) = run_with_touch_fault(Fault::EmergencyStop, patient()).await;
     let status = ended.unwrap();
-    assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::StopCircuit)));
+    assert_eq!((status.state, status.fault), (MachineState::Faulted, Some(MachineFault::StopCircuit)));
     assert_eq!((status.outcome, status.clear_of_part), (Outcome::Failed, None));
     assert!(bench.cmm.notes()[0].contains("error 0500"), "{:?}", bench.cmm.notes());
-    assert_eq!(bench.cmm.clear().await.unwrap().state, State::Idle);
+    assert_eq!(bench.cmm.clear().await.unwrap().state, MachineState::Idle);
 }
 
 #[tokio::test]
@@ -165,7 +165,7 @@ async fn emergency_stop_between_jobs_faults() {
     let mut bench = Bench::new(FAST, limits).await;
     bench.cmm.connect().await.unwrap();
     bench.serving.with(|server| server.emergency_stop(Duration::ZERO));
-    let status = until(&mut bench.cmm, |status| status.state == State::Faulted).await.unwrap();
+    let status = until(&mut bench.cmm, |status| status.state == MachineState::Faulted).await.unwrap();
     assert_eq!(status.fault, Some(MachineFault::StopCircuit));
 }
 
@@ -184,7 +184,7 @@ async fn travel_limit_warning_faults() {
     bench.cmm = regrind::device::IppdmeCmm::new(settings);
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::TravelLimit)));
+    assert_eq!((status.state, status.fault), (MachineState::Faulted, Some(MachineFault::TravelLimit)));
 }
 
 #[tokio::test]
@@ -195,7 +195,7 @@ async fn miss_needing_operator_not_retried() {
     let plan = bench.plan(3);
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::Other(1006))));
+    assert_eq!((status.state, status.fault), (MachineState::Faulted, Some(MachineFault::Other(1006))));
 }
 
 #[tokio::test]
@@ -204,7 +204,7 @@ async fn ignored_abort_is_link_error() {
     bench.faults.add("AbortE", 0, Fault::AbortIgnored);
     let plan = bench.plan(8);
     bench.begin(&plan).await.unwrap();
-    until(&mut bench.cmm, |status| status.state == State::Execute).await.unwrap();
+    until(&mut bench.cmm, |status| status.state == MachineState::Execute).await.unwrap();
     bench.cmm.abort().await.unwrap();
     let error = until_still(&mut bench.cmm).await.unwrap_err();
     assert!(error.is_link(), "{error}");

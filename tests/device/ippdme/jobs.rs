@@ -1,7 +1,7 @@
 //! Jobs from their beginning to their end, with interventions of people and crashes.
 
 use regrind::device::{
-    CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Reconciled, State,
+    CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, Reconciled, MachineState,
 };
 use regrind_sim::dme::machine::Options;
 use regrind_sim::spec::CmmSpec;
@@ -20,13 +20,13 @@ async fn ippdme_plan_measured_on_part() {
     let plan = Plan { careful_start: Some(CarefulStart { target_count: 2, speed_mm_s: 0.5 }), ..bench.plan(20) };
     let armed = bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     assert_eq!((status.done, status.clear_of_part), (armed.start_sequence, Some(true)));
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.assert_on_part(&plan, &measurement);
-    assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
+    assert!(measurement.points.iter().all(|point| point.status == TouchStatus::Touched));
     assert_eq!(measurement.probe_radius_mm, Some(1.5));
-    assert_eq!(bench.cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
+    assert_eq!(bench.cmm.acknowledge(status.done).await.unwrap().state, MachineState::Idle);
     assert_eq!(bench.world.measurements_begun(), 1);
 }
 
@@ -53,7 +53,7 @@ async fn ippdme_read_ahead_in_plan_order() {
     bench.begin(&plan).await.unwrap();
     let mut ahead = Vec::new();
     loop {
-        let over = has_state(&bench.cmm.status().await.unwrap(), State::Complete);
+        let over = has_state(&bench.cmm.status().await.unwrap(), MachineState::Complete);
         if let Some(more) = bench.cmm.read_ahead(job(&plan), &Interrupt::new()).await {
             assert_eq!(more.first_index, ahead.len());
             ahead.extend(more.points);
@@ -72,15 +72,15 @@ async fn hold_retracts_resume_touches_rest() {
     let plan = bench.plan(10);
     bench.begin(&plan).await.unwrap();
     until_points(&mut bench.cmm, 2).await;
-    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
-    let held = until(&mut bench.cmm, |status| has_state(status, State::Held)).await.unwrap();
+    assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
+    let held = until(&mut bench.cmm, |status| has_state(status, MachineState::Held)).await.unwrap();
     assert!(held.progress.is_some_and(|(done, _)| done < 10) && held.clear_of_part == Some(true));
     let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::MIN, f64::max);
     let height = bench.serving.with(|server| server.machine().at_mm()[2]);
     assert!(height >= highest + plan.safe_height_mm, "{height}");
     bench.cmm.resume().await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.assert_on_part(&plan, &measurement);
 }
@@ -93,7 +93,7 @@ async fn stop_gives_no_measurement() {
     until_points(&mut bench.cmm, 1).await;
     bench.cmm.stop().await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Stopped));
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Stopped));
     let none = bench.cmm.collect(job(&plan), &Interrupt::new()).await;
     assert!(matches!(none, Err(DeviceError::NoResult { .. })));
 }
@@ -103,12 +103,12 @@ async fn abort_then_clear_allows_prepare() {
     let mut bench = Bench::new(1.0, patient()).await;
     let plan = bench.plan(20);
     bench.begin(&plan).await.unwrap();
-    assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);
+    assert_eq!(bench.cmm.abort().await.unwrap().state, MachineState::Aborting);
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (MachineState::Aborted, Outcome::Aborted, None));
     // Nothing of the job remains at the server.
     assert_eq!(bench.serving.with(|server| server.due()), None);
-    assert_eq!(bench.cmm.clear().await.unwrap().state, State::Idle);
+    assert_eq!(bench.cmm.clear().await.unwrap().state, MachineState::Idle);
     bench.cmm.prepare(job(&plan)).await.unwrap();
 }
 
@@ -132,7 +132,7 @@ async fn restarted_program_reports_lost_points() {
     drop(std::mem::replace(&mut bench.cmm, another));
     bench.cmm.connect().await.unwrap();
     let Reconciled::Finished(status) = bench.cmm.reconcile(&armed).await.unwrap() else { panic!() };
-    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Complete, Outcome::Failed, None));
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (MachineState::Complete, Outcome::Failed, None));
     assert!(bench.cmm.notes().iter().any(|note| note.contains("are lost")));
     assert!(bench.cmm.collect(job(&plan), &Interrupt::new()).await.is_err());
     bench.cmm.acknowledge(status.done).await.unwrap();
@@ -158,7 +158,7 @@ async fn wrong_probe_radius_faults() {
     let mut bench = Bench::with(FAST, patient(), Options { tools, ..Options::default() }).await;
     let plan = bench.plan(5);
     bench.begin(&plan).await.unwrap();
-    assert_eq!(until_still(&mut bench.cmm).await.unwrap().state, State::Faulted);
+    assert_eq!(until_still(&mut bench.cmm).await.unwrap().state, MachineState::Faulted);
     assert!(bench.cmm.notes()[0].contains("1.52 mm"), "{:?}", bench.cmm.notes());
     assert_eq!(bench.world.measurements_begun(), 0);
 }
@@ -199,7 +199,7 @@ async fn missed_targets_retried_then_reported() {
     assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.assert_on_part(&plan, &measurement);
-    let missed = measurement.points.iter().filter(|point| point.status == PointStatus::NotFound).count();
+    let missed = measurement.points.iter().filter(|point| point.status == TouchStatus::NotFound).count();
     // Half of the first tries, and a quarter after the second ones.
     assert!((1..15).contains(&missed), "{missed}");
 }
@@ -222,7 +222,7 @@ async fn job_without_status_polls_holds() {
     bench.cmm = IppdmeCmm::new(settings);
     let plan = bench.plan(10);
     bench.begin(&plan).await.unwrap();
-    let held = until(&mut bench.cmm, |status| has_state(status, State::Held)).await.unwrap();
+    let held = until(&mut bench.cmm, |status| has_state(status, MachineState::Held)).await.unwrap();
     assert!(held.progress.is_some_and(|(done, _)| done < 10));
     assert!(bench.cmm.notes()[0].contains("no status request"), "{:?}", bench.cmm.notes());
 }

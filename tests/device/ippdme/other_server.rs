@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, State, Target, TargetKind};
+use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, MachineState, PlanTarget, TargetKind};
 
 use super::bench::{begin, job, patient, settings, until_still};
 
@@ -41,7 +41,7 @@ async fn other_server_measures_sphere_cap() {
         let normal = [tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos()];
         // A little off the surface, like a real part.
         let point_mm = [60.01 * normal[0], 60.01 * normal[1], 60.01 * normal[2] - 50.0];
-        Target { index, kind: TargetKind::Part, point_mm, normal }
+        PlanTarget { index, kind: TargetKind::Part, point_mm, normal }
     };
     let plan = Plan {
         targets: (0..30).map(target).collect(),
@@ -54,11 +54,11 @@ async fn other_server_measures_sphere_cap() {
     };
     begin(&mut cmm, &plan).await.unwrap();
     let status = until_still(&mut cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", cmm.notes());
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete), "{:?}", cmm.notes());
     let measurement = cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     for point in &measurement.points {
         let [x, y, z] = point.position_mm;
         let distance = (x * x + y * y + (z + 50.0).powi(2)).sqrt();
-        assert!(point.status == PointStatus::Touched && (distance - 61.5).abs() < 1e-6, "{point:?}");
+        assert!(point.status == TouchStatus::Touched && (distance - 61.5).abs() < 1e-6, "{point:?}");
     }
 }

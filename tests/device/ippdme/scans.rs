@@ -1,8 +1,8 @@
 //! Scanned rows: their points lie on the part, each at its target, and no fault brings a wrong one.
 
 use regrind::device::{
-    Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Scanning,
-    State, Status, Target, TargetKind,
+    Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, Scanning,
+    MachineState, Status, PlanTarget, TargetKind,
 };
 use regrind_sim::dme::faults::Fault;
 use regrind_sim::dme::machine::Options;
@@ -28,7 +28,7 @@ fn rows(bench: &Bench) -> Plan {
     let places = (0..3).flat_map(row).chain([(-12.0, -6.0)]);
     let targets = places.enumerate().map(|(index, (x, y))| {
         let (point_mm, normal) = bench.world.nominal(x, y);
-        Target { index: 10 + index as u32, kind: TargetKind::Part, point_mm, normal }
+        PlanTarget { index: 10 + index as u32, kind: TargetKind::Part, point_mm, normal }
     });
     Plan { targets: targets.collect(), ..bench.plan(1) }
 }
@@ -46,11 +46,11 @@ async fn run_with_fault(fault: Option<Fault>) -> (Bench, Result<Status, DeviceEr
 
 async fn assert_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let status = ended.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let plan = rows(bench);
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.assert_on_part(&plan, &measurement);
-    assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
+    assert!(measurement.points.iter().all(|point| point.status == TouchStatus::Touched));
 }
 
 #[tokio::test]
@@ -79,7 +79,7 @@ async fn duplicate_or_split_scan_line_is_one() {
 async fn assert_scan_refused(fault: Fault, says: &str) {
     let (bench, ended) = run_with_fault(Some(fault)).await;
     let status = ended.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Faulted, Outcome::Failed));
+    assert_eq!((status.state, status.outcome), (MachineState::Faulted, Outcome::Failed));
     assert_eq!(status.progress, Some((12, 37)), "the first row alone");
     assert!(bench.cmm.notes()[0].contains(says), "{:?}", bench.cmm.notes());
 }
@@ -101,7 +101,7 @@ async fn disconnect_in_scan_rescans_row() {
     assert!(error.is_link(), "{error}");
     bench.cmm.connect().await.unwrap();
     let held = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((held.state, held.progress, held.clear_of_part), (State::Held, Some((12, 37)), None));
+    assert_eq!((held.state, held.progress, held.clear_of_part), (MachineState::Held, Some((12, 37)), None));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
     assert_measured(&mut bench, ended).await;
@@ -138,9 +138,9 @@ async fn in_the_second_row(speed_mm_s: f64) -> Bench {
 async fn hold_in_scan_defers_next_row() {
     // The row ends after about five seconds.
     let mut bench = in_the_second_row(10.0).await;
-    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
+    assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
     let held = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((held.state, held.progress, held.clear_of_part), (State::Held, Some((24, 37)), Some(true)));
+    assert_eq!((held.state, held.progress, held.clear_of_part), (MachineState::Held, Some((24, 37)), Some(true)));
     assert_eq!(bench.serving.with(|server| (server.due(), server.machine().contacts())), (None, 2));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
@@ -153,7 +153,7 @@ async fn abort_in_scan_ends_row() {
     let mut bench = in_the_second_row(0.4).await;
     bench.cmm.abort().await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (MachineState::Aborted, Outcome::Aborted, None));
     // The row that was finished before is present, and nothing of this one. Nothing of this one remains at the server.
     assert_eq!(status.progress, Some((12, 37)));
     let left = bench.serving.with(|server| (server.due(), server.machine().contacts()));
@@ -183,6 +183,6 @@ async fn non_scanning_probe_is_tool_fault() {
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
-    assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::Tool)));
+    assert_eq!((status.state, status.fault), (MachineState::Faulted, Some(MachineFault::Tool)));
     assert!(bench.cmm.notes()[0].contains("2002"), "{:?}", bench.cmm.notes());
 }

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Plan, State, Target, TargetKind};
+use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Plan, MachineState, PlanTarget, TargetKind};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -73,7 +73,7 @@ fn answers(said: &str) -> Option<&'static str> {
 
 fn plan() -> Plan {
     Plan {
-        targets: vec![Target {
+        targets: vec![PlanTarget {
             index: 3,
             kind: TargetKind::Part,
             point_mm: [10.0, 20.0, 5.1],
@@ -95,7 +95,7 @@ async fn ippdme_session_golden_transcript() {
     cmm.connect().await.unwrap();
     begin(&mut cmm, &plan()).await.unwrap();
     let status = until_still(&mut cmm).await.unwrap();
-    assert_eq!(status.state, State::Complete, "{:?}", cmm.notes());
+    assert_eq!(status.state, MachineState::Complete, "{:?}", cmm.notes());
     let measurement = cmm.collect(job(&plan()), &Interrupt::new()).await.unwrap();
     assert_eq!(measurement.points[0].position_mm, [10.0, 20.0, 6.6]);
     let golden = "\
@@ -135,7 +135,7 @@ async fn abort_sent_during_motion() {
     until(&mut cmm, |_| says("GoTo(")).await.unwrap();
     cmm.abort().await.unwrap();
     let status = until_still(&mut cmm).await.unwrap();
-    assert_eq!(status.state, State::Aborted);
+    assert_eq!(status.state, MachineState::Aborted);
     let lines = heard.lock().unwrap().clone();
     let [.., before, abort, after] = &lines[..] else { panic!("{lines:?}") };
     assert!(before.contains("GoTo(") && abort.contains("AbortE()") && after.contains("ClearAllErrors()"), "{lines:?}");
@@ -153,7 +153,7 @@ async fn abort_is_first_after_reconnect() {
     cmm.abort().await.unwrap();
     let lines = heard.lock().unwrap().clone();
     assert!(lines[before].contains("AbortE()") && lines[before + 1].contains("EndSession()"), "{lines:?}");
-    assert_eq!(until_still(&mut cmm).await.unwrap().state, State::Aborted);
+    assert_eq!(until_still(&mut cmm).await.unwrap().state, MachineState::Aborted);
 }
 
 #[tokio::test]
@@ -165,7 +165,7 @@ async fn touch_off_target_faults() {
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
     cmm.connect().await.unwrap();
     begin(&mut cmm, &plan()).await.unwrap();
-    assert_eq!(until_still(&mut cmm).await.unwrap().state, State::Faulted);
+    assert_eq!(until_still(&mut cmm).await.unwrap().state, MachineState::Faulted);
     assert!(cmm.notes()[0].contains("target 3"), "{:?}", cmm.notes());
 }
 
@@ -191,6 +191,6 @@ async fn touch_with_bad_coordinates_faults() {
         let mut cmm = IppdmeCmm::new(settings(port, patient()));
         cmm.connect().await.unwrap();
         begin(&mut cmm, &plan()).await.unwrap();
-        assert_eq!(until_still(&mut cmm).await.unwrap().state, State::Faulted, "{line}");
+        assert_eq!(until_still(&mut cmm).await.unwrap().state, MachineState::Faulted, "{line}");
     }
 }

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use regrind::device::ippdme::{Command, Response};
+use regrind::device::ippdme::{DmeCommand, DmeResponse};
 
 #[path = "../../common/data.rs"]
 mod data;
@@ -45,11 +45,11 @@ fn vector_commands_round_trip() {
         let bad =
             if matches!(name.as_str(), "parserCmdErrors" | "numbersErrorCmd") { refused(text) } else { Vec::new() };
         for line in lines(&program).filter(|line| !bad.iter().any(|(bad, _)| bad == line)) {
-            match Command::read(line) {
+            match DmeCommand::read(line) {
                 Ok((tag, command)) => {
                     let again = command.line(tag);
                     let whole = again.strip_suffix("\r\n").unwrap();
-                    assert_eq!(Command::read(whole), Ok((tag, command)), "{line}");
+                    assert_eq!(DmeCommand::read(whole), Ok((tag, command)), "{line}");
                     good += 1;
                 }
                 // The angle is read already where it stands for the checker, which comes later.
@@ -71,7 +71,7 @@ fn vector_bad_commands_give_error_code() {
     {
         for (line, number) in refused(text) {
             seen += 1;
-            let found = Command::read(line).map_err(|flaw| flaw.number);
+            let found = DmeCommand::read(line).map_err(|flaw| flaw.number);
             if found.as_ref().err() != Some(&number) {
                 wrong.push(format!("{name}: {line}: {number}, and not {found:?}"));
             }
@@ -89,7 +89,7 @@ fn vector_responses_parse() {
         files("res").iter().filter(|(name, _)| !matches!(name.as_str(), "parserResErrors" | "numbersErrorRes"))
     {
         for line in lines(answers) {
-            match Response::read(line) {
+            match DmeResponse::read(line) {
                 Ok(_) => good += 1,
                 Err(flaw) => wrong.push(format!("{name}: {line}: {flaw:?}")),
             }
@@ -106,7 +106,7 @@ fn vector_broken_numbers_refused() {
         // A number with more digits than the standard allows is still a number.
         let broken = lines(answers).filter(|line| !line.contains("12345678901234567"));
         for line in broken {
-            assert!(Response::read(line).is_err(), "{line}");
+            assert!(DmeResponse::read(line).is_err(), "{line}");
         }
     }
 }

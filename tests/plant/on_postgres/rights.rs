@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use regrind::journal::{AuditKey, Entry, Header, Journal, Kind, Reader, Record};
+use regrind::journal::{AuditKey, Entry, Header, Journal, RecordKind, Reader, Record};
 use serde_json::json;
 
 use crate::Plant;
@@ -25,7 +25,7 @@ fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
     let mut journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
     journal.store("cycle-1/points.csv", SQL.as_bytes(), 1, 1).unwrap();
     for k in 0..6 {
-        journal.append(Entry::new(Kind::Note, k, 1, json!({ "said": SQL, "k": k }))).unwrap();
+        journal.append(Entry::new(RecordKind::Note, k, 1, json!({ "said": SQL, "k": k }))).unwrap();
     }
     journal.close(10, 1, json!(SQL)).unwrap();
     Reader::open(&folder).unwrap().records(1).map(Result::unwrap).collect()

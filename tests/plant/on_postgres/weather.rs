@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind::journal::{Kind, Reader, verify};
+use regrind::journal::{RecordKind, Reader, verify};
 
 use super::work::approves;
 use crate::Plant;
@@ -248,7 +248,7 @@ fn is_once_and_whole(plant: &Plant, cells: &[Cell], parts: usize, seed: u64) {
                 cell.name
             ));
             assert_eq!(there, format!("{0} {1} {0}", records.len(), last.hash), "seed {seed}, {name}");
-            let was_driven = records.iter().any(|record| matches!(record.kind, Kind::Intent | Kind::Event));
+            let was_driven = records.iter().any(|record| matches!(record.kind, RecordKind::Intent | RecordKind::Event));
             assert!(!was_driven || made.insert(last.part.clone()), "seed {seed}: {} was begun twice", last.part);
             all += records.len();
         }

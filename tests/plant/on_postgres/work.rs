@@ -4,7 +4,7 @@
 use std::fs;
 use std::process::Stdio;
 
-use regrind::journal::{Entry, Header, Journal, Kind};
+use regrind::journal::{Entry, Header, Journal, RecordKind};
 use serde_json::{Value, json};
 
 use crate::Plant;
@@ -228,7 +228,7 @@ fn begun_and_died(plant: &Plant, run: &str, events: usize) {
     };
     let mut journal = Journal::create(plant.path("runs").join(run), header).unwrap();
     for k in 0..events {
-        journal.append(Entry::new(Kind::Event, k as u64, 1, json!({ "event": "start" }))).unwrap();
+        journal.append(Entry::new(RecordKind::Event, k as u64, 1, json!({ "event": "start" }))).unwrap();
     }
     drop(journal);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);

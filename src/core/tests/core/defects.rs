@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector};
 use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::Point;
 use regrind_core::model::{Form, ModelInputs};
-use regrind_core::registration::{Options, PointStatus, Registration, register};
+use regrind_core::registration::{RegistrationOptions, PointStatus, Registration, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
@@ -45,7 +45,7 @@ fn touched([columns, rows]: [usize; 2], noise_mm: f64, planted_mm: impl Fn(f64, 
 }
 
 fn registered(measured: &[Point]) -> Registration {
-    register(nominal(), measured, &Options::new(RADIUS_MM)).unwrap()
+    register(nominal(), measured, &RegistrationOptions::new(RADIUS_MM)).unwrap()
 }
 
 fn left_out(found: &Registration) -> Vec<usize> {

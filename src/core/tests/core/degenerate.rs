@@ -5,7 +5,7 @@ use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Pose};
-use regrind_core::registration::{Coordinate, Options, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{Coordinate, RegistrationOptions, Registration, RegistrationError, Start, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -39,12 +39,12 @@ fn line(count: u32, [x, y]: [f64; 2], degrees: f64, half_mm: f64) -> Vec<[f64; 2
     (0..count).map(along).map(|t| [x + t * cosine, y + t * sine]).collect()
 }
 
-fn registered(cloud: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
+fn registered(cloud: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     register(&free_form(205, 125), cloud, options)
 }
 
-fn free() -> Options {
-    Options::new(RADIUS_MM)
+fn free() -> RegistrationOptions {
+    RegistrationOptions::new(RADIUS_MM)
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn scan_line_is_degenerate() {
         for (count, form_mm, seed) in [(30, 0.0, 1), (60, 0.0, 2), (60, 5e-3, 3), (400, 5e-3, 4)] {
             let cloud = measured(&line(count, [2.0, -3.0], degrees, half_mm), form_mm, seed);
             for start in [Start::Search, Start::Pose(pose(&placement()))] {
-                let told = registered(&cloud, &Options { start, ..free() });
+                let told = registered(&cloud, &RegistrationOptions { start, ..free() });
                 let Err(RegistrationError::Narrow { width_mm, distance_mm, .. }) = told else {
                     panic!("{degrees} degrees, {count} points, seed {seed}: {told:?}")
                 };
@@ -93,7 +93,7 @@ fn degenerate_line_and_valid_strip() {
 fn line_registers_with_locked_directions() {
     let cloud = measured(&line(60, [2.0, -3.0], 0.0, 45.0), 0.0, 8);
     let start = Start::Pose(pose(&placement()));
-    let hold = |held: &[Coordinate]| Options { start, locked: Coordinate::locked_flags(held), ..free() };
+    let hold = |held: &[Coordinate]| RegistrationOptions { start, locked: Coordinate::locked_flags(held), ..free() };
     assert!(matches!(registered(&cloud, &hold(&[Coordinate::Y])), Err(RegistrationError::Narrow { .. })));
     let said = registered(&cloud, &free()).unwrap_err().to_string();
     assert!(said.contains("lock y and rx") && said.contains("measure a strip at least"), "{said}");
@@ -106,7 +106,7 @@ fn coverage_of_line_is_its_strip() {
     let cover = |places: &[[f64; 2]]| {
         let start = Start::Pose(pose(&placement()));
         let held = Coordinate::locked_flags(&[Coordinate::Y, Coordinate::Rx]);
-        registered(&measured(places, 0.0, 9), &Options { start, locked: held, ..free() }).unwrap().quality.coverage
+        registered(&measured(places, 0.0, 9), &RegistrationOptions { start, locked: held, ..free() }).unwrap().quality.coverage
     };
     let grid = |columns: u32, rows: u32, [x0, x1]: [f64; 2]| -> Vec<[f64; 2]> {
         let at = |k: u32, count: u32, [a, b]: [f64; 2]| a + (b - a) * (f64::from(k) + 0.5) / f64::from(count);
@@ -137,7 +137,7 @@ fn rotation_from_sampling_is_locked() {
         let mut cloud =
             placed(&placement(), &centres(&shape, &FormError::none(), [[-48.0, -28.0], [48.0, 28.0]], [47, 31]));
         cloud.iter_mut().flatten().for_each(|v| *v += 3e-4 * normal(&mut rng));
-        let options = Options { start: Start::Pose(pose(&placement())), ..free() };
+        let options = RegistrationOptions { start: Start::Pose(pose(&placement())), ..free() };
         let found = register(&nominal, &points(&cloud), &options).unwrap();
         let weak: Vec<&str> = found.quality.weak_directions.iter().map(|weak| weak.words.as_str()).collect();
         assert!(
@@ -156,10 +156,10 @@ fn points_required_by_free_directions() {
     let cloud = measured(&places, 0.0, 10);
     let start = Start::Pose(pose(&placement()));
     let held = Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
-    let options = Options { start, locked: held, ..free() };
+    let options = RegistrationOptions { start, locked: held, ..free() };
     for (count, options, is_enough) in [(7, free(), true), (6, free(), false), (4, options, true), (3, options, false)]
     {
-        let start = Options { start, ..options };
+        let start = RegistrationOptions { start, ..options };
         let told = registered(&cloud[..count], &start);
         assert_eq!(told.is_ok(), is_enough, "{count} points: {told:?}");
     }

@@ -3,7 +3,7 @@
 use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
 use nalgebra::{Matrix6, Vector6};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{Options, PointStatus, Start, register};
+use regrind_core::registration::{RegistrationOptions, PointStatus, Start, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, add_outliers};
@@ -113,7 +113,7 @@ fn register_matches_exact_least_squares() {
         ("mesh", Nominal::from_mesh(grid, triangles)),
     ];
     for (name, nominal) in kinds {
-        let found = register(&nominal.unwrap(), &measured, &Options::new(RADIUS_MM)).unwrap();
+        let found = register(&nominal.unwrap(), &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
         let (um, urad) = difference(&found.cmm_from_model, &exact);
         let map = rms_nm(found.deviations.iter().zip(&distances).map(|(f, d)| f.deviation_mm - d));
         println!("{name}: {um:.5} um {urad:.5} urad {map:.5} nm used {}", found.quality.inliers);
@@ -149,7 +149,7 @@ fn register_with_noise_and_gross_outliers() {
         let (exact, distances) = exact_least_squares(&shape, &measured, &fits, first);
         // An outlier is gross if it is far from the surface, not if it slid along it.
         let far: Vec<usize> = gross.iter().copied().filter(|&k| distances[k].abs() > 0.02).collect();
-        let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
+        let found = register(&nominal, &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
         // Two of them side by side may pass for form, but no pose is fitted to either.
         let dropped = |k: usize| found.deviations[k].status != PointStatus::Inlier || !found.deviations[k].in_fit;
         assert!(far.iter().all(|&k| dropped(k)), "seed {seed}: an outlier was kept");
@@ -182,7 +182,7 @@ fn pose_covariance_matches_observed() {
         for seed in 0..DRAWS {
             let mut measured = clean.clone();
             add_noise(&mut regrind_sim::rng(seed), &mut measured, 3e-4);
-            let mut options = Options::new(RADIUS_MM);
+            let mut options = RegistrationOptions::new(RADIUS_MM);
             options.start = regrind_core::registration::Start::Pose(truth);
             let found = register(&nominal, &points(&measured), &options).unwrap();
             let error = (truth.inverse() * found.cmm_from_model).log();
@@ -212,7 +212,7 @@ fn register_starts_far_with_few_points() {
         let found = register(
             &free_form(409, 249),
             &cloud,
-            &Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) },
+            &RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) },
         );
         let found = found.unwrap();
         assert!(pose_error_mm(&found.cmm_from_model, &pose(&placement)) < 0.02);

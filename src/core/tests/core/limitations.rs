@@ -4,7 +4,7 @@
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose, pose_error_mm};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{Options, PointStatus, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{RegistrationOptions, PointStatus, ProbeSide, Registration, RegistrationError, Start, register};
 use regrind_core::surface::accuracy::{NominalPoints, estimate_accuracy};
 use regrind_core::surface::{Nominal, PlaneProjection, SurfaceError};
 use regrind_sim::form::FormError;
@@ -57,7 +57,7 @@ fn points_beyond_edge_have_no_effect() {
     for to_x_mm in [36.0, 22.0, 12.0, 4.0] {
         let nominal = part_of_the_free_form(to_x_mm);
         for start in [Start::Search, Start::Pose(truth)] {
-            let options = Options { start, ..Options::new(RADIUS_MM) };
+            let options = RegistrationOptions { start, ..RegistrationOptions::new(RADIUS_MM) };
             let found = register(&nominal, &measured, &options).unwrap();
             let off = statuses(&found, PointStatus::OffPart);
             // By hand: the truth tells on which side of the edge each touch is.
@@ -70,7 +70,7 @@ fn points_beyond_edge_have_no_effect() {
             assert!(farthest_mm < 1e-3, "{to_x_mm}: a point {farthest_mm} mm beyond the edge");
             // The others alone give the same map.
             let alone: Vec<Point> = inside.iter().map(|&k| measured[k]).collect();
-            let options = Options { start: Start::Pose(truth), ..options };
+            let options = RegistrationOptions { start: Start::Pose(truth), ..options };
             let other = register(&nominal, &alone, &options).unwrap();
             let squares: Vec<f64> = inside
                 .iter()
@@ -115,7 +115,7 @@ fn sparse_nominal_has_no_false_edge() {
             Nominal::from_points(scattered(|x| if x < 0.0 { 0.25 } else { 0.25 * ratio }, 0.0), PlaneProjection::Xy)
                 .unwrap();
         let found =
-            register(&nominal, &cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]), &Options::new(RADIUS_MM)).unwrap();
+            register(&nominal, &cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]), &RegistrationOptions::new(RADIUS_MM)).unwrap();
         assert_eq!(statuses(&found, PointStatus::OffPart), [0usize; 0], "{ratio}");
     }
 }
@@ -124,7 +124,7 @@ fn sparse_nominal_has_no_false_edge() {
 fn gap_of_nominal_is_reported() {
     let holed = scattered(|_| 0.5, 0.0).into_iter().filter(|p| p.x.hypot(p.y) > 8.0).collect();
     let nominal = Nominal::from_points(holed, PlaneProjection::Xy).unwrap();
-    let found = register(&nominal, &cloud(WHOLE, [60, 30]), &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &cloud(WHOLE, [60, 30]), &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let off = statuses(&found, PointStatus::OffPart);
     assert!(!off.is_empty() && off.iter().all(|&k| found.deviations[k].point.coords.xy().norm() < 8.5));
     assert!(
@@ -159,7 +159,7 @@ fn projection_stays_on_gutter_wall() {
         let truth = pose(&Placement::new([3.0, -2.0, 1.0], [2.0, -3.0, 5.0]));
         let measured: Vec<Point> = (0..625).map(|k| truth.transform_point(&centre(k))).collect();
         for start in [Start::Search, Start::Pose(truth)] {
-            let options = Options { start, side: ProbeSide::Above, ..Options::new(BALL_MM) };
+            let options = RegistrationOptions { start, side: ProbeSide::Above, ..RegistrationOptions::new(BALL_MM) };
             let found = register(&nominal, &measured, &options).unwrap();
             let largest = found.deviations.iter().fold(0.0f64, |most, d| most.max(d.deviation_mm.abs()));
             assert!(largest < 0.01, "grid {as_grid}, {start:?}: {largest}");
@@ -184,7 +184,7 @@ fn near_duplicates_and_far_off_refused() {
     assert!(matches!(refused, Some(SurfaceError::FarOff { index: 300, .. })), "{refused:?}");
     let mut measured = cloud(WHOLE, [40, 20]);
     measured[17] = Point::new(0.0, -1e6, 0.0);
-    let refused = register(&free_form(205, 125), &measured, &Options::new(RADIUS_MM)).err();
+    let refused = register(&free_form(205, 125), &measured, &RegistrationOptions::new(RADIUS_MM)).err();
     assert!(matches!(refused, Some(RegistrationError::FarOff { index: 17, .. })), "{refused:?}");
 }
 
@@ -193,7 +193,7 @@ fn noisy_nominal_is_reported() {
     let measured = cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]);
     for (noise_mm, is_told) in [(0.0, false), (1e-3, true)] {
         let nominal = Nominal::from_points(scattered(|_| 0.5, noise_mm), PlaneProjection::Xy).unwrap();
-        let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
+        let found = register(&nominal, &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
         assert_eq!(
             has_warning(&found, "nominal points have a noise"),
             is_told,
@@ -211,12 +211,12 @@ fn wrong_lock_is_not_mirror_image() {
     let beside = Pose::exp(&regrind_core::geometry::Twist::new(3.0, 0.0, 0.0, 0.0, 0.0, 0.035));
     let start = Start::Pose(pose(&placement()) * beside);
     let locked = [true, true, false, false, false, true];
-    let refused = register(&nominal, &measured, &Options { start, locked, ..Options::new(RADIUS_MM) }).unwrap_err();
+    let refused = register(&nominal, &measured, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) }).unwrap_err();
     let RegistrationError::DoesNotFit { remedy, .. } = &refused else { panic!("{refused:?}") };
     assert!(remedy.contains("locked pose"), "{remedy}");
     // A mirror image is one all the same.
     let mirrored: Vec<Point> = measured.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
-    let refused = register(&nominal, &mirrored, &Options { start, locked, ..Options::new(RADIUS_MM) }).unwrap_err();
+    let refused = register(&nominal, &mirrored, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) }).unwrap_err();
     assert!(matches!(refused, RegistrationError::Mirrored { .. }), "{refused:?}");
 }
 
@@ -224,7 +224,7 @@ fn wrong_lock_is_not_mirror_image() {
 fn better_probe_side_is_certain() {
     let measured = cloud(WHOLE, [80, 40]);
     for to_x_mm in [51.0, 12.0] {
-        let found = register(&part_of_the_free_form(to_x_mm), &measured, &Options::new(RADIUS_MM)).unwrap();
+        let found = register(&part_of_the_free_form(to_x_mm), &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
         assert!(!has_warning(&found, "on which side"), "{to_x_mm}: {:?}", found.quality.warnings);
     }
 }
@@ -236,7 +236,7 @@ fn free_directions_start_at_file_frame() {
     let tilt = pose(&Placement::new([4.0, -3.0, 7.0], [1.0, -2.0, 0.0]));
     let centre = |k: usize| Point::new(2.0 * (k % 25) as f64 - 24.0, 2.0 * (k / 25) as f64 - 16.0, RADIUS_MM);
     let measured: Vec<Point> = (0..25 * 17).map(|k| tilt.transform_point(&centre(k))).collect();
-    let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let turned = found.cmm_from_model.angle_rad().to_degrees();
     assert!(turned < 3.0, "a flat is turned by {turned} degrees");
     // A bump on a twentieth of the touches is a defect: a flat is its own mirror image.
@@ -245,7 +245,7 @@ fn free_directions_start_at_file_frame() {
         Point::new(p.x, p.y, RADIUS_MM + 1e-3 * (1.0 - away / 6.0).max(0.0))
     };
     let bumped: Vec<Point> = (0..25 * 17).map(|k| bump(&centre(k))).collect();
-    let found = register(&nominal, &bumped, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &bumped, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     assert!(found.quality.pv_mm > 6e-4 && found.cmm_from_model.angle_rad() < 1e-3, "{}", found.quality.pv_mm);
 
     let sphere = Sphere { radius_mm: 80.0 };
@@ -257,7 +257,7 @@ fn free_directions_start_at_file_frame() {
     let form = FormError::new(7, 30.0, 0.0, 60.0, 60.0);
     let all = centres(&sphere, &form, [[-27.0, -27.0], [27.0, 27.0]], [21, 21]);
     let shifted: Vec<Point> = points(&all).iter().map(|p| p + Vector::new(5.0, -4.0, 9.0)).collect();
-    let found = register(&nominal, &shifted, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &shifted, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let turned = found.cmm_from_model.angle_rad().to_degrees();
     assert!(turned < 8.0, "a sphere is turned by {turned} degrees");
 }
@@ -274,10 +274,10 @@ fn locked_pose_gives_deviations() {
             .into_iter()
             .take(counts[0] * counts[1])
             .collect();
-        let options = Options { start: Start::Pose(raised), locked: [true; 6], ..Options::new(RADIUS_MM) };
+        let options = RegistrationOptions { start: Start::Pose(raised), locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&nominal, &centres, &options).unwrap();
         assert_eq!(pose_error_mm(&found.cmm_from_model, &raised), 0.0);
-        let at_truth = Options { start: Start::Pose(truth), ..options };
+        let at_truth = RegistrationOptions { start: Start::Pose(truth), ..options };
         let from_truth = register(&nominal, &centres, &at_truth).unwrap();
         for (raised, truth) in found.deviations.iter().zip(&from_truth.deviations) {
             // By hand: raised by 5 um along z, the surface is nearer by that times the normal's z.
@@ -286,7 +286,7 @@ fn locked_pose_gives_deviations() {
         }
         assert_eq!(found.quality.covariance.amax(), 0.0);
     }
-    let searched = Options { locked: [true; 6], ..Options::new(RADIUS_MM) };
+    let searched = RegistrationOptions { locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
     assert_eq!(register(&nominal, &cloud(WHOLE, [9, 5]), &searched).unwrap_err(), RegistrationError::Undetermined);
 }
 
@@ -300,14 +300,14 @@ fn trace_ends_with_reported_result() {
     for (k, height) in [(205, 0.4), (410, -0.1), (411, -0.1)] {
         bad[k] += truth.transform_direction(&Vector::z()) * height;
     }
-    let held = Options { start: Start::Pose(truth), locked: [true; 6], ..Options::new(RADIUS_MM) };
-    let at_truth = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
+    let held = RegistrationOptions { start: Start::Pose(truth), locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
+    let at_truth = RegistrationOptions { start: Start::Pose(truth), ..RegistrationOptions::new(RADIUS_MM) };
     for (name, measured, options) in [
-        ("searched", &clean, Options::new(RADIUS_MM)),
+        ("searched", &clean, RegistrationOptions::new(RADIUS_MM)),
         ("begun at the truth", &clean, at_truth),
-        ("with outliers", &bad, Options::new(RADIUS_MM)),
+        ("with outliers", &bad, RegistrationOptions::new(RADIUS_MM)),
         ("held", &clean, held),
-        ("robust", &bad, Options { loss: regrind_core::registration::Loss::Tukey, ..Options::new(RADIUS_MM) }),
+        ("robust", &bad, RegistrationOptions { loss: regrind_core::registration::Loss::Tukey, ..RegistrationOptions::new(RADIUS_MM) }),
     ] {
         let found = register(&nominal, measured, &options).unwrap();
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
@@ -331,7 +331,7 @@ fn no_verdict_when_points_contradict() {
                 *p += truth.transform_direction(&Vector::z()) * (0.02 + 0.03 * rng.random::<f64>());
             }
         }
-        let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
+        let found = register(&nominal, &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
         let why = found.unjudgeable_reason();
         assert_eq!(why.is_none(), is_judged, "{share}: {why:?}");
         assert_eq!(has_warning(&found, "contradict their neighbours"), !is_judged);

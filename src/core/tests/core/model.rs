@@ -13,7 +13,7 @@ use regrind_core::geometry::Pose;
 use regrind_core::model::{
     AngleInterval, BudgetEntry, Form, FormFigures, Interval, MachineUncertainty, ModelInputs, UncertaintySource,
 };
-use regrind_core::registration::{Coordinate, Deviation, Options, PointStatus, Registration, Start, register};
+use regrind_core::registration::{Coordinate, Deviation, RegistrationOptions, PointStatus, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
@@ -54,7 +54,7 @@ fn drifting(seed: u64, rms_mm: f64, drift: f64) -> Part {
         centre.iter_mut().zip(off_mm).for_each(|(v, off)| *v += off);
     }
     let truth = pose(&placement);
-    let options = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(truth), ..RegistrationOptions::new(RADIUS_MM) };
     let found = register(&free_form(409, 249), &points(&all), &options).unwrap();
     let model = Form::estimate(&found, &ModelInputs::default()).unwrap();
     Part { form, truth, registration: found, model }
@@ -153,7 +153,7 @@ fn many_points_bound_polynomial_corners() {
                 std::array::from_fn(|k| on[k] + (RADIUS_MM + form(x, y)) * up[k] + NOISE_MM * normal(&mut rng))
             })
             .collect();
-        let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+        let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&free_form(409, 249), &points(&touched), &options).unwrap();
         let [_, pv_mm] = figures(&after_best_fit(&found, |d| form(d.point.x, d.point.y)));
         let pv = Form::estimate(&found, &ModelInputs::default()).unwrap().figures.pv;
@@ -226,7 +226,7 @@ fn measured_by_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm:
         centre.iter_mut().for_each(|v| *v += NOISE_MM * normal(&mut rng));
     }
     let stated_mm = RADIUS_MM + radius_sigma_mm * normal(&mut rng);
-    let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(stated_mm) };
+    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(stated_mm) };
     (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
 }
 
@@ -273,7 +273,7 @@ fn held_with_offset(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
         centre.iter_mut().zip(by_mm).for_each(|(v, by)| *v += by + NOISE_MM * normal(&mut rng));
     }
     let locked = Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
-    let options = Options { start: Start::Pose(Pose::identity()), locked, ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), locked, ..RegistrationOptions::new(RADIUS_MM) };
     (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
 }
 
@@ -335,7 +335,7 @@ fn corrected_by_machine(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]
     } else {
         Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz])
     };
-    let options = Options { start: Start::Pose(Pose::identity()), locked: held, ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), locked: held, ..RegistrationOptions::new(RADIUS_MM) };
     let [looks, is] = [looks, is].map(|all| register(&free_form(409, 249), &points(&all), &options).unwrap());
     (looks, is)
 }
@@ -557,7 +557,7 @@ fn figures_independent_of_threads() {
     let placement = Placement::new([1.0, -2.0, 0.5], [0.3, -0.2, 0.5]);
     // Enough points that the sums are made of several blocks.
     let centres = centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [80, 65]);
-    let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
+    let options = RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
     let found = register(&free_form(409, 249), &points(&placed(&placement, &centres)), &options).unwrap();
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -2,7 +2,7 @@
 
 use crate::common::{RADIUS_MM, centres, placed, points, pose};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{Method, Options, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{Method, RegistrationOptions, ProbeSide, Registration, RegistrationError, Start, register};
 use regrind_core::surface::{
     DefinedSurface, FacetIndex, Nominal, NominalKind, OffsetSurface, PlaneProjection, Side, SurfaceError,
 };
@@ -36,8 +36,8 @@ fn normal_error_mm(found: &Pose, truth: &Pose, shape: &dyn Shape, half: [f64; 2]
         .fold(0.0, f64::max)
 }
 
-fn from_identity(probe_radius_mm: f64) -> Options {
-    Options { start: Start::Pose(Pose::identity()), ..Options::new(probe_radius_mm) }
+fn from_identity(probe_radius_mm: f64) -> RegistrationOptions {
+    RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(probe_radius_mm) }
 }
 
 fn weak_direction_words(found: &Registration) -> String {
@@ -50,7 +50,7 @@ fn register_off_axis_asphere() {
     let nominal = gridded(&shape, [80.0, 60.0], [401, 301]);
     let placement = Placement::new([30.0, -80.0, 12.0], [15.0, -100.0, 60.0]);
     let cloud = measured(&shape, [39.0, 29.0], [60, 45], &placement, 3e-4);
-    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [39.0, 29.0]);
     assert!(error < 2e-4, "{error} mm");
     // The parent is a surface of revolution about the line x = -70.
@@ -65,7 +65,7 @@ fn biconic_reports_alternative_pose() {
     let nominal = gridded(&shape, [60.0, 60.0], [301, 301]);
     let placement = Placement::new([-5.0, 8.0, 100.0], [3.0, 170.0, 40.0]);
     let cloud = measured(&shape, [29.0, 29.0], [45, 45], &placement, 3e-4);
-    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     // Half a turn about z carries the surface into itself: either pose is right, and the other one is named.
     let half_turn = Pose::exp(&regrind_core::geometry::Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
     let truths = [pose(&placement), pose(&placement) * half_turn];
@@ -197,7 +197,7 @@ fn register_hyper_hemisphere() {
         .fold(0.0, f64::max);
     assert!(worst < 2e-6, "{worst} mm");
     let placement = Placement::new([100.0, -40.0, 7.0], [30.0, 160.0, -70.0]);
-    let found = register(&nominal, &points(&placed(&placement, &exact)), &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &points(&placed(&placement, &exact)), &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let off = (pose(&placement).inverse() * found.cmm_from_model).log();
     assert!(off.fixed_rows::<3>(0).norm() < 1e-6 && off.fixed_rows::<3>(3).norm() < 1e-6, "{off}");
     assert!(matches!(
@@ -219,7 +219,7 @@ fn several_patches_are_one_surface() {
     let nominal = Nominal::from_patches(vec![part(-51.0, 1.0), part(-1.0, 51.0)]).unwrap();
     let placement = Placement::new([10.0, 5.0, 3.0], [5.0, -5.0, 8.0]);
     let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 0.0);
-    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
+    let found = register(&nominal, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     assert_eq!(found.quality.inliers, 1500);
     assert!(normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]) < 1e-7);
 }
@@ -229,7 +229,7 @@ fn folding_offset_refused_with_radius() {
     let bowl = Sphere { radius_mm: 1.2 };
     let nominal = gridded(&bowl, [1.2, 1.2], [61, 61]);
     let cloud = measured(&Sphere { radius_mm: 40.0 }, [0.5, 0.5], [10, 10], &Placement::IDENTITY, 0.0);
-    let mut options = Options { side: ProbeSide::Above, ..from_identity(0.3) };
+    let mut options = RegistrationOptions { side: ProbeSide::Above, ..from_identity(0.3) };
     // A probe that fits is not refused for folding.
     assert!(!matches!(
         register(&nominal, &cloud, &options),
@@ -286,8 +286,8 @@ fn formula_and_points_agree() {
     let mut cloud = centres(&shape, &form, [[-37.0, -27.0], [37.0, 27.0]], [80, 60]);
     cloud.retain(|c| (c[0] / 36.0).hypot(c[1] / 26.0) < 0.97);
     let cloud = points(&placed(&placement, &cloud));
-    let from_formula = register(&analytic, &cloud, &Options::new(RADIUS_MM)).unwrap();
-    let from_points = register(&gridded(&shape, [80.0, 60.0], [801, 601]), &cloud, &Options::new(RADIUS_MM)).unwrap();
+    let from_formula = register(&analytic, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
+    let from_points = register(&gridded(&shape, [80.0, 60.0], [801, 601]), &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let lifted = Pose { translation_mm: Vector::new(0.0, 0.0, lift), ..Pose::identity() };
     // Both hold the rotation about the parent's axis where their own search left it, so the surfaces are compared.
     let between =
@@ -304,7 +304,7 @@ fn robust_losses_from_start_pose() {
     let placement = Placement::new([0.3, -0.2, 0.25], [0.2, 0.1, -0.3]);
     let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 3e-4);
     for loss in [regrind_core::registration::Loss::Huber, regrind_core::registration::Loss::Tukey] {
-        let options = Options { loss, start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+        let options = RegistrationOptions { loss, start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&nominal, &cloud, &options).unwrap();
         let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]);
         assert!(error < 1e-4, "{loss:?}: {error} mm");
@@ -319,9 +319,9 @@ fn subtracted_radius_errs_by_micrometres() {
     let placement = Placement::new([0.1, -0.2, 0.15], [0.1, 0.05, -0.1]);
     let form = FormError::new(8, 30.0, 6.657e-3, 102.0, 62.0);
     let cloud = points(&placed(&placement, &centres(&shape, &form, [[-50.0, -30.0], [50.0, 30.0]], [90, 60])));
-    let offset = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
+    let offset = register(&nominal, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     // Fig. 12b: the facet is looked up below the centre.
-    let options = Options { method: Method::SubtractRadius, ..from_identity(RADIUS_MM) };
+    let options = RegistrationOptions { method: Method::SubtractRadius, ..from_identity(RADIUS_MM) };
     let subtracted = register(&nominal, &cloud, &options).unwrap();
     let (low, high) = subtracted
         .deviations

@@ -1,7 +1,7 @@
 //! Registration without an initial guess.
 
 use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
-use regrind_core::registration::{Options, register};
+use regrind_core::registration::{RegistrationOptions, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;
@@ -20,7 +20,7 @@ fn missed_poses(
         let placement = Placement::random(&mut rng, 500.0);
         let mut measured = placed(&placement, &centres);
         regrind_sim::probe::add_noise(&mut rng, &mut measured, 3e-4);
-        match register(&nominal, &points(&measured), &Options::new(RADIUS_MM)) {
+        match register(&nominal, &points(&measured), &RegistrationOptions::new(RADIUS_MM)) {
             Ok(found) => {
                 let error_mm = pose_error_mm(&found.cmm_from_model, &pose(&placement));
                 (error_mm > limit_mm).then(|| format!("{error_mm:.5} mm"))

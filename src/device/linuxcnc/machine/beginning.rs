@@ -9,29 +9,29 @@ use super::looking::standing_fault;
 use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
 use crate::error::{DeviceError, DeviceResult};
 use crate::linuxcnc::controller::{ControllerState, Interpreter};
-use crate::linuxcnc::program::{Program, ProgramRecord, RECORD, opening, path};
-use crate::linuxcnc::protocol::{Mode, Set};
+use crate::linuxcnc::program::{FramedProgram, ProgramRecord, RECORD, opening, path};
+use crate::linuxcnc::protocol::{ControllerMode, Set};
 use crate::linuxcnc::work::{ActiveJob, Stage};
-use crate::words::{Answer, Armed, Command, Fault, Job, State, Status};
+use crate::words::{Answer, Armed, MachineCommand, Fault, Job, MachineState, Status};
 
 impl LinuxcncGrinder {
-    pub(super) async fn prepare_program(&mut self, job: Job, program: Arc<Program>) -> DeviceResult<Armed> {
+    pub(super) async fn prepare_program(&mut self, job: Job, program: Arc<FramedProgram>) -> DeviceResult<Armed> {
         let (seen, _) = self.read_status().await?;
         self.check_ready(&seen)?;
         if !self.controller.has_control {
-            return Err(self.refused(Command::Prepare, Answer::NotOwner));
+            return Err(self.refused(MachineCommand::Prepare, Answer::NotOwner));
         }
         let name = program.name.clone();
         let before = self.in_folders(move |folders| folders.record(&name)).await?.unwrap_or_default();
         if before.begun > 0 {
-            return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
+            return Err(self.refused(MachineCommand::Prepare, Answer::AlreadyBegun));
         }
         let token = self.rng.random::<u32>().max(1);
         self.controller.errors().await?;
         self.open_record(&program, token).await?;
-        self.controller.enter(Mode::Auto, Command::Prepare).await?;
+        self.controller.enter(ControllerMode::Auto, MachineCommand::Prepare).await?;
         let path = self.path(&program);
-        self.controller.open(&path, Command::Prepare).await?;
+        self.controller.open(&path, MachineCommand::Prepare).await?;
         let sequence = u32::from(job.cycle).max(1);
         let (stage, requested_outcome, errors, round) = (Stage::Prepared, None, Vec::new(), (0, 0));
         self.job = Some(ActiveJob {
@@ -47,7 +47,7 @@ impl LinuxcncGrinder {
         });
         (self.began, self.duration_s, self.fault, self.clear_at) = (None, None, Fault::None, None);
         self.notes.clear();
-        self.last_state = Some(State::Prepared);
+        self.last_state = Some(MachineState::Prepared);
         Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
     }
 
@@ -55,7 +55,7 @@ impl LinuxcncGrinder {
     pub(super) fn check_ready(&self, seen: &ControllerState) -> DeviceResult<()> {
         match () {
             () if seen.stop_circuit_open || !seen.drives_on => {
-                let (state, fault) = (State::Faulted, standing_fault(seen).unwrap_or(Fault::None));
+                let (state, fault) = (MachineState::Faulted, standing_fault(seen).unwrap_or(Fault::None));
                 Err(DeviceError::Faulted { machine: self.machine(), state, fault })
             }
             () if seen.interpreter == Interpreter::Running => Err(self.unready("it runs a program")),
@@ -73,11 +73,11 @@ impl LinuxcncGrinder {
 
     /// Has the controller open the record and reads the token in it. This proves that both see one folder, that the
     /// controller can write in it, and that later lines of the record are of this preparation.
-    async fn open_record(&mut self, program: &Program, token: u32) -> DeviceResult<()> {
+    async fn open_record(&mut self, program: &FramedProgram, token: u32) -> DeviceResult<()> {
         let record = path(&self.folders.remote, &program.name, RECORD);
-        self.controller.enter(Mode::Mdi, Command::Prepare).await?;
+        self.controller.enter(ControllerMode::Mdi, MachineCommand::Prepare).await?;
         for line in opening(&record, token) {
-            self.controller.order(Set::Mdi(line), Command::Prepare).await?;
+            self.controller.order(Set::Mdi(line), MachineCommand::Prepare).await?;
         }
         let began = Instant::now();
         loop {
@@ -101,7 +101,7 @@ impl LinuxcncGrinder {
 
     /// Sends the start and waits until its effect is seen.
     pub(super) async fn send_start(&mut self) -> DeviceResult<Status> {
-        let heard = self.controller.order(Set::Run, Command::Start).await;
+        let heard = self.controller.order(Set::Run, MachineCommand::Start).await;
         let refused = match heard {
             Ok(()) => None,
             Err(refused @ (DeviceError::Refused { .. } | DeviceError::ControlTaken { .. })) => Some(refused),

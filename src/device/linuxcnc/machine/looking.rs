@@ -7,9 +7,9 @@ use tokio::time::Instant;
 use super::LinuxcncGrinder;
 use crate::error::DeviceResult;
 use crate::linuxcnc::controller::{ControllerState, Interpreter};
-use crate::linuxcnc::protocol::Mode;
+use crate::linuxcnc::protocol::ControllerMode;
 use crate::linuxcnc::work::{ActiveJob, Stage, Verdict};
-use crate::words::{Fault, Outcome, State, Status};
+use crate::words::{Fault, Outcome, MachineState, Status};
 
 /// Time without a change after which a running program that does not move is noted.
 const STANDSTILL_AFTER: Duration = Duration::from_secs(5);
@@ -111,7 +111,7 @@ impl LinuxcncGrinder {
         let blank = Status { clear_of_part: is_clear.then_some(true), ..Status::from_state(self.idle_state(seen)) };
         let (still, settles) = (Duration::ZERO, self.settings.record_timeout);
         let Some(work) = &mut self.job else { return Status { fault: standing_fault(seen), ..blank } };
-        let is_auto = Some(seen.mode == Mode::Auto);
+        let is_auto = Some(seen.mode == ControllerMode::Auto);
         let status = Status { job: Some(work.job), automatic: is_auto, ..blank.clone() };
         match work.stage {
             Stage::Ended(state, outcome) => {
@@ -122,25 +122,25 @@ impl LinuxcncGrinder {
                 Verdict::Foreign(state) => Status { state, ..blank },
                 Verdict::InState(state) => Status { state, progress: work.progress(seen.line), ..status },
                 // Its standstill is not known until the record is read or a person has confirmed it.
-                _ => Status { state: State::Execute, ..status },
+                _ => Status { state: MachineState::Execute, ..status },
             },
             Stage::Prepared if seen.interpreter != Interpreter::Idle => blank,
             Stage::Prepared if seen.stop_circuit_open || !seen.drives_on => {
                 Status { fault: standing_fault(seen), ..status }
             }
             Stage::Prepared if seen.program.as_deref() != Some(&work.path) => blank,
-            Stage::Prepared => Status { state: State::Prepared, ..status },
+            Stage::Prepared => Status { state: MachineState::Prepared, ..status },
         }
     }
 
     /// Returns the state when no job of ours is active.
-    fn idle_state(&self, seen: &ControllerState) -> State {
+    fn idle_state(&self, seen: &ControllerState) -> MachineState {
         match seen.interpreter {
-            Interpreter::Running => State::Execute,
-            Interpreter::Paused => State::Held,
-            Interpreter::Idle if self.aborted => State::Aborted,
-            Interpreter::Idle if seen.stop_circuit_open || !seen.drives_on => State::Faulted,
-            Interpreter::Idle => State::Idle,
+            Interpreter::Running => MachineState::Execute,
+            Interpreter::Paused => MachineState::Held,
+            Interpreter::Idle if self.aborted => MachineState::Aborted,
+            Interpreter::Idle if seen.stop_circuit_open || !seen.drives_on => MachineState::Faulted,
+            Interpreter::Idle => MachineState::Idle,
         }
     }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use regrind_core::geometry::Grid;
 use regrind_device::{
     Armed, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LinuxcncGrinder, LinuxcncSettings, Machine,
-    Pass, State, Status, digest, hex,
+    Pass, MachineState, Status, digest, hex,
 };
 use tempfile::TempDir;
 
@@ -126,7 +126,7 @@ pub fn job() -> Job {
 }
 
 /// Asks until it is in a state.
-pub async fn until(grinder: &mut LinuxcncGrinder, state: State) -> Status {
+pub async fn until(grinder: &mut LinuxcncGrinder, state: MachineState) -> Status {
     let mut last = None;
     for _ in 0..6000 {
         let status = grinder.status().await.unwrap();

@@ -3,7 +3,7 @@
 use std::fs;
 use std::time::Duration;
 
-use regrind_device::{DeviceError, Fault, Grinder, Interrupt, Machine, Outcome, Reconciled, State};
+use regrind_device::{DeviceError, Fault, Grinder, Interrupt, Machine, Outcome, Reconciled, MachineState};
 
 use crate::bench::{Bench, job, map, pass, program, to_and_fro, until};
 use crate::isolated::{Controller, Operator, PORT, give_away, with_controller};
@@ -58,7 +58,7 @@ on_a_controller! {
     program_completes_and_starts_once(_controller) {
         let bench = bench(&to_and_fro(40));
         let (mut grinder, armed) = bench.started().await;
-        let status = until(&mut grinder, State::Complete).await;
+        let status = until(&mut grinder, MachineState::Complete).await;
         assert_eq!((status.outcome, status.job, status.done), (Outcome::Complete, Some(job()), armed.start_sequence));
         assert_eq!((status.clear_of_part, bench.wrote("begin"), bench.wrote("end")), (Some(true), 1, 1));
         let record = grinder.collect(job(), &Interrupt::new()).await.unwrap();
@@ -66,7 +66,7 @@ on_a_controller! {
         assert!(record.duration_s.is_some_and(|s| s > 1.0), "{record:?}");
         // Once begun it is never begun again.
         refuses!(grinder.start(armed).await, DeviceError::Refused { .. });
-        assert_eq!(grinder.acknowledge(status.done).await.unwrap().state, State::Idle);
+        assert_eq!(grinder.acknowledge(status.done).await.unwrap().state, MachineState::Idle);
         grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
         refuses!(grinder.prepare(job()).await, DeviceError::Refused { answer: regrind_device::Answer::AlreadyBegun, .. });
         assert_eq!(bench.wrote("begin"), 1);
@@ -90,7 +90,7 @@ on_a_controller! {
                 assert_eq!(of, 3000);
                 furthest = furthest.max(done);
             }
-            if status.state == State::Complete {
+            if status.state == MachineState::Complete {
                 break;
             }
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -103,37 +103,37 @@ on_a_controller! {
         let bench = bench(&to_and_fro(60));
         let (mut grinder, _) = bench.started().await;
         grinder.hold().await.unwrap();
-        until(&mut grinder, State::Held).await;
+        until(&mut grinder, MachineState::Held).await;
         let mut operator = Operator::connect(PORT).await;
         // A moment for it to come to a stand.
         tokio::time::sleep(Duration::from_millis(300)).await;
         let stands = operator.ask("get abs_act_pos").await;
         tokio::time::sleep(Duration::from_millis(300)).await;
         assert_eq!(operator.ask("get abs_act_pos").await, stands);
-        assert_eq!(grinder.status().await.unwrap().state, State::Held);
+        assert_eq!(grinder.status().await.unwrap().state, MachineState::Held);
         refuses!(grinder.hold().await, DeviceError::Refused { .. });
         grinder.resume().await.unwrap();
-        until(&mut grinder, State::Execute).await;
-        assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
+        until(&mut grinder, MachineState::Execute).await;
+        assert_eq!(until(&mut grinder, MachineState::Complete).await.outcome, Outcome::Complete);
     }
 
     abort_then_clear_gives_idle(_controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         grinder.abort().await.unwrap();
-        let status = until(&mut grinder, State::Aborted).await;
+        let status = until(&mut grinder, MachineState::Aborted).await;
         assert_eq!((status.outcome, status.clear_of_part), (Outcome::Aborted, None));
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 0));
-        assert_eq!(grinder.clear().await.unwrap().state, State::Idle);
+        assert_eq!(grinder.clear().await.unwrap().state, MachineState::Idle);
     }
 
     stop_while_held(_controller) {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         grinder.hold().await.unwrap();
-        until(&mut grinder, State::Held).await;
+        until(&mut grinder, MachineState::Held).await;
         grinder.stop().await.unwrap();
-        assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Stopped);
+        assert_eq!(until(&mut grinder, MachineState::Complete).await.outcome, Outcome::Stopped);
     }
 
     wrong_program_folder_fails_load(controller) {
@@ -160,16 +160,16 @@ on_a_controller! {
     unparsable_program_faults(_controller) {
         let bench = bench(&program("F600\nG1 X1\nG1 X(\n"));
         let (mut grinder, _) = bench.started().await;
-        let status = until(&mut grinder, State::Faulted).await;
+        let status = until(&mut grinder, MachineState::Faulted).await;
         assert_eq!((status.outcome, status.fault), (Outcome::Failed, Some(Fault::Other(0))));
         assert!(grinder.notes().iter().any(|note| note.contains("Unclosed comment")), "{:?}", grinder.notes());
-        assert_eq!(grinder.clear().await.unwrap().state, State::Idle);
+        assert_eq!(grinder.clear().await.unwrap().state, MachineState::Idle);
     }
 
     travel_limit_faults(_controller) {
         let bench = bench(&program("F6000\nG1 X1\nG1 X500\n"));
         let (mut grinder, _) = bench.started().await;
-        let status = until(&mut grinder, State::Faulted).await;
+        let status = until(&mut grinder, MachineState::Faulted).await;
         assert_eq!((status.outcome, status.fault), (Outcome::Failed, Some(Fault::TravelLimit)));
         assert!(grinder.notes().iter().any(|note| note.contains("X's positive limit")), "{:?}", grinder.notes());
     }
@@ -184,7 +184,7 @@ on_a_controller! {
         // Another client took control to do so.
         refuses!(grinder.status().await, DeviceError::ControlTaken { .. });
         grinder.abort().await.unwrap();
-        let status = until(&mut grinder, State::Aborted).await;
+        let status = until(&mut grinder, MachineState::Aborted).await;
         assert_eq!((status.outcome, bench.wrote("end")), (Outcome::Aborted, 0));
         refuses!(grinder.clear().await, DeviceError::Faulted { fault: Fault::StopCircuit, .. });
         operator.make_ready().await;
@@ -196,7 +196,7 @@ on_a_controller! {
         let bench = bench(&to_and_fro(600));
         let (mut grinder, _) = bench.started().await;
         controller.open_the_stop_circuit();
-        let status = until(&mut grinder, State::Faulted).await;
+        let status = until(&mut grinder, MachineState::Faulted).await;
         assert_eq!((status.outcome, status.fault), (Outcome::Failed, Some(Fault::StopCircuit)));
         refuses!(grinder.clear().await, DeviceError::Faulted { fault: Fault::StopCircuit, .. });
         refuses!(grinder.hold().await, DeviceError::Refused { .. });
@@ -210,7 +210,7 @@ on_a_controller! {
         refuses!(grinder.hold().await, DeviceError::ControlTaken { .. });
         refuses!(grinder.claim().await, DeviceError::ControlTaken { .. });
         grinder.abort().await.unwrap();
-        assert_eq!(until(&mut grinder, State::Aborted).await.outcome, Outcome::Aborted);
+        assert_eq!(until(&mut grinder, MachineState::Aborted).await.outcome, Outcome::Aborted);
     }
 
     new_driver_adopts_active_program(_controller) {
@@ -223,7 +223,7 @@ on_a_controller! {
         assert_eq!(grinder.status().await.unwrap().job, Some(job()));
         grinder.claim().await.unwrap();
         assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::Running(status) if status.job == Some(job())));
-        assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
+        assert_eq!(until(&mut grinder, MachineState::Complete).await.outcome, Outcome::Complete);
         assert_eq!(grinder.collect(job(), &Interrupt::new()).await.unwrap().outcome, Outcome::Complete);
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 1));
     }
@@ -238,7 +238,7 @@ on_a_controller! {
         let mut grinder = bench.grinder();
         grinder.connect().await.unwrap();
         let Reconciled::Finished(status) = grinder.reconcile(&armed).await.unwrap() else { panic!() };
-        assert_eq!((status.state, status.outcome, status.done), (State::Complete, Outcome::Complete, armed.start_sequence));
+        assert_eq!((status.state, status.outcome, status.done), (MachineState::Complete, Outcome::Complete, armed.start_sequence));
     }
 
     reconcile_not_started(_controller) {
@@ -269,9 +269,9 @@ on_a_controller! {
         grinder.claim().await.unwrap();
         assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::Running(_)));
         grinder.hold().await.unwrap();
-        until(&mut grinder, State::Held).await;
+        until(&mut grinder, MachineState::Held).await;
         grinder.resume().await.unwrap();
-        assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
+        assert_eq!(until(&mut grinder, MachineState::Complete).await.outcome, Outcome::Complete);
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 1));
         again.kill().unwrap();
         again.wait().unwrap();
@@ -288,7 +288,7 @@ on_a_controller! {
         grinder.connect().await.unwrap();
         grinder.claim().await.unwrap();
         let Reconciled::Finished(status) = grinder.reconcile(&armed).await.unwrap() else { panic!() };
-        assert_eq!((status.state, status.outcome), (State::Aborted, Outcome::Aborted));
+        assert_eq!((status.state, status.outcome), (MachineState::Aborted, Outcome::Aborted));
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 0));
     }
 
@@ -299,7 +299,7 @@ on_a_controller! {
         let killed = std::process::Command::new("pkill").args(["-STOP", "-x", "milltask"]).status().unwrap();
         assert!(killed.success());
         // It is told as if all were well, until something is asked of it.
-        assert_eq!(grinder.status().await.unwrap().state, State::Execute);
+        assert_eq!(grinder.status().await.unwrap().state, MachineState::Execute);
         let error = grinder.abort().await.unwrap_err();
         assert!(matches!(error, DeviceError::TimedOut { .. }), "{error:?}");
     }
@@ -310,7 +310,7 @@ on_a_controller! {
         let (mut grinder, armed) = bench.prepared().await;
         let (mut sampler, file) = controller.sample();
         grinder.start(armed).await.unwrap();
-        until(&mut grinder, State::Complete).await;
+        until(&mut grinder, MachineState::Complete).await;
         tokio::time::sleep(Duration::from_millis(300)).await;
         sampler.kill().unwrap();
         sampler.wait().unwrap();
@@ -345,7 +345,7 @@ on_a_controller! {
         let mut grinder = bench.grinder();
         grinder.connect().await.unwrap();
         let status = grinder.claim().await.unwrap();
-        assert_eq!((status.state, status.fault), (State::Faulted, Some(Fault::Supplies)));
+        assert_eq!((status.state, status.fault), (MachineState::Faulted, Some(Fault::Supplies)));
         refuses!(grinder.load_pass(&map(), &pass(), &Interrupt::new()).await, DeviceError::Faulted { .. });
         assert_eq!(operator.ask("get machine").await, "MACHINE OFF");
     }

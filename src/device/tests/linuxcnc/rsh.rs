@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use regrind_device::{
     Answer, Armed, DeviceError, Fault as Told, Grinder, Interrupt, LinuxcncGrinder, Machine, OperatorConfirmation,
-    Outcome, Reconciled, State,
+    Outcome, Reconciled, MachineState,
 };
 use tokio::sync::Notify;
 
@@ -31,9 +31,9 @@ fn hasty(mut bench: Bench) -> Bench {
 async fn whole_pass_protocol_transcript() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.started().await;
-    assert_eq!(grinder.status().await.unwrap().state, State::Execute);
+    assert_eq!(grinder.status().await.unwrap().state, MachineState::Execute);
     fake.controller().end();
-    let status = until(&mut grinder, State::Complete).await;
+    let status = until(&mut grinder, MachineState::Complete).await;
     assert_eq!(
         (status.outcome, status.done, status.clear_of_part),
         (Outcome::Complete, armed.start_sequence, Some(true))
@@ -103,7 +103,7 @@ async fn unmatched_lines_ignored() {
     fake.controller().faults.extend(lines.map(|line| (line, Fault::Say(garbage))));
     let (mut grinder, _) = bench.started().await;
     fake.controller().end();
-    until(&mut grinder, State::Complete).await;
+    until(&mut grinder, MachineState::Complete).await;
     assert!(fake.controller().faults.is_empty());
 }
 
@@ -207,7 +207,7 @@ async fn prepare_refuses_begun_program() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     fake.controller().end();
-    let status = until(&mut grinder, State::Complete).await;
+    let status = until(&mut grinder, MachineState::Complete).await;
     grinder.acknowledge(status.done).await.unwrap();
     grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
     refuses!(grinder.prepare(job()).await, DeviceError::Refused { answer: Answer::AlreadyBegun, .. });
@@ -233,7 +233,7 @@ async fn abort_sent_during_pending_reply() {
         heard.has_heard("set abort").await;
     });
     aborted.unwrap();
-    until(&mut grinder, State::Aborted).await;
+    until(&mut grinder, MachineState::Aborted).await;
     let heard = fake.controller().heard.clone();
     let run = heard.iter().position(|line| line == "set run").unwrap();
     assert_eq!(heard[run + 1..run + 3], ["set enable EMCTOO", "set abort"]);
@@ -246,7 +246,7 @@ async fn abort_reconnects() {
     // Before anything was known of it, and after.
     fake.controller().faults.push(("set abort", Fault::Close));
     grinder.abort().await.unwrap();
-    assert_eq!(until(&mut grinder, State::Aborted).await.outcome, Outcome::Aborted);
+    assert_eq!(until(&mut grinder, MachineState::Aborted).await.outcome, Outcome::Aborted);
     fake.controller().faults.push(("get enable", Fault::Close));
     refuses!(grinder.status().await, DeviceError::Disconnected { .. });
     grinder.abort().await.unwrap();
@@ -260,7 +260,7 @@ async fn pause_after_program_end_is_undone() {
     grinder.status().await.unwrap();
     fake.controller().end();
     let status = grinder.hold().await.unwrap();
-    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete));
+    assert_eq!((status.state, status.outcome), (MachineState::Complete, Outcome::Complete));
     assert_eq!(fake.controller().interpreter, "IDLE");
     refuses!(grinder.hold().await, DeviceError::Refused { .. });
     assert_eq!(fake.controller().heard.iter().filter(|line| *line == "set pause").count(), 1);
@@ -271,10 +271,10 @@ async fn controller_error_faults_pass() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     fake.controller().fail("joint 1 following error");
-    let status = until(&mut grinder, State::Faulted).await;
+    let status = until(&mut grinder, MachineState::Faulted).await;
     assert_eq!((status.outcome, status.fault), (Outcome::Failed, Some(Told::Drive)));
     assert!(grinder.notes().iter().any(|note| note.contains("joint 1 following error")));
-    assert_eq!(grinder.clear().await.unwrap().state, State::Idle);
+    assert_eq!(grinder.clear().await.unwrap().state, MachineState::Idle);
 }
 
 #[tokio::test]
@@ -286,7 +286,7 @@ async fn stolen_control_is_not_reclaimed() {
     grinder.connect().await.unwrap();
     refuses!(grinder.claim().await, DeviceError::ControlTaken { .. });
     grinder.abort().await.unwrap();
-    assert_eq!((grinder.clear().await.unwrap().state, fake.controller().runs), (State::Idle, 0));
+    assert_eq!((grinder.clear().await.unwrap().state, fake.controller().runs), (MachineState::Idle, 0));
 }
 
 #[tokio::test]
@@ -321,7 +321,7 @@ async fn missing_record_needs_confirmation() {
         refuses!(grinder.confirm(word.clone()).await, DeviceError::ConfirmationNotNeeded { .. });
         fake.controller().end();
         for _ in 0..10 {
-            assert_eq!(grinder.status().await.unwrap().state, State::Execute);
+            assert_eq!(grinder.status().await.unwrap().state, MachineState::Execute);
             tokio::time::sleep(bench.settings.record_timeout / 2).await;
         }
         assert!(grinder.notes().iter().any(|note| note.contains("regrind confirm")));
@@ -329,7 +329,7 @@ async fn missing_record_needs_confirmation() {
         refuses!(grinder.confirm(other).await, DeviceError::NotAccepted { .. });
         grinder.confirm(word).await.unwrap();
         let status = grinder.status().await.unwrap();
-        assert_eq!((status.state, status.outcome), (State::Complete, outcome));
+        assert_eq!((status.state, status.outcome), (MachineState::Complete, outcome));
     }
 }
 
@@ -384,7 +384,7 @@ async fn run_pass(bench: &Bench, fake: &FakeServer) -> Outcome {
             }
             loop {
                 let status = grinder.status().await?;
-                if status.state == State::Complete {
+                if status.state == MachineState::Complete {
                     grinder.acknowledge(status.done).await?;
                     return Ok::<_, DeviceError>(status.outcome);
                 }
@@ -441,6 +441,6 @@ async fn new_driver_continues_active_pass() {
     let verdict = reconnect_and_reconcile(&mut grinder, Some(&armed)).await;
     assert!(matches!(verdict, Some(Reconciled::Running(status)) if status.job == Some(job())));
     fake.controller().end();
-    assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
+    assert_eq!(until(&mut grinder, MachineState::Complete).await.outcome, Outcome::Complete);
     assert_eq!(grinder.collect(job(), &Interrupt::new()).await.unwrap().done, armed.start_sequence);
 }

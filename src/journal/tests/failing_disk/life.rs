@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind_disk::Disk;
-use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, Kind, Reader, Record, Verified, verify};
+use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, RecordKind, Reader, Record, Verified, verify};
 use rusqlite::{Connection, OpenFlags};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -88,7 +88,7 @@ pub fn long() -> Vec<Step> {
 /// Record that the journal has acknowledged.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AcknowledgedRecord {
-    pub kind: Kind,
+    pub kind: RecordKind,
     pub mono_ns: u64,
     pub command_id: Option<u32>,
     /// Content of the record, or the member that identifies the record.
@@ -99,8 +99,8 @@ impl AcknowledgedRecord {
     pub fn from_record(record: &Record) -> Self {
         let value = record.value();
         let payload = match record.kind {
-            Kind::Artefact => value["name"].clone(),
-            Kind::End => value["ending"].clone(),
+            RecordKind::Artefact => value["name"].clone(),
+            RecordKind::End => value["ending"].clone(),
             _ => value,
         };
         Self { kind: record.kind, mono_ns: record.mono_ns, command_id: record.command_id, payload }
@@ -164,27 +164,27 @@ impl<'d> Life<'d> {
             }
             Step::Note(letters) => {
                 let payload = json!({ "words": words(number, letters) });
-                self.until_written(|| journal.append(entry(Kind::Note, payload.clone())));
-                (AcknowledgedRecord { kind: Kind::Note, mono_ns: number, command_id: None, payload }, self.id)
+                self.until_written(|| journal.append(entry(RecordKind::Note, payload.clone())));
+                (AcknowledgedRecord { kind: RecordKind::Note, mono_ns: number, command_id: None, payload }, self.id)
             }
             Step::Intend => {
                 let payload = json!({ "command": "register" });
-                let id = self.until_written(|| journal.intend(entry(Kind::Intent, payload.clone())));
+                let id = self.until_written(|| journal.intend(entry(RecordKind::Intent, payload.clone())));
                 assert!(Some(id) > self.id, "{}: command {id} after {:?}", self.at, self.id);
-                (AcknowledgedRecord { kind: Kind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
+                (AcknowledgedRecord { kind: RecordKind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
             }
             Step::Outcome => {
                 let (payload, command_id) = (json!({ "event": "registered" }), self.id);
-                let entry = Entry { command_id, ..entry(Kind::Outcome, payload.clone()) };
+                let entry = Entry { command_id, ..entry(RecordKind::Outcome, payload.clone()) };
                 self.until_written(|| journal.append(entry.clone()));
-                (AcknowledgedRecord { kind: Kind::Outcome, mono_ns: number, command_id, payload }, self.id)
+                (AcknowledgedRecord { kind: RecordKind::Outcome, mono_ns: number, command_id, payload }, self.id)
             }
             Step::Store(letters) => {
                 let (name, bytes) = (format!("cycle-1/{number}.csv"), words(number, letters));
                 self.until_written(|| journal.store(&name, bytes.as_bytes(), number, 1));
                 (
                     AcknowledgedRecord {
-                        kind: Kind::Artefact,
+                        kind: RecordKind::Artefact,
                         mono_ns: number,
                         command_id: None,
                         payload: json!(name),
@@ -196,7 +196,7 @@ impl<'d> Life<'d> {
                 self.until_written(|| journal.end(number, 1, json!("accepted")));
                 (
                     AcknowledgedRecord {
-                        kind: Kind::End,
+                        kind: RecordKind::End,
                         mono_ns: number,
                         command_id: None,
                         payload: json!("accepted"),
@@ -282,7 +282,7 @@ pub fn records(folder: &Path) -> Vec<Record> {
 
 /// Returns the records of a journal without the records that the journal writes by itself.
 pub fn read_acknowledged(folder: &Path) -> Vec<AcknowledgedRecord> {
-    let own = [Kind::Begin, Kind::Reopen, Kind::Seal];
+    let own = [RecordKind::Begin, RecordKind::Reopen, RecordKind::Seal];
     records(folder).iter().filter(|record| !own.contains(&record.kind)).map(AcknowledgedRecord::from_record).collect()
 }
 
@@ -291,14 +291,14 @@ pub fn is_gone_on_with(folder: &Path, key: Option<&AuditKey>, at: &str) {
     let before = records(folder);
     let mut journal = Journal::open_with(folder, key.cloned()).unwrap_or_else(|error| panic!("{at}: {error}"));
     let open: Vec<_> = journal.open_intents().unwrap().iter().map(|record| record.command_id).collect();
-    let answered = |id| before.iter().any(|record| record.kind == Kind::Outcome && record.command_id == id);
-    let intents: Vec<_> = before.iter().filter(|r| r.kind == Kind::Intent).map(|record| record.command_id).collect();
+    let answered = |id| before.iter().any(|record| record.kind == RecordKind::Outcome && record.command_id == id);
+    let intents: Vec<_> = before.iter().filter(|r| r.kind == RecordKind::Intent).map(|record| record.command_id).collect();
     let unanswered: Vec<_> = intents.iter().copied().filter(|id| !answered(*id)).collect();
     assert_eq!(open, unanswered, "{at}");
-    let id = journal.intend(Entry::new(Kind::Intent, 1000, 2, json!({ "command": "measure" }))).unwrap();
+    let id = journal.intend(Entry::new(RecordKind::Intent, 1000, 2, json!({ "command": "measure" }))).unwrap();
     assert!(intents.iter().all(|used| *used < Some(id)), "{at}: {id} after {intents:?}");
     journal.store("gone-on.csv", b"1,2\n", 1001, 2).unwrap();
-    journal.append(Entry::new(Kind::Note, 1002, 2, json!({ "words": words(1002, 5000) }))).unwrap();
+    journal.append(Entry::new(RecordKind::Note, 1002, 2, json!({ "words": words(1002, 5000) }))).unwrap();
     journal.close(1003, 2, json!("accepted")).unwrap();
     let verified = verified(folder, at);
     assert!(verified.closed && !verified.lacks_last_seal(), "{at}: {verified:?}");

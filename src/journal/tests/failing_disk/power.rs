@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use regrind_disk::{Cut, Disk, Fault, Operation, Outcome, SeededNumbers};
-use regrind_journal::{AuditKey, Entry, Journal, JournalError, Kind, Reader, verify};
+use regrind_journal::{AuditKey, Entry, Journal, JournalError, RecordKind, Reader, verify};
 use rusqlite::Connection;
 use serde_json::json;
 
@@ -32,7 +32,7 @@ fn is_sound(folder: &Path, cut: &Cut, told: &[AcknowledgedRecord], at: &str) -> 
 }
 
 fn note(k: u64) -> Entry {
-    Entry::new(Kind::Note, k, 1, json!({ "k": k }))
+    Entry::new(RecordKind::Note, k, 1, json!({ "k": k }))
 }
 
 /// Returns the outcomes to try for one cut.

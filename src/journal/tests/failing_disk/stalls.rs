@@ -5,13 +5,13 @@ use std::path::Path;
 use std::thread;
 
 use regrind_disk::{Disk, Operation};
-use regrind_journal::{AuditKey, Entry, Journal, Kind, verify};
+use regrind_journal::{AuditKey, Entry, Journal, RecordKind, verify};
 use serde_json::json;
 
 use crate::life::{Home, header, read_acknowledged, verified, words};
 
 fn note(k: u64) -> Entry {
-    Entry::new(Kind::Note, k, 1, json!({ "words": words(k, 200) }))
+    Entry::new(RecordKind::Note, k, 1, json!({ "words": words(k, 200) }))
 }
 
 /// Asserts that a reader sees all acknowledged records during the stall, and that the run is under way.

@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
 use regrind_journal::{
-    Anchor, AuditKey, Entry, ExternalEvidence, Journal, JournalError, Kind, PublicKey, Reader, Record, SEALED_EVERY,
+    Anchor, AuditKey, Entry, ExternalEvidence, Journal, JournalError, RecordKind, PublicKey, Reader, Record, SEALED_EVERY,
     Verified, canonical_json, sha256_hex, verify, verify_against,
 };
 use rusqlite::Connection;
@@ -17,7 +17,7 @@ use crate::tampering::{copied, place};
 use crate::written::{Home, closed, header, home, tamper};
 
 fn note(k: u64) -> Entry {
-    Entry::new(Kind::Note, k, 1, json!({ "k": k }))
+    Entry::new(RecordKind::Note, k, 1, json!({ "k": k }))
 }
 
 fn write_notes(journal: &mut Journal, numbers: Range<u64>) {
@@ -95,7 +95,7 @@ fn anchor_without_signing_key() {
     assert_eq!(anchor(&folder), Anchor::new(SEALED_EVERY + 1, records(&folder).pop().unwrap().hash));
     let verified = verify(&folder).unwrap();
     assert_eq!((verified.signed, verified.seals, verified.keys.len()), (0, 0, 0));
-    let refused = journal.append(Entry::new(Kind::Seal, 0, 0, json!({})));
+    let refused = journal.append(Entry::new(RecordKind::Seal, 0, 0, json!({})));
     assert!(matches!(refused, Err(JournalError::Entry { kind: "seal", .. })));
 }
 
@@ -123,7 +123,7 @@ fn forged(folder: &Path, from: u64, change: impl Fn(&mut Value)) {
         fields.remove("hash");
         if record.seq == from {
             change(&mut fields["payload"]);
-        } else if record.kind == Kind::Seal {
+        } else if record.kind == RecordKind::Seal {
             fields["payload"]["head"] = json!(head);
         }
         let text = canonical_json(&json!(fields));
@@ -275,7 +275,7 @@ fn failed_seal_written_once_later() {
         let verified = with_key(&folder, key.public()).unwrap();
         assert!(verified.closed && !verified.lacks_last_seal(), "{when}: {verified:?}");
         let last: Vec<_> = records(&folder).iter().rev().take(3).map(|r| r.kind).collect();
-        assert_eq!(last, [Kind::Seal, Kind::End, Kind::Note], "{when}");
+        assert_eq!(last, [RecordKind::Seal, RecordKind::End, RecordKind::Note], "{when}");
     }
 }
 
@@ -291,9 +291,9 @@ fn failed_record_written_once() {
         journal.append(note(500)).unwrap_err();
         database.execute_batch("DROP TRIGGER refused").unwrap();
         assert_eq!(journal.append(note(500)).unwrap(), SEALED_EVERY + 2, "{when}");
-        let command = Entry::new(Kind::Intent, 501, 1, json!({}));
+        let command = Entry::new(RecordKind::Intent, 501, 1, json!({}));
         assert_eq!(journal.intend(command).unwrap(), 1);
-        let notes = records(&folder).iter().filter(|r| r.mono_ns == 500 && r.kind == Kind::Note).count();
+        let notes = records(&folder).iter().filter(|r| r.mono_ns == 500 && r.kind == RecordKind::Note).count();
         assert_eq!((notes, seals(&folder).len()), (1, 2), "{when}");
         verify(&folder).unwrap();
     }

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind_journal::{AuditKey, Entry, ExternalEvidence, Journal, JournalError, Kind, Reader, verify, verify_against};
+use regrind_journal::{AuditKey, Entry, ExternalEvidence, Journal, JournalError, RecordKind, Reader, verify, verify_against};
 use rusqlite::Connection;
 use serde_json::json;
 
@@ -51,7 +51,7 @@ fn reopen_after_cut_reuses_no_number() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
-    let first = journal.intend(Entry::new(Kind::Intent, 1, 1, json!({}))).unwrap();
+    let first = journal.intend(Entry::new(RecordKind::Intent, 1, 1, json!({}))).unwrap();
     assert!(matches!(Journal::open(&folder).map(|_| ()), Err(JournalError::Busy { .. })), "two writers");
     assert_eq!(verify(&folder).unwrap().open_intents, [first], "read while it is written");
     // The folder as a power cut would leave it: nothing was closed.
@@ -62,7 +62,7 @@ fn reopen_after_cut_reuses_no_number() {
     }
     let mut again = Journal::open(&copy).unwrap();
     assert_eq!(again.open_intents().unwrap().iter().map(|r| r.command_id).collect::<Vec<_>>(), [Some(first)]);
-    assert_eq!(again.intend(Entry::new(Kind::Intent, 1, 1, json!({}))).unwrap(), first + 1);
+    assert_eq!(again.intend(Entry::new(RecordKind::Intent, 1, 1, json!({}))).unwrap(), first + 1);
 }
 
 #[test]
@@ -71,9 +71,9 @@ fn open_intents_without_index() {
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
     for k in 0..4 {
-        let id = journal.intend(Entry::new(Kind::Intent, k, 1, json!({}))).unwrap();
+        let id = journal.intend(Entry::new(RecordKind::Intent, k, 1, json!({}))).unwrap();
         if k % 2 == 0 {
-            let outcome = Entry { command_id: Some(id), ..Entry::new(Kind::Outcome, k, 1, json!({})) };
+            let outcome = Entry { command_id: Some(id), ..Entry::new(RecordKind::Outcome, k, 1, json!({})) };
             journal.append(outcome.clone()).unwrap();
             journal.append(Entry { mono_ns: 9, ..outcome }).unwrap();
         }
@@ -83,7 +83,7 @@ fn open_intents_without_index() {
     let mut journal = Journal::open(&folder).unwrap();
     let open: Vec<_> = journal.open_intents().unwrap().iter().map(|record| record.command_id).collect();
     assert_eq!(open, [Some(2), Some(4)]);
-    assert_eq!(journal.intend(Entry::new(Kind::Intent, 9, 1, json!({}))).unwrap(), 5);
+    assert_eq!(journal.intend(Entry::new(RecordKind::Intent, 9, 1, json!({}))).unwrap(), 5);
 }
 
 #[test]
@@ -148,7 +148,7 @@ fn part_of_a_writer() {
     let mut journal = Journal::create(folder, header()).unwrap();
     for cycle in 0.. {
         let payload = json!({ "words": "x".repeat(cycle as usize % 3000) });
-        let seq = journal.append(Entry::new(Kind::Event, 0, cycle, payload)).unwrap();
+        let seq = journal.append(Entry::new(RecordKind::Event, 0, cycle, payload)).unwrap();
         println!("\nacknowledged {seq}");
     }
 }
@@ -177,7 +177,7 @@ fn killed_writer_loses_no_record() {
         assert!(!verified.closed);
         let mut journal = Journal::open(&folder).unwrap();
         assert_eq!(journal.last_seq(), verified.records + 1, "the lock was free and nothing was lost");
-        journal.append(Entry::new(Kind::Note, 0, 0, json!("gone on"))).unwrap();
+        journal.append(Entry::new(RecordKind::Note, 0, 0, json!("gone on"))).unwrap();
         journal.close(0, 0, json!("accepted")).unwrap();
         assert!(verify(&folder).unwrap().closed);
     }
@@ -192,24 +192,24 @@ fn part_of_a_writer_on_a_small_disk() {
     std::fs::write(&ballast, vec![0; 128 << 10]).unwrap();
     let folder = disk.join("run");
     let mut journal = Journal::create_with(&folder, header(), Some(AuditKey::new())).unwrap();
-    let event = |k: u64| Entry::new(Kind::Event, k, 1, json!({ "words": "x".repeat(2000) }));
+    let event = |k: u64| Entry::new(RecordKind::Event, k, 1, json!({ "words": "x".repeat(2000) }));
     let full =
         (0..10_000).find_map(|k| journal.append(event(k)).err()).expect("the disk was large enough for everything");
     assert!(full.is_disk_full(), "{full:?}");
     assert!(full.to_string().contains("free space"), "{full}");
     // Until there is no room for a short record either.
-    let short = |k: u64| Entry::new(Kind::Event, k, 2, json!({}));
+    let short = |k: u64| Entry::new(RecordKind::Event, k, 2, json!({}));
     (0..10_000).find_map(|k| journal.append(short(k)).err()).expect("the disk was large enough for everything");
     let acknowledged = journal.last_seq();
     assert_eq!(verify(&folder).unwrap().records, acknowledged, "read on a full disk");
-    let refused = journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap_err();
+    let refused = journal.intend(Entry::new(RecordKind::Intent, 0, 1, json!({}))).unwrap_err();
     assert!(refused.is_disk_full(), "a command is not on record, so it is not carried out: {refused:?}");
     let refused = journal.store("large.csv", &[b'1'; 256 << 10], 0, 1).unwrap_err();
     assert!(refused.is_disk_full(), "{refused:?}");
     assert_eq!(std::fs::read_dir(&folder).unwrap().filter(|f| is_named(f, "large")).count(), 0, "half a file");
     std::fs::remove_file(ballast).unwrap();
     assert_eq!(journal.append(event(0)).unwrap(), acknowledged + 1, "room again: the run goes on");
-    assert_eq!(journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap(), 1, "no number was used up");
+    assert_eq!(journal.intend(Entry::new(RecordKind::Intent, 0, 1, json!({}))).unwrap(), 1, "no number was used up");
     journal.close(0, 1, json!("stopped")).unwrap();
     let verified = verify(&folder).unwrap();
     // The event, the command, the end and its seal; the first seal stands behind the beginning.
@@ -277,7 +277,7 @@ fn read_only_folder_refuses_writer() {
     let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
-    journal.append(Entry::new(Kind::Note, 0, 0, json!("x"))).unwrap();
+    journal.append(Entry::new(RecordKind::Note, 0, 0, json!("x"))).unwrap();
     let anchor = journal.close(0, 0, json!("stopped")).unwrap();
     make_read_only(&folder, true);
     let verified = verify(&folder);
@@ -324,6 +324,6 @@ fn reader_finds_appended_records() {
     let mut records = reader.records(0);
     for seq in 1..40 {
         assert_eq!(records.next().unwrap().unwrap().seq, seq);
-        assert_eq!(journal.append(Entry::new(Kind::Note, 0, 0, json!(seq))).unwrap(), seq + 1);
+        assert_eq!(journal.append(Entry::new(RecordKind::Note, 0, 0, json!(seq))).unwrap(), seq + 1);
     }
 }

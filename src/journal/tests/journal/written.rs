@@ -4,7 +4,7 @@ use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use ed25519_compact::{KeyPair, Seed};
-use regrind_journal::{Anchor, AuditKey, Entry, Header, Journal, Kind, Reader, canonical_json, sha256_hex};
+use regrind_journal::{Anchor, AuditKey, Entry, Header, Journal, RecordKind, Reader, canonical_json, sha256_hex};
 use rusqlite::Connection;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -50,11 +50,11 @@ pub fn closed() -> (Home, PathBuf, Anchor) {
     let folder = home.path().join("runs/run-1");
     let mut journal = Journal::create(&folder, header()).unwrap();
     for cycle in 1..4 {
-        let id = journal.intend(Entry::new(Kind::Intent, 5, cycle, json!({ "command": "register" }))).unwrap();
+        let id = journal.intend(Entry::new(RecordKind::Intent, 5, cycle, json!({ "command": "register" }))).unwrap();
         journal
             .append(Entry {
                 command_id: Some(id),
-                ..Entry::new(Kind::Outcome, 6, cycle, json!({ "z": 1.5, "a": "ü\n" }))
+                ..Entry::new(RecordKind::Outcome, 6, cycle, json!({ "z": 1.5, "a": "ü\n" }))
             })
             .unwrap();
         journal.store(&format!("cycle-{cycle}/measured.csv"), b"1,2,3\n", 7, cycle).unwrap();
