@@ -8,7 +8,7 @@ use divan::Bencher;
 use nalgebra::DMatrix;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{DensePosterior, Field, Form, Hyperparameters, IncrementalPosterior, ModelInputs, Observations};
-use regrind::registration::{RegistrationOptions, Registration, Start, register};
+use regrind::registration::{Registration, RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{add_noise, centre};

@@ -11,7 +11,7 @@ use std::sync::LazyLock;
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use regrind::geometry::{Point, Pose};
-use regrind::registration::{RegistrationOptions, Registration, Start, register};
+use regrind::registration::{Registration, RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, centre};

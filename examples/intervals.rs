@@ -16,7 +16,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{Form, Interval, ModelInputs};
-use regrind::registration::{Deviation, RegistrationOptions, PointStatus, Start, register};
+use regrind::registration::{Deviation, PointStatus, RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};

@@ -22,7 +22,7 @@ use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose, Twist, Vector, fit_rigid};
 use regrind::registration::{
-    Deviation, Method, RegistrationOptions, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
+    Deviation, Method, PointStatus, ProbeSide, Registration, RegistrationError, RegistrationOptions, Start, register,
 };
 use regrind::report::{Axis, ColourMap, HeatMap, Plot, Scale, Series};
 use regrind::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, PlaneProjection, Side};
@@ -496,7 +496,11 @@ fn subtracting_the_radius(
 ) -> Outcome {
     heading("fig. 12b: centres on the nominal surface, the radius subtracted");
     for (distance, name) in [(DistanceModel::Triangle, "flat triangles"), (DistanceModel::Curved, "curved triangles")] {
-        let options = RegistrationOptions { method: Method::SubtractRadius, rms_limit_mm: Some(10.0), ..as_in_the_paper(distance) };
+        let options = RegistrationOptions {
+            method: Method::SubtractRadius,
+            rms_limit_mm: Some(10.0),
+            ..as_in_the_paper(distance)
+        };
         let found: Result<_, RegistrationError> = register(nominal, &measured.centres, &options);
         let found = match found {
             Ok(found) => found,

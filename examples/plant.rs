@@ -20,8 +20,8 @@ use std::time::Instant;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind::config::PlantConfig;
-use regrind::journal::{RecordKind, Reader, Record, restore, restore_file, sha256_hex};
-use regrind_plant::{DatabaseSettings, DatabaseLink, Replicator, enrol_cell};
+use regrind::journal::{Reader, Record, RecordKind, restore, restore_file, sha256_hex};
+use regrind_plant::{DatabaseLink, DatabaseSettings, Replicator, enrol_cell};
 
 const PASSWORD: &str = "for-measuring";
 

@@ -170,7 +170,8 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         next.iter().for_each(|&k| tried[k] = Some(batch));
         touched.extend(&next);
         let cloud: Vec<Point> = touched.iter().map(|&k| centres[k]).collect();
-        let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
+        let options =
+            RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(nominal, &cloud, &options).expect("a registration");
         let so_far = PartialMeasurement { targets: &targets, tried: &tried, touched: &touched };
         let decision = decide(&found, &given, &so_far, &adaptive.stopping_criteria(true), seed).expect("a model");

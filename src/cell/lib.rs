@@ -44,4 +44,4 @@ pub use interval::RecordedInterval;
 pub use judge::{ComparedFigure, Conformity};
 pub use plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};
-pub use table::{Reaction, TransitionRow, TABLE_VERSION, sample_events, transition_table};
+pub use table::{Reaction, TABLE_VERSION, TransitionRow, sample_events, transition_table};

@@ -93,7 +93,9 @@ pub fn transition_table() -> Vec<TransitionRow> {
             rows.entry((state, name)).or_default().extend(answers.into_iter().map(Reaction::from_labels));
         }
     }
-    rows.into_iter().map(|((state, event), answers)| TransitionRow { state, event: event.to_owned(), answers }).collect()
+    rows.into_iter()
+        .map(|((state, event), answers)| TransitionRow { state, event: event.to_owned(), answers })
+        .collect()
 }
 
 /// Returns everything that decides the answer of a cell, without times and counts, and only as fine as the table needs.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use regrind::journal::{
-    Anchor, DATABASE, ExternalEvidence, JournalError, RecordKind, PublicKey, Reader, Record, Verified, verify_against,
+    Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};

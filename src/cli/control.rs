@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
 use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, is_live, send_request};
-use regrind::journal::{RecordKind, MachineLock, Reader};
+use regrind::journal::{MachineLock, Reader, RecordKind};
 use regrind_control::{is_live_at, send_request_at};
 
 use super::Outcome;

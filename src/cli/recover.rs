@@ -7,9 +7,9 @@ use std::time::{Duration, SystemTime};
 use clap::Args;
 use regrind::cell::{Actor, Device};
 use regrind::config::{CellConfig, LinkConfig};
-use regrind::device::{Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, MachineState};
+use regrind::device::{Machine, MachineKind, MachineState, ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::recovery::{self, RecoveryError, RecoveryStep, describe_status, read_status};
-use regrind::journal::{Header, Journal, RecordKind, MachineLock, Reader};
+use regrind::journal::{Header, Journal, MachineLock, Reader, RecordKind};
 use regrind::setup;
 use serde_json::json;
 

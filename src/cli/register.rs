@@ -10,7 +10,7 @@ use regrind::formats::{
 };
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, Interval, IsoFigures, ModelInputs, SlopeFigures};
-use regrind::registration::{Coordinate, Loss, Method, RegistrationOptions, ProbeSide, Start, register};
+use regrind::registration::{Coordinate, Loss, Method, ProbeSide, RegistrationOptions, Start, register};
 use regrind::surface::{DistanceModel, Nominal, NominalKind, PlaneProjection};
 
 use super::choice::word_of;

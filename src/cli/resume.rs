@@ -11,7 +11,8 @@ use regrind::config::CellConfig;
 use regrind::drive::{InterruptedRun, Request, Task};
 use regrind::formats::{FormatError, Learned};
 use regrind::journal::{
-    Artefact, DATABASE, Entry, Journal, JournalError, RecordKind, LOCK, Reader, RunLock, may_be_lost, newest_cycle, verify,
+    Artefact, DATABASE, Entry, Journal, JournalError, LOCK, Reader, RecordKind, RunLock, may_be_lost, newest_cycle,
+    verify,
 };
 use regrind::recipe::Recipe;
 use regrind::setup;

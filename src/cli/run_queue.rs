@@ -8,9 +8,9 @@ use clap::Args;
 use regrind::config::{BUILT_IN_CELL, PlantConfig};
 use regrind::drive::is_live;
 use regrind::formats::{ResultFolder, write_atomic};
-use regrind::journal::{DATABASE, RecordKind, Reader};
+use regrind::journal::{DATABASE, Reader, RecordKind};
 use regrind::recipe::Recipe;
-use regrind_plant::{LEASE, Lease, DatabaseLink, PlantError, PlantRecipe, StartedPart};
+use regrind_plant::{DatabaseLink, LEASE, Lease, PlantError, PlantRecipe, StartedPart};
 
 use super::failure::Failure;
 use super::{Outcome, check, plant, recover, run as making};
@@ -185,7 +185,12 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
 
 /// Returns true if a person at the cell confirms the part, or if the recipe needs no confirmation. Renews the lease
 /// while it waits.
-async fn confirmed(link: &DatabaseLink, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
+async fn confirmed(
+    link: &DatabaseLink,
+    lease: &Lease,
+    recipe: &Recipe,
+    arguments: &Arguments,
+) -> Result<bool, Failure> {
     if let Some(serial) = &arguments.part {
         return Ok(*serial == lease.serial);
     }

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use crate::{Coordinates, Measurement, Plan, TouchStatus, TargetKind};
+use crate::{Coordinates, Measurement, Plan, TargetKind, TouchStatus};
 use regrind_core::geometry::{Point, Vector, fit_rigid};
 
 /// Reason why a measurement does not belong to the plan.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{Answer, MachineCommand, Fault, Job, MachineKind, MachineState};
+use super::{Answer, Fault, Job, MachineCommand, MachineKind, MachineState};
 
 /// Answer of a machine, or the reason why there is no answer.
 pub(super) type DeviceResult<T> = Result<T, DeviceError>;

@@ -57,8 +57,8 @@ pub use modbus::{
     ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
 pub use payload::{
-    CarefulStart, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, TouchStatus,
-    PreliminaryPoints, PlanTarget, TargetKind,
+    CarefulStart, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PlanTarget,
+    PreliminaryPoints, TargetKind, TouchStatus,
 };
 pub use place::MachineTable;
 pub use range::{RANGES, ValueRange};
@@ -67,6 +67,6 @@ pub use table::{AnyCmm, AnyGrinder, Wire};
 pub use wiring::{DriverContext, DriverError, DriverFactory, Timing};
 pub use words::hex;
 pub use words::{
-    Answer, Armed, BatchId, MachineCommand, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled,
-    SignalValue, Started, MachineState, Status, digest,
+    Answer, Armed, BatchId, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation,
+    Outcome, Reconciled, SignalValue, Started, Status, digest,
 };

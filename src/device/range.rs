@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::{DeviceError, Measurement, PassRecord, TouchStatus, SignalValue};
+use super::{DeviceError, Measurement, PassRecord, SignalValue, TouchStatus};
 
 /// Possible range of a value.
 #[derive(Clone, Copy, Debug, PartialEq)]

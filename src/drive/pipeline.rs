@@ -18,7 +18,7 @@ use crate::compensation::{
     self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map,
     estimate_response,
 };
-use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TouchStatus, TargetKind};
+use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TargetKind, TouchStatus};
 use crate::form::pv_998;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
@@ -27,7 +27,7 @@ use crate::formats::{
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
 use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
-use crate::registration::{RegistrationOptions, PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
+use crate::registration::{PointStatus as Fate, Registration, RegistrationOptions, RegistrationQuality, map_obstacle};
 
 use super::adaptive_measurement;
 use super::cycle_output;

@@ -3,7 +3,7 @@
 
 use regrind_control::PreviewStatistics;
 
-use crate::device::{Coordinates, Job, MeasuredPoint, Plan, TouchStatus, PreliminaryPoints, TargetKind};
+use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PreliminaryPoints, TargetKind, TouchStatus};
 
 /// Sums over the touches of the part received for a job so far.
 #[derive(Debug, Default)]

@@ -149,7 +149,8 @@ async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError
 pub fn describe_status(status: &Status) -> String {
     let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
     let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
-    let result = if status.state == MachineState::Complete { format!(", result {}", status.done) } else { String::new() };
+    let result =
+        if status.state == MachineState::Complete { format!(", result {}", status.done) } else { String::new() };
     format!("{}{job}{fault}{result}", status.state)
 }
 

@@ -32,7 +32,7 @@ use super::{Computation, Task, batch_folder, create_folder, cycle_folder};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
-use crate::journal::{Artefact, JournalError, RecordKind, Reader, Record, sha256_hex};
+use crate::journal::{Artefact, JournalError, Reader, Record, RecordKind, sha256_hex};
 
 /// Folder for the repeated computations, below the run folder; removed afterwards.
 const SCRATCH: &str = "replay";

@@ -20,9 +20,9 @@ use crate::cell::{
     Reconciliation,
 };
 use crate::device::{
-    Armed, BatchId, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement,
-    OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue, MachineState, Status,
-    digest,
+    Armed, BatchId, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, MachineState,
+    Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue,
+    Status, digest,
 };
 
 /// Request to a machine. The answers are the events that [`crate::cell::Command`] names.
@@ -850,7 +850,9 @@ impl<B: StationDriver> MachineTask<B> {
                 }
                 self.report_progress(status).await;
             }
-            MachineState::Held if before != Some(MachineState::Held) => self.report(Event::MachineHeld { device: B::DEVICE }).await,
+            MachineState::Held if before != Some(MachineState::Held) => {
+                self.report(Event::MachineHeld { device: B::DEVICE }).await
+            }
             MachineState::Complete => self.finish_job(status).await,
             MachineState::Idle if self.observed.stopping => {
                 self.observed.stopping = false;
@@ -883,7 +885,9 @@ impl<B: StationDriver> MachineTask<B> {
         if at_a_job && !is_another {
             (self.observed.at_job, self.observed.reads_without_job) = (true, 0);
         }
-        if !self.observed.at_job || !(matches!(status.state, MachineState::Idle | MachineState::Prepared) || at_a_job && is_another) {
+        if !self.observed.at_job
+            || !(matches!(status.state, MachineState::Idle | MachineState::Prepared) || at_a_job && is_another)
+        {
             return;
         }
         self.observed.reads_without_job += 1;

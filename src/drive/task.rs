@@ -16,7 +16,7 @@ use crate::geometry::{DeviationSample, Grid, Point, Pose, Vector};
 use crate::measuring::{self, ThermalExpansion, sphere_targets};
 use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
 use crate::registration::{
-    Deviation, MapLimits, Method, RegistrationOptions, PointStatus, Registration, RegistrationError, Start, register,
+    Deviation, MapLimits, Method, PointStatus, Registration, RegistrationError, RegistrationOptions, Start, register,
 };
 use crate::surface::Nominal;
 

@@ -9,7 +9,7 @@ use super::error::FormatError;
 use super::registration::{DeviationRow, write_column, write_deviations, write_json_atomic};
 use regrind_core::geometry::Pose;
 use regrind_core::registration::{
-    Deviation, Iteration, Loss, Method, RegistrationOptions, PointStatus, Registration, WeakDirection,
+    Deviation, Iteration, Loss, Method, PointStatus, Registration, RegistrationOptions, WeakDirection,
 };
 use regrind_core::surface::{DistanceModel, Side};
 

@@ -40,7 +40,8 @@ use std::path::Path;
 
 pub use columns::{Columns, Table, Unit};
 pub use document::{
-    Alternative, MeasuredInput, NominalInput, ProgramVersion, RegistrationDocument, StandardUncertainty, save_registration,
+    Alternative, MeasuredInput, NominalInput, ProgramVersion, RegistrationDocument, StandardUncertainty,
+    save_registration,
 };
 pub use error::FormatError;
 pub use figures::write_figures;

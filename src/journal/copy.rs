@@ -82,7 +82,7 @@ pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), Jou
 
 #[cfg(test)]
 mod tests {
-    use super::super::{AuditKey, Entry, ExternalEvidence, Header, Journal, RecordKind, Reader, verify_against};
+    use super::super::{AuditKey, Entry, ExternalEvidence, Header, Journal, Reader, RecordKind, verify_against};
     use super::*;
     use serde_json::json;
 

@@ -48,7 +48,7 @@ pub use key::{AuditKey, PublicKey};
 pub use lost::{may_be_lost, newest_cycle};
 pub use machine::MachineLock;
 pub use open::{free_bytes, is_open_to_all};
-pub use record::{Entry, RecordKind, Record, Records};
+pub use record::{Entry, Record, RecordKind, Records};
 pub use seal::SEALED_EVERY;
 pub use verify::{Anchor, ExternalEvidence, Verified, anchor_of, is_driven, verify, verify_against};
 pub use write::{Header, Journal, RunLock};

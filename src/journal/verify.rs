@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::artefact::{Artefact, describe, path_within, temporary_name};
 use super::error::JournalError;
 use super::key::PublicKey;
-use super::record::{RecordKind, Record};
+use super::record::{Record, RecordKind};
 use super::seal::{Seal, is_signed};
 use super::{ANCHOR, DATABASE, LOCK, Reader};
 

@@ -14,7 +14,7 @@ use super::clock::utc;
 use super::error::JournalError;
 use super::key::AuditKey;
 use super::locked_file::LockedFile;
-use super::record::{Entry, RecordKind, Record, Records, signed, whole};
+use super::record::{Entry, Record, RecordKind, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
 use super::{ANCHOR, DATABASE, LOCK, open, system};

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use regrind_journal::{
-    Anchor, ExternalEvidence, JournalError, RecordKind, PublicKey, Reader, Record, Verified, restore, restore_file,
+    Anchor, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, restore, restore_file,
     verify_against,
 };
 use serde_json::Value;

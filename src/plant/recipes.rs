@@ -126,7 +126,11 @@ impl PlantRecipe {
     /// # Errors
     /// The recipe does not match its hash, too few people have signed it, or it was withdrawn; the plant receives a
     /// report of this. Or the plant cannot be reached.
-    pub async fn pull(link: &DatabaseLink, sha256: &str, approvers: &[Approver]) -> Result<(Self, Vec<String>), PlantError> {
+    pub async fn pull(
+        link: &DatabaseLink,
+        sha256: &str,
+        approvers: &[Approver],
+    ) -> Result<(Self, Vec<String>), PlantError> {
         let bytes = unhex(sha256).unwrap_or_default();
         let text = "SELECT name, version, text, names, contents, persons, keys, signatures FROM pull_recipe($1)";
         let row = link.client().query_opt(text, &[&bytes]).await.map_err(refused("a recipe"))?;

@@ -15,7 +15,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind_formats::{LEARNED, ResultFolder, write_atomic};
-use regrind_journal::{DATABASE, RecordKind, Reader, Record, Stamp, sha256_hex, stamp};
+use regrind_journal::{DATABASE, Reader, Record, RecordKind, Stamp, sha256_hex, stamp};
 use regrind_report::{RunResult, RunSummary, run_summary};
 use serde_json::{Value, json};
 use tokio_postgres::types::ToSql;
@@ -134,7 +134,8 @@ impl Replicator {
             there = send_records(link, name, there, &batch).await?;
         }
         let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
-        let is_over = || Ok::<_, PlantError>(matches!(last.kind, RecordKind::End | RecordKind::Seal) && has_end(&folder, &last)?);
+        let is_over =
+            || Ok::<_, PlantError>(matches!(last.kind, RecordKind::End | RecordKind::Seal) && has_end(&folder, &last)?);
         if there.records > began_with || is_over()? {
             report_run(link, there.id, &run_overview(&folder)?).await?;
         }
@@ -254,7 +255,12 @@ async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, Plan
 }
 
 /// Compares a journal with the plant's copy, and reports a difference to the plant.
-async fn compare_with_plant(link: &DatabaseLink, folder: &Path, run: &str, there: &PlantRunState) -> Result<(), PlantError> {
+async fn compare_with_plant(
+    link: &DatabaseLink,
+    folder: &Path,
+    run: &str,
+    there: &PlantRunState,
+) -> Result<(), PlantError> {
     let copy = PlantRun {
         id: there.id,
         cell: String::new(),

@@ -130,7 +130,12 @@ impl StartedPart {
 }
 
 /// Runs a query for a step of a part. The database answers with the reason if it refuses.
-async fn answered(link: &DatabaseLink, work: i64, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
+async fn answered(
+    link: &DatabaseLink,
+    work: i64,
+    text: &str,
+    values: &[&(dyn ToSql + Sync)],
+) -> Result<(), PlantError> {
     let row = link.client().query_one(text, values).await.map_err(refused("a part"))?;
     match row.get::<_, Option<String>>(0) {
         Some(why) => Err(PlantError::Work { work, why }),

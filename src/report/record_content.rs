@@ -6,7 +6,7 @@
 use serde_json::Value;
 
 use regrind_cell::{Command, Device, Ending, Event};
-use regrind_journal::{RecordKind, Record};
+use regrind_journal::{Record, RecordKind};
 
 /// Content of a record. Values are the same as in the record.
 #[derive(Debug)]

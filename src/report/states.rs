@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::svg::{Anchor, INK, LARGE, Svg};
-use regrind_cell::{TransitionRow, State};
+use regrind_cell::{State, TransitionRow};
 
 const WIDTH_PX: f64 = 1300.0;
 const HEIGHT_PX: f64 = 1260.0;

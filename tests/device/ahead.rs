@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Cmm, DeviceError, Interrupt, Machine, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan,
-    PreliminaryPoints, MachineState,
+    Cmm, DeviceError, Interrupt, Machine, MachineState, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan,
+    PreliminaryPoints,
 };
 use regrind_sim::body::Kind;
 use regrind_sim::command::State as At;

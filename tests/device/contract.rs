@@ -7,9 +7,9 @@ use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
 use regrind::device::{
-    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine as Driver, ModbusCmm, ModbusGrinder,
-    ModbusSettings, Outcome, Plan, TouchStatus, RANGES, RegisterMap, MachineState, Status, PlanTarget, TargetKind, ValueRange,
-    WordOrder, digest,
+    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine as Driver, MachineState, ModbusCmm,
+    ModbusGrinder, ModbusSettings, Outcome, Plan, PlanTarget, RANGES, RegisterMap, Status, TargetKind, TouchStatus,
+    ValueRange, WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
@@ -124,7 +124,8 @@ fn rtu(tcp: &[u8]) -> Vec<u8> {
 // ---- what is sent -------------------------------------------------------------------------------------------------------------------
 
 fn plan() -> Plan {
-    let target = PlanTarget { index: 70_000, kind: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
+    let target =
+        PlanTarget { index: 70_000, kind: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: vec![target],
         probe_radius_mm: 2.0,

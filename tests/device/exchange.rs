@@ -13,7 +13,8 @@ use regrind::device::exchange::{
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
-    Measurement, OperatorConfirmation, Outcome, Plan, TouchStatus, Reconciled, MachineState, PlanTarget, TargetKind, digest,
+    MachineState, Measurement, OperatorConfirmation, Outcome, Plan, PlanTarget, Reconciled, TargetKind, TouchStatus,
+    digest,
 };
 use regrind::geometry::Grid;
 use tokio::sync::oneshot;
@@ -578,7 +579,10 @@ async fn exchange_cmm_state_sequence() {
     assert!(cmm.status().await.unwrap().state == MachineState::Execute && cmm.notes()[0].contains("waiting for"));
     shop.put("SN_7_c2.csv", &three());
     let status = cmm.status().await.unwrap();
-    assert_eq!((status.state, status.outcome, status.done), (MachineState::Complete, Outcome::Complete, armed.start_sequence));
+    assert_eq!(
+        (status.state, status.outcome, status.done),
+        (MachineState::Complete, Outcome::Complete, armed.start_sequence)
+    );
     let found = Cmm::collect(&mut cmm, job, &Interrupt::new()).await.unwrap();
     assert_eq!((found.points.len(), found.done), (3, status.done));
     assert_eq!(answer_of(cmm.acknowledge(status.done + 1).await), Answer::OtherResult);

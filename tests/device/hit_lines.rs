@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use regrind::device::hit_lines::{HitLinesCmm, HitLinesSettings, HitSource, LineFormat, LineParser, Repeated};
 use regrind::device::{
-    Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, Measurement, OperatorConfirmation, Outcome, Parity,
-    Plan, TouchStatus, MachineState, PlanTarget, TargetKind, digest,
+    Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, MachineState, Measurement, OperatorConfirmation,
+    Outcome, Parity, Plan, PlanTarget, TargetKind, TouchStatus, digest,
 };
 use regrind_sim::hits::faults::Fault;
 use regrind_sim::hits::print::Style;

@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use regrind::compensation::ErrorMap;
 use regrind::device::{
-    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine, MachineKind, ModbusCmm,
-    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, TouchStatus, MachineState, Status, PlanTarget, TargetKind, digest,
+    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine, MachineKind,
+    MachineState, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PlanTarget, Status, TargetKind,
+    TouchStatus, digest,
 };
 use regrind::formats::write_error_map_x3p;
 use regrind::geometry::Grid;

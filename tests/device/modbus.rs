@@ -7,9 +7,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LineAddress, Link,
-    Machine, MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan,
-    TouchStatus, Reconciled, RegisterMap, Signal, SignalType, MachineState, PlanTarget, TargetKind, WordOrder, digest,
+    Answer, Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LineAddress, Link, Machine,
+    MachineCommand, MachineKind, MachineState, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity,
+    Pass, Plan, PlanTarget, Reconciled, RegisterMap, Signal, SignalType, TargetKind, TouchStatus, WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;

@@ -9,7 +9,7 @@ use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     transition_table,
 };
-use regrind::journal::{AuditKey, Entry, Header, Journal, RecordKind, PublicKey, Reader, sha256_hex, verify};
+use regrind::journal::{AuditKey, Entry, Header, Journal, PublicKey, Reader, RecordKind, sha256_hex, verify};
 use regrind::report::state_picture;
 use serde_json::{Value, json};
 use tempfile::TempDir;

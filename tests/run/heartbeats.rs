@@ -10,7 +10,7 @@ use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
 use regrind::cell::Ending;
 use regrind::device::{
     Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
-    Plan, TouchStatus, Reconciled, Started, Status, digest,
+    Plan, Reconciled, Started, Status, TouchStatus, digest,
 };
 use regrind::drive::{Drive, Request};
 

@@ -13,7 +13,7 @@ use crate::rig::{CMM, GRINDER, Rig, small};
 use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::journal::{RecordKind, Reader, verify};
+use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::seen::HandshakeEvent;
 
 /// Maximum number of kills of a part's program.

@@ -8,8 +8,8 @@ use std::time::Duration;
 use crate::rig::{PATIENCE, Ready, Rig, event, order, small, until};
 use regrind::cell::{AlarmId, Device, Ending};
 use regrind::device::{
-    Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, Measurement, ModbusCmm,
-    ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, MachineState, Status,
+    Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, MachineState, Measurement,
+    ModbusCmm, ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, Status,
 };
 use regrind::drive::{Drive, Notice, Request};
 use tokio::sync::mpsc::UnboundedReceiver;

@@ -15,7 +15,7 @@ use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
 use regrind::model::{Form, Interval, ModelError, ModelInputs, Prior, Sessions};
 use regrind::registration::{
-    MapLimits, RegistrationOptions, PointStatus, Registration, Start, lateral_error, map_obstacle, register,
+    MapLimits, PointStatus, Registration, RegistrationOptions, Start, lateral_error, map_obstacle, register,
 };
 use regrind::surface::{DefinedSurface, Nominal, Side};
 

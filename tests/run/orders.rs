@@ -11,7 +11,7 @@ use crate::rig::{CMM, GRINDER, Ready, Rig, event, order};
 use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, OrderSender, Request};
-use regrind::journal::{RecordKind, Reader, verify};
+use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::command::CommandFrame;
 use regrind_sim::seen::HandshakeEvent;
 use serde_json::Value;

@@ -8,7 +8,7 @@ use regrind::cell::{
     Actor, AlarmId, Command, Ending, Event, Figures, GateFailure, GateResult, Judgement, Phase, State, Tolerance,
     Verdict, sample_events,
 };
-use regrind::journal::{Entry, Header, Journal, RecordKind, Reader};
+use regrind::journal::{Entry, Header, Journal, Reader, RecordKind};
 use regrind::report::{run_report, write_run_report};
 use serde_json::{Value, json};
 use tempfile::TempDir;

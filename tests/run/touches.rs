@@ -11,7 +11,7 @@ use crate::sample::cases;
 use crate::worlds::{Ran, Setup, run, table};
 use regrind::cell::AlarmId;
 use regrind::drive::Notice;
-use regrind::journal::{RecordKind, Reader, verify};
+use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::part::ShapeSpec;
 use regrind_sim::spec::WorldFaults;
 use serde_json::Value;
@@ -27,7 +27,8 @@ fn document(path: &Path) -> Value {
 /// Returns the number of requested targets of every measurement in the record.
 fn batches(folder: &Path) -> Vec<u64> {
     let records = Reader::open(folder).unwrap();
-    let values = records.records(0).map(Result::unwrap).filter(|record| record.kind == RecordKind::Event).map(|r| r.value());
+    let values =
+        records.records(0).map(Result::unwrap).filter(|record| record.kind == RecordKind::Event).map(|r| r.value());
     values.filter(|value| value["event"] == "collected").map(|value| value["targets"].as_u64().unwrap()).collect()
 }
 

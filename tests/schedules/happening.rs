@@ -15,7 +15,7 @@ use regrind::device::{
     ModbusCmm, ModbusGrinder, ModbusSettings,
 };
 use regrind::drive::{BlockingExecutor, BlockingWork, Drive, InterruptedRun, OrderSender, RunInputs};
-use regrind::journal::{AuditKey, Header, Journal, RecordKind, Reader, RunLock, verify};
+use regrind::journal::{AuditKey, Header, Journal, Reader, RecordKind, RunLock, verify};
 use regrind::setup;
 use regrind_sim::seen::HandshakeEvent;
 use regrind_sim::wire::faults::{FaultPlan, SharedFaultPlan};

@@ -14,7 +14,7 @@ use std::process::{Child, Command, Stdio};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::{DatabaseSettings, DatabaseLink};
+use regrind_plant::{DatabaseLink, DatabaseSettings};
 
 use super::failure::Failure;
 use super::{Outcome, check};

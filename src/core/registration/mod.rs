@@ -45,7 +45,7 @@ pub use error::RegistrationError;
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, map_obstacle};
-pub use options::{Coordinate, Method, RegistrationOptions, ProbeSide, Start};
+pub use options::{Coordinate, Method, ProbeSide, RegistrationOptions, Start};
 use part::Part;
 pub use quality::{RegistrationQuality, WeakDirection};
 pub(crate) use refit::MIN_SIGMA_MM;
@@ -63,7 +63,11 @@ use start::{InitialPose, detect_mirror_image, free_rms, initial_pose, mirrored_r
 ///
 /// # Errors
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
-pub fn register(nominal: &Nominal, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
+pub fn register(
+    nominal: &Nominal,
+    measured: &[Point],
+    options: &RegistrationOptions,
+) -> Result<Registration, RegistrationError> {
     let part = Part::new(nominal, measured, options)?;
     degenerate::check_scan_line(measured, options)?;
     let mut registration =
@@ -141,7 +145,11 @@ const ROUNDING_MM: f64 = 1e-12;
 
 /// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
 /// more points count than at the last accepted step.
-fn with_final_state(mut trace: Vec<Iteration>, verdict: &RegistrationQuality, options: &RegistrationOptions) -> Vec<Iteration> {
+fn with_final_state(
+    mut trace: Vec<Iteration>,
+    verdict: &RegistrationQuality,
+    options: &RegistrationOptions,
+) -> Vec<Iteration> {
     let RegistrationQuality { objective_mm2, inliers: used, .. } = *verdict;
     let is_told = |taken: &&Iteration| {
         let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();

@@ -34,7 +34,11 @@ impl<'a> Part<'a> {
     /// # Errors
     /// A fully locked pose without a start pose, too few, non-finite, collinear or repeated points, a cloud of the
     /// wrong size, and a probe radius outside its limits.
-    pub(super) fn new(nominal: &'a Nominal, measured: &[Point], options: &RegistrationOptions) -> Result<Self, RegistrationError> {
+    pub(super) fn new(
+        nominal: &'a Nominal,
+        measured: &[Point],
+        options: &RegistrationOptions,
+    ) -> Result<Self, RegistrationError> {
         // A fully locked pose is given; only the deviations from it are wanted.
         let is_held = options.locked == [true; 6];
         if is_held && options.start == Start::Search {

@@ -439,7 +439,12 @@ pub(crate) struct DeviationReporter<'a> {
 }
 
 impl<'a> DeviationReporter<'a> {
-    pub(crate) fn new(part: &Part<'a>, scaling: &Scaling, verdict: &RegistrationQuality, options: &RegistrationOptions) -> Self {
+    pub(crate) fn new(
+        part: &Part<'a>,
+        scaling: &Scaling,
+        verdict: &RegistrationQuality,
+        options: &RegistrationOptions,
+    ) -> Self {
         let to_scaled = scaling.to_twist().try_inverse().unwrap_or_default();
         Self {
             nominal: part.nominal,

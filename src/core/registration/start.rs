@@ -102,7 +102,11 @@ pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOp
 }
 
 /// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
-pub(crate) fn detect_mirror_image(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Option<(f64, f64)> {
+pub(crate) fn detect_mirror_image(
+    part: &Part,
+    measured: &[Point],
+    options: &RegistrationOptions,
+) -> Option<(f64, f64)> {
     let sides = options.side.side().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
     let best = |points: &[Point]| {
         sides.iter().filter_map(|side| searched_rms(part, points, options, *side)).min_by(f64::total_cmp)

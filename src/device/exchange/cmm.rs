@@ -653,7 +653,12 @@ fn stored_target(row: &str) -> Option<PlanTarget> {
         let [x, y, z] = words.map(|word| word.parse().ok());
         Some([x?, y?, z?])
     };
-    Some(PlanTarget { index: index.parse().ok()?, kind: what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
+    Some(PlanTarget {
+        index: index.parse().ok()?,
+        kind: what,
+        point_mm: three([x, y, z])?,
+        normal: three([nx, ny, nz])?,
+    })
 }
 
 /// Returns the plan as a CSV table, with a header that identifies it.

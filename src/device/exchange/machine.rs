@@ -7,9 +7,9 @@ use tokio::time::{Instant, timeout};
 
 use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, MeasureOrder, Permit};
 use crate::{
-    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
-    Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
-    MachineState, Status, digest,
+    Answer, Armed, Cmm, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt, Job,
+    Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord,
+    Plan, Reconciled, Started, Status, digest,
 };
 
 /// Machine that is reached through two folders.

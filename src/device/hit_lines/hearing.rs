@@ -15,7 +15,7 @@ use super::format::{LineError, LineParser};
 use super::lines::ReceivedLine;
 use super::list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
-use crate::words::{Job, Outcome, MachineState, hex};
+use crate::words::{Job, MachineState, Outcome, hex};
 use regrind_formats::JsonlAppender;
 
 /// Number of refused lines kept for a person: the last ones.
@@ -236,7 +236,8 @@ impl MeasurementSession {
     /// Ends a complete measurement when `clear_after` has passed since its last line: the time that the probe needs to
     /// move clear.
     pub(super) fn finish_if_clear(&mut self, clear_after: Option<Duration>) {
-        let (Some(asked), Some(clear_after), MachineState::Execute) = (&self.measurement, clear_after, self.state) else {
+        let (Some(asked), Some(clear_after), MachineState::Execute) = (&self.measurement, clear_after, self.state)
+        else {
             return;
         };
         if asked.list.is_complete() && asked.last_line.elapsed() >= clear_after {
@@ -360,7 +361,10 @@ mod tests {
         heard.finish_if_clear(Some(Duration::from_secs(3600)));
         assert_eq!((heard.state, heard.clear_of_part), (MachineState::Execute, None));
         heard.finish_if_clear(Some(Duration::ZERO));
-        assert_eq!((heard.state, heard.outcome, heard.clear_of_part), (MachineState::Complete, Outcome::Complete, Some(true)));
+        assert_eq!(
+            (heard.state, heard.outcome, heard.clear_of_part),
+            (MachineState::Complete, Outcome::Complete, Some(true))
+        );
     }
 
     #[test]

@@ -21,8 +21,8 @@ use crate::kept::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
 use crate::words::{
-    Answer, Armed, MachineCommand, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, MachineState,
-    Status, digest, hex,
+    Answer, Armed, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome, Reconciled,
+    Started, Status, digest, hex,
 };
 use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
 
@@ -339,7 +339,11 @@ impl Machine for HitLinesCmm {
                 hearing.finish(Outcome::Stopped);
                 Ok(status_of(&hearing))
             }
-            _ => self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping),
+            _ => self.transition(
+                MachineCommand::Stop,
+                &[MachineState::Execute, MachineState::Holding],
+                MachineState::Stopping,
+            ),
         }
     }
 
@@ -383,7 +387,9 @@ impl Machine for HitLinesCmm {
             == Some((intended.job, intended.start_sequence));
         Ok(match hearing.state {
             MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
-            state if ours && (state.is_moving() || state == MachineState::Held) => Reconciled::Running(status_of(&hearing)),
+            state if ours && (state.is_moving() || state == MachineState::Held) => {
+                Reconciled::Running(status_of(&hearing))
+            }
             _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }

@@ -21,7 +21,8 @@ use crate::machine::{Cmm, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, PreliminaryPoints};
 use crate::words::{
-    Answer, Armed, MachineCommand, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, MachineState, Status, digest,
+    Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, Outcome, Reconciled, Started,
+    Status, digest,
 };
 use crate::{Connector, LineAddress};
 use regrind_formats::result::Coordinates;
@@ -369,7 +370,11 @@ impl Machine for IppdmeCmm {
                 self.transition(MachineCommand::Stop, &[MachineState::Held], MachineState::Complete)
             }
             _ => {
-                let status = self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping)?;
+                let status = self.transition(
+                    MachineCommand::Stop,
+                    &[MachineState::Execute, MachineState::Holding],
+                    MachineState::Stopping,
+                )?;
                 self.job_request.send_replace(JobRequest::Stop);
                 Ok(status)
             }
@@ -429,11 +434,14 @@ impl Machine for IppdmeCmm {
         if shared.job == key {
             return Ok(match shared.state {
                 MachineState::Prepared => Reconciled::NotStarted(self.status_of(&shared)),
-                MachineState::Complete | MachineState::Aborted | MachineState::Faulted => Reconciled::Finished(self.status_of(&shared)),
+                MachineState::Complete | MachineState::Aborted | MachineState::Faulted => {
+                    Reconciled::Finished(self.status_of(&shared))
+                }
                 _ => Reconciled::Running(self.status_of(&shared)),
             });
         }
-        if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == MachineState::Idle {
+        if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == MachineState::Idle
+        {
             let gone =
                 "the server stores no job: the machine has stopped, and the touches of the interrupted run are lost";
             (shared.job, shared.state, shared.outcome) = (key, MachineState::Complete, Outcome::Failed);

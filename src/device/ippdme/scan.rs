@@ -15,7 +15,7 @@ use super::session::Failure;
 use super::text::Item;
 use super::work::{MISS_ERRORS, RoutedPlan, Worker, distance, locked};
 use crate::error::DeviceError;
-use crate::payload::{MeasuredPoint, Plan, TouchStatus, PlanTarget};
+use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 
 /// Radius of curvature sent for a straight curve, in mm.
 const STRAIGHT_MM: f64 = 1e4;

@@ -13,8 +13,8 @@ use super::session::{CommandReply, Failure, Session};
 use super::settings::IppdmeSettings;
 use super::text::Item;
 use crate::error::DeviceError;
-use crate::payload::{MeasuredPoint, Plan, TouchStatus, PlanTarget};
-use crate::words::{Fault, Job, Outcome, MachineState};
+use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
+use crate::words::{Fault, Job, MachineState, Outcome};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.
@@ -425,7 +425,12 @@ impl Worker {
     }
 
     /// Returns the measured point in the answer to a touch, if it is plausible for this target.
-    fn point(&mut self, work: &RoutedPlan, target: &PlanTarget, answer: &CommandReply) -> Result<MeasuredPoint, Failure> {
+    fn point(
+        &mut self,
+        work: &RoutedPlan,
+        target: &PlanTarget,
+        answer: &CommandReply,
+    ) -> Result<MeasuredPoint, Failure> {
         let missing = || Failure::Implausible(self.missing_value("PtMeas", "X, Y and Z, each once"));
         let mut at_mm = [0.0; 3];
         for (at, name) in at_mm.iter_mut().zip(["X", "Y", "Z"]) {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::time::{Instant, sleep};
 
 use super::link::{Link, LinkFault};
-use super::protocol::{Get, ControllerMode, RshReply, RshRequest, Set};
+use super::protocol::{ControllerMode, Get, RshReply, RshRequest, Set};
 use super::settings::LinuxcncSettings;
 use crate::error::{DeviceError, DeviceResult};
 use crate::words::{Answer, MachineCommand, MachineState};
@@ -200,7 +200,11 @@ impl Controller {
         self.check_acknowledged(answer, command).await
     }
 
-    async fn check_acknowledged(&mut self, answer: Result<RshReply, LinkFault>, command: MachineCommand) -> DeviceResult<()> {
+    async fn check_acknowledged(
+        &mut self,
+        answer: Result<RshReply, LinkFault>,
+        command: MachineCommand,
+    ) -> DeviceResult<()> {
         match answer {
             Ok(RshReply::Acknowledged) => Ok(()),
             Ok(_) => Err(self.denied(command).await?),
@@ -234,7 +238,8 @@ impl Controller {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let within = self.settings.answer_timeout;
         let link = self.link("an abort")?;
-        let (taken, aborted) = (link.ask(RshRequest::Set(enable), within), link.ask(RshRequest::Set(Set::Abort), within));
+        let (taken, aborted) =
+            (link.ask(RshRequest::Set(enable), within), link.ask(RshRequest::Set(Set::Abort), within));
         if let Ok(RshReply::Refused) = taken.answer().await {
             return Err(DeviceError::Password { machine: self.machine(), key: "control_password" });
         }

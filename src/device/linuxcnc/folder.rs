@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
 
-use super::program::{PROGRAM, FramedProgram, ProgramInputs, ProgramRecord, RECORD, name_begins};
+use super::program::{FramedProgram, PROGRAM, ProgramInputs, ProgramRecord, RECORD, name_begins};
 
 /// File name of the program that a run writes with every correction.
 const PASS_PROGRAM_FILE: &str = "toolpath.ngc";

@@ -23,7 +23,7 @@ use tokio::time::{Instant, timeout};
 
 use super::controller::{Controller, Interpreter};
 use super::folder::Folders;
-use super::program::{PROGRAM, FramedProgram, ProgramRecord, path};
+use super::program::{FramedProgram, PROGRAM, ProgramRecord, path};
 use super::protocol::{ControllerMode, Set};
 use super::settings::LinuxcncSettings;
 use super::work::{ActiveJob, Stage};
@@ -33,8 +33,8 @@ use crate::machine::{Grinder, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use crate::words::{
-    Answer, Armed, MachineCommand, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started,
-    MachineState, Status, digest,
+    Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome,
+    Reconciled, Started, Status, digest,
 };
 use looking::standing_fault;
 use reconciling::unknown;
@@ -362,8 +362,11 @@ impl Grinder for LinuxcncGrinder {
     }
 
     async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<PassRecord> {
-        let no_result =
-            DeviceError::NoResult { machine: self.machine(), job, state: self.last_state.unwrap_or(MachineState::Idle) };
+        let no_result = DeviceError::NoResult {
+            machine: self.machine(),
+            job,
+            state: self.last_state.unwrap_or(MachineState::Idle),
+        };
         let work = self.job.as_ref().filter(|work| work.job == job).ok_or_else(|| no_result.clone())?;
         let (Stage::Ended(_, outcome), Some(program)) = (work.stage, &work.program) else { return Err(no_result) };
         Ok(PassRecord {

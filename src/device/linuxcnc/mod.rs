@@ -23,5 +23,5 @@ mod work;
 
 pub use machine::LinuxcncGrinder;
 pub use program::{FramedProgram, ProgramInputs, ProgramRecord};
-pub use protocol::{Get, LineMatch, LineSplitter, ControllerMode, PendingRequests, RshReply, RshRequest, Set};
+pub use protocol::{ControllerMode, Get, LineMatch, LineSplitter, PendingRequests, RshReply, RshRequest, Set};
 pub use settings::{LinuxcncSettings, LinuxcncWire};

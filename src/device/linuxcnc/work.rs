@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use super::controller::{ControllerState, Interpreter};
 use super::program::{FramedProgram, ProgramRecord};
-use crate::words::{Fault, Job, Outcome, MachineState};
+use crate::words::{Fault, Job, MachineState, Outcome};
 
 /// Prepared job and everything known about it.
 #[derive(Clone, Debug)]
@@ -88,7 +88,9 @@ impl ActiveJob {
             _ if record.ended > 0 => Verdict::Ended(MachineState::Complete, Outcome::Complete, Fault::None),
             _ if still < settles && self.requested_outcome.is_none() => Verdict::InState(MachineState::Execute),
             _ if aborts => Verdict::Ended(MachineState::Aborted, Outcome::Aborted, Fault::None),
-            _ if self.requested_outcome.is_some() => Verdict::Ended(MachineState::Complete, Outcome::Stopped, Fault::None),
+            _ if self.requested_outcome.is_some() => {
+                Verdict::Ended(MachineState::Complete, Outcome::Stopped, Fault::None)
+            }
             _ if record.begun == 0 => Verdict::Unresolved,
             _ if seen.stop_circuit_open => Verdict::Ended(MachineState::Faulted, Outcome::Failed, Fault::StopCircuit),
             _ if !seen.drives_on => Verdict::Ended(MachineState::Faulted, Outcome::Failed, Fault::Supplies),
@@ -208,9 +210,10 @@ mod tests {
     #[test]
     fn judge_requested_outcome() {
         let (running, idle) = (seen(Interpreter::Running, "/nc/p.ngc"), seen(Interpreter::Idle, "/nc/p.ngc"));
-        for (wanted, on_the_way, state) in
-            [(Outcome::Aborted, MachineState::Aborting, MachineState::Aborted), (Outcome::Stopped, MachineState::Stopping, MachineState::Complete)]
-        {
+        for (wanted, on_the_way, state) in [
+            (Outcome::Aborted, MachineState::Aborting, MachineState::Aborted),
+            (Outcome::Stopped, MachineState::Stopping, MachineState::Complete),
+        ] {
             let work = ActiveJob { requested_outcome: Some(wanted), ..work() };
             assert_eq!(judged(&work, &running, record(1, 0)), Verdict::InState(on_the_way));
             assert_eq!(judged(&work, &idle, record(1, 0)), Verdict::Ended(state, wanted, Fault::None));

@@ -22,9 +22,9 @@ use super::exchange::{
     ExchangeError, ResultRequirements, assemble_measurement, check_measurement, contradiction, file_word, plan_csv,
 };
 use super::{
-    Answer, Armed, Cmm, MachineCommand, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
-    Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
-    MachineState, Status, digest, hex,
+    Answer, Armed, Cmm, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt, Job,
+    Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord,
+    Plan, Reconciled, Started, Status, digest, hex,
 };
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::{FormatError, ResultFolder, write_atomic};
@@ -150,8 +150,12 @@ impl ManualMachine {
         let still =
             |what: &str| vec![format!("{what} it at its own panel"), confirm(&format!("still --machine {name}"))];
         match (self.state, &self.task) {
-            (MachineState::Execute, Some((ManualTask::Measure(plan), _))) => self.prompt_to_measure(job, plan, &confirm),
-            (MachineState::Execute, Some((ManualTask::Grind(pass, map), _))) => self.prompt_to_grind(job, pass, map, &confirm),
+            (MachineState::Execute, Some((ManualTask::Measure(plan), _))) => {
+                self.prompt_to_measure(job, plan, &confirm)
+            }
+            (MachineState::Execute, Some((ManualTask::Grind(pass, map), _))) => {
+                self.prompt_to_grind(job, pass, map, &confirm)
+            }
             (MachineState::Holding, _) => still("HOLD"),
             (MachineState::Stopping, _) => still("STOP"),
             (MachineState::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
@@ -426,7 +430,13 @@ impl Machine for ManualMachine {
             MachineState::Prepared => (self.state, self.job) = (MachineState::Idle, None),
             // A person has confirmed that it does not move.
             MachineState::Held => self.finish(Outcome::Stopped),
-            _ => return self.transition(MachineCommand::Stop, &[MachineState::Execute, MachineState::Holding], MachineState::Stopping),
+            _ => {
+                return self.transition(
+                    MachineCommand::Stop,
+                    &[MachineState::Execute, MachineState::Holding],
+                    MachineState::Stopping,
+                );
+            }
         }
         Ok(self.current_status())
     }
@@ -462,7 +472,9 @@ impl Machine for ManualMachine {
         let ours = self.job == Some((intended.job, intended.start_sequence));
         Ok(match self.state {
             MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(self.current_status()),
-            state if ours && (state.is_moving() || state == MachineState::Held) => Reconciled::Running(self.current_status()),
+            state if ours && (state.is_moving() || state == MachineState::Held) => {
+                Reconciled::Running(self.current_status())
+            }
             _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }

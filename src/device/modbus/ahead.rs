@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::codec::{self, Registers};
 use super::link::LinkRequest;
 use super::{Header, MAX_RESULT_BYTES, ModbusMachine, PAGE_REGISTERS, StatusBlock};
-use crate::{DeviceError, Interrupt, Job, MeasuredPoint, PreliminaryPoints, MachineState, digest};
+use crate::{DeviceError, Interrupt, Job, MachineState, MeasuredPoint, PreliminaryPoints, digest};
 
 /// Maximum transmission time of a page. An order waits for the request under way, so nothing is read ahead if a page
 /// takes longer.
@@ -68,7 +68,10 @@ impl ModbusMachine {
     /// Takes at most one step of reading ahead after a read of the status. Returns the new points, if there are any.
     pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
         let block = self.last_block.take()?;
-        let runs = matches!(block.state, MachineState::Execute | MachineState::Holding | MachineState::Held | MachineState::Stopping);
+        let runs = matches!(
+            block.state,
+            MachineState::Execute | MachineState::Holding | MachineState::Held | MachineState::Stopping
+        );
         let mine = block.job == Some(job) && self.last_start == Some(block.begun_by) && block.begun_by != 0;
         let room = self.unit.link.line().transmission(PAGE_BYTES) <= MAX_PAGE_TIME;
         if !(runs && mine && room && self.unit.offers_read_ahead()) || self.has_failed_ahead(block.begun_by) {

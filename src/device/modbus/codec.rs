@@ -6,7 +6,9 @@
 use sha2::{Digest, Sha256};
 
 use super::settings::WordOrder;
-use crate::{CarefulStart, MachineCommand, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, TouchStatus};
+use crate::{
+    CarefulStart, CorrectionMap, Identified, Job, MachineCommand, MeasuredPoint, Outcome, Pass, Plan, TouchStatus,
+};
 use regrind_core::geometry::Grid;
 
 impl WordOrder {
@@ -465,8 +467,12 @@ mod tests {
     }
 
     fn plan() -> Plan {
-        let target =
-            PlanTarget { index: 9, kind: TargetKind::ReferenceSphere, point_mm: [1.0, -2.0, 0.5], normal: [0.0, 0.0, 1.0] };
+        let target = PlanTarget {
+            index: 9,
+            kind: TargetKind::ReferenceSphere,
+            point_mm: [1.0, -2.0, 0.5],
+            normal: [0.0, 0.0, 1.0],
+        };
         Plan {
             targets: vec![target],
             probe_radius_mm: 2.0,

@@ -29,9 +29,9 @@ use tokio::time::{Instant, sleep};
 
 use super::range;
 use super::{
-    Answer, Armed, Cmm, MachineCommand, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
-    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue,
-    Started, MachineState, Status, digest,
+    Answer, Armed, Cmm, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job, Machine,
+    MachineCommand, MachineKind, MachineState, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints,
+    Reconciled, SignalValue, Started, Status, digest,
 };
 use ahead::{ReadAhead, ReadAheadFailures};
 #[cfg(fuzzing)]
@@ -948,9 +948,11 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
             Some(held) if held != job => unknown(format!("START {start_sequence} began {held} instead of {job}")),
             _ if status.done == start_sequence => Some(Reconciled::Finished(status.into())),
             _ => match status.state {
-                MachineState::Execute | MachineState::Holding | MachineState::Held | MachineState::Stopping | MachineState::Aborting => {
-                    Some(Reconciled::Running(status.into()))
-                }
+                MachineState::Execute
+                | MachineState::Holding
+                | MachineState::Held
+                | MachineState::Stopping
+                | MachineState::Aborting => Some(Reconciled::Running(status.into())),
                 MachineState::Aborted | MachineState::Faulted => Some(Reconciled::Finished(status.into())),
                 state => unknown(format!(
                     "the machine accepted START {start_sequence}, but it is {state} and has no result of it"
@@ -1046,19 +1048,19 @@ macro_rules! modbus_driver {
                 self.0.start(armed).await
             }
             async fn hold(&mut self) -> Result<Status, DeviceError> {
-                self.0.run_command(Command::Hold).await.map(Status::from)
+                self.0.run_command(MachineCommand::Hold).await.map(Status::from)
             }
             async fn resume(&mut self) -> Result<Status, DeviceError> {
-                self.0.run_command(Command::Resume).await.map(Status::from)
+                self.0.run_command(MachineCommand::Resume).await.map(Status::from)
             }
             async fn stop(&mut self) -> Result<Status, DeviceError> {
-                self.0.run_command(Command::Stop).await.map(Status::from)
+                self.0.run_command(MachineCommand::Stop).await.map(Status::from)
             }
             async fn abort(&mut self) -> Result<Status, DeviceError> {
                 self.0.abort().await.map(Status::from)
             }
             async fn clear(&mut self) -> Result<Status, DeviceError> {
-                self.0.run_command(Command::Clear).await.map(Status::from)
+                self.0.run_command(MachineCommand::Clear).await.map(Status::from)
             }
             async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
                 self.0.acknowledge(done).await.map(Status::from)

@@ -19,7 +19,9 @@ mod table;
 mod write;
 
 pub use amend::{AlongNormals, Amended, Amendment, correct_program};
-pub use dialect::{ArcWords, CentreWords, Dialect, DialectError, Exactness, DialectProblem, LINUXCNC, Tilting, Turning};
+pub use dialect::{
+    ArcWords, CentreWords, Dialect, DialectError, DialectProblem, Exactness, LINUXCNC, Tilting, Turning,
+};
 pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};
 pub use table::write_axis_table;

@@ -17,7 +17,7 @@ use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use regrind_journal::{AuditKey, Entry, Journal, RecordKind, Reader, verify};
+use regrind_journal::{AuditKey, Entry, Journal, Reader, RecordKind, verify};
 use serde_json::json;
 
 fn main() {

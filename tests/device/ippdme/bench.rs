@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use regrind::device::Interrupt;
 use regrind::device::ippdme::Limits;
 use regrind::device::{
-    Armed, Cmm, DeviceError, Identified, IppdmeCmm, IppdmeSettings, Job, Machine, Measurement, Plan, TouchStatus,
-    MachineState, Status, PlanTarget, TargetKind, digest,
+    Armed, Cmm, DeviceError, Identified, IppdmeCmm, IppdmeSettings, Job, Machine, MachineState, Measurement, Plan,
+    PlanTarget, Status, TargetKind, TouchStatus, digest,
 };
 use regrind_sim::dme::Server;
 use regrind_sim::dme::faults::CommandFaults;

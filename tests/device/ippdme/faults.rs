@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use regrind::device::{
-    Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, Outcome, Reconciled, MachineState, Status,
+    Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, MachineState, Outcome, Reconciled, Status,
 };
 use regrind_sim::dme::faults::Fault;
 

@@ -1,7 +1,7 @@
 //! Jobs from their beginning to their end, with interventions of people and crashes.
 
 use regrind::device::{
-    CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, Reconciled, MachineState,
+    CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, Reconciled, TouchStatus,
 };
 use regrind_sim::dme::machine::Options;
 use regrind_sim::spec::CmmSpec;

@@ -5,7 +5,9 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, MachineState, PlanTarget, TargetKind};
+use regrind::device::{
+    Cmm, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, PlanTarget, TargetKind, TouchStatus,
+};
 
 use super::bench::{begin, job, patient, settings, until_still};
 

@@ -1,8 +1,8 @@
 //! Scanned rows: their points lie on the part, each at its target, and no fault brings a wrong one.
 
 use regrind::device::{
-    Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, Outcome, Plan, TouchStatus, Scanning,
-    MachineState, Status, PlanTarget, TargetKind,
+    Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, PlanTarget,
+    Scanning, Status, TargetKind, TouchStatus,
 };
 use regrind_sim::dme::faults::Fault;
 use regrind_sim::dme::machine::Options;

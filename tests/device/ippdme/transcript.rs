@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Plan, MachineState, PlanTarget, TargetKind};
+use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, MachineState, Plan, PlanTarget, TargetKind};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 

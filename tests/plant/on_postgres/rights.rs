@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use regrind::journal::{AuditKey, Entry, Header, Journal, RecordKind, Reader, Record};
+use regrind::journal::{AuditKey, Entry, Header, Journal, Reader, Record, RecordKind};
 use serde_json::json;
 
 use crate::Plant;

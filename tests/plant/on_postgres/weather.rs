@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind::journal::{RecordKind, Reader, verify};
+use regrind::journal::{Reader, RecordKind, verify};
 
 use super::work::approves;
 use crate::Plant;

@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector};
 use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::Point;
 use regrind_core::model::{Form, ModelInputs};
-use regrind_core::registration::{RegistrationOptions, PointStatus, Registration, register};
+use regrind_core::registration::{PointStatus, Registration, RegistrationOptions, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};

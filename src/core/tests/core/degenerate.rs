@@ -5,7 +5,7 @@ use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Pose};
-use regrind_core::registration::{Coordinate, RegistrationOptions, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{Coordinate, Registration, RegistrationError, RegistrationOptions, Start, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -106,7 +106,10 @@ fn coverage_of_line_is_its_strip() {
     let cover = |places: &[[f64; 2]]| {
         let start = Start::Pose(pose(&placement()));
         let held = Coordinate::locked_flags(&[Coordinate::Y, Coordinate::Rx]);
-        registered(&measured(places, 0.0, 9), &RegistrationOptions { start, locked: held, ..free() }).unwrap().quality.coverage
+        registered(&measured(places, 0.0, 9), &RegistrationOptions { start, locked: held, ..free() })
+            .unwrap()
+            .quality
+            .coverage
     };
     let grid = |columns: u32, rows: u32, [x0, x1]: [f64; 2]| -> Vec<[f64; 2]> {
         let at = |k: u32, count: u32, [a, b]: [f64; 2]| a + (b - a) * (f64::from(k) + 0.5) / f64::from(count);

@@ -3,7 +3,7 @@
 use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
 use nalgebra::{Matrix6, Vector6};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{RegistrationOptions, PointStatus, Start, register};
+use regrind_core::registration::{PointStatus, RegistrationOptions, Start, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, add_outliers};

@@ -4,7 +4,9 @@
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose, pose_error_mm};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{RegistrationOptions, PointStatus, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{
+    PointStatus, ProbeSide, Registration, RegistrationError, RegistrationOptions, Start, register,
+};
 use regrind_core::surface::accuracy::{NominalPoints, estimate_accuracy};
 use regrind_core::surface::{Nominal, PlaneProjection, SurfaceError};
 use regrind_sim::form::FormError;
@@ -115,7 +117,8 @@ fn sparse_nominal_has_no_false_edge() {
             Nominal::from_points(scattered(|x| if x < 0.0 { 0.25 } else { 0.25 * ratio }, 0.0), PlaneProjection::Xy)
                 .unwrap();
         let found =
-            register(&nominal, &cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]), &RegistrationOptions::new(RADIUS_MM)).unwrap();
+            register(&nominal, &cloud([[-48.0, -28.0], [48.0, 28.0]], [60, 30]), &RegistrationOptions::new(RADIUS_MM))
+                .unwrap();
         assert_eq!(statuses(&found, PointStatus::OffPart), [0usize; 0], "{ratio}");
     }
 }
@@ -211,12 +214,16 @@ fn wrong_lock_is_not_mirror_image() {
     let beside = Pose::exp(&regrind_core::geometry::Twist::new(3.0, 0.0, 0.0, 0.0, 0.0, 0.035));
     let start = Start::Pose(pose(&placement()) * beside);
     let locked = [true, true, false, false, false, true];
-    let refused = register(&nominal, &measured, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) }).unwrap_err();
+    let refused =
+        register(&nominal, &measured, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) })
+            .unwrap_err();
     let RegistrationError::DoesNotFit { remedy, .. } = &refused else { panic!("{refused:?}") };
     assert!(remedy.contains("locked pose"), "{remedy}");
     // A mirror image is one all the same.
     let mirrored: Vec<Point> = measured.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
-    let refused = register(&nominal, &mirrored, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) }).unwrap_err();
+    let refused =
+        register(&nominal, &mirrored, &RegistrationOptions { start, locked, ..RegistrationOptions::new(RADIUS_MM) })
+            .unwrap_err();
     assert!(matches!(refused, RegistrationError::Mirrored { .. }), "{refused:?}");
 }
 
@@ -274,7 +281,11 @@ fn locked_pose_gives_deviations() {
             .into_iter()
             .take(counts[0] * counts[1])
             .collect();
-        let options = RegistrationOptions { start: Start::Pose(raised), locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
+        let options = RegistrationOptions {
+            start: Start::Pose(raised),
+            locked: [true; 6],
+            ..RegistrationOptions::new(RADIUS_MM)
+        };
         let found = register(&nominal, &centres, &options).unwrap();
         assert_eq!(pose_error_mm(&found.cmm_from_model, &raised), 0.0);
         let at_truth = RegistrationOptions { start: Start::Pose(truth), ..options };
@@ -300,14 +311,22 @@ fn trace_ends_with_reported_result() {
     for (k, height) in [(205, 0.4), (410, -0.1), (411, -0.1)] {
         bad[k] += truth.transform_direction(&Vector::z()) * height;
     }
-    let held = RegistrationOptions { start: Start::Pose(truth), locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
+    let held =
+        RegistrationOptions { start: Start::Pose(truth), locked: [true; 6], ..RegistrationOptions::new(RADIUS_MM) };
     let at_truth = RegistrationOptions { start: Start::Pose(truth), ..RegistrationOptions::new(RADIUS_MM) };
     for (name, measured, options) in [
         ("searched", &clean, RegistrationOptions::new(RADIUS_MM)),
         ("begun at the truth", &clean, at_truth),
         ("with outliers", &bad, RegistrationOptions::new(RADIUS_MM)),
         ("held", &clean, held),
-        ("robust", &bad, RegistrationOptions { loss: regrind_core::registration::Loss::Tukey, ..RegistrationOptions::new(RADIUS_MM) }),
+        (
+            "robust",
+            &bad,
+            RegistrationOptions {
+                loss: regrind_core::registration::Loss::Tukey,
+                ..RegistrationOptions::new(RADIUS_MM)
+            },
+        ),
     ] {
         let found = register(&nominal, measured, &options).unwrap();
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);

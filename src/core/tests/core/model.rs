@@ -13,7 +13,9 @@ use regrind_core::geometry::Pose;
 use regrind_core::model::{
     AngleInterval, BudgetEntry, Form, FormFigures, Interval, MachineUncertainty, ModelInputs, UncertaintySource,
 };
-use regrind_core::registration::{Coordinate, Deviation, RegistrationOptions, PointStatus, Registration, Start, register};
+use regrind_core::registration::{
+    Coordinate, Deviation, PointStatus, Registration, RegistrationOptions, Start, register,
+};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
@@ -153,7 +155,8 @@ fn many_points_bound_polynomial_corners() {
                 std::array::from_fn(|k| on[k] + (RADIUS_MM + form(x, y)) * up[k] + NOISE_MM * normal(&mut rng))
             })
             .collect();
-        let options = RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
+        let options =
+            RegistrationOptions { start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&free_form(409, 249), &points(&touched), &options).unwrap();
         let [_, pv_mm] = figures(&after_best_fit(&found, |d| form(d.point.x, d.point.y)));
         let pv = Form::estimate(&found, &ModelInputs::default()).unwrap().figures.pv;
@@ -273,7 +276,8 @@ fn held_with_offset(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
         centre.iter_mut().zip(by_mm).for_each(|(v, by)| *v += by + NOISE_MM * normal(&mut rng));
     }
     let locked = Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
-    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), locked, ..RegistrationOptions::new(RADIUS_MM) };
+    let options =
+        RegistrationOptions { start: Start::Pose(Pose::identity()), locked, ..RegistrationOptions::new(RADIUS_MM) };
     (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
 }
 
@@ -335,7 +339,11 @@ fn corrected_by_machine(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]
     } else {
         Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz])
     };
-    let options = RegistrationOptions { start: Start::Pose(Pose::identity()), locked: held, ..RegistrationOptions::new(RADIUS_MM) };
+    let options = RegistrationOptions {
+        start: Start::Pose(Pose::identity()),
+        locked: held,
+        ..RegistrationOptions::new(RADIUS_MM)
+    };
     let [looks, is] = [looks, is].map(|all| register(&free_form(409, 249), &points(&all), &options).unwrap());
     (looks, is)
 }

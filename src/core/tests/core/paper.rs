@@ -2,7 +2,7 @@
 
 use crate::common::{RADIUS_MM, free_form, placed, points};
 use regrind_core::geometry::{Point, Pose};
-use regrind_core::registration::{Method, RegistrationOptions, ProbeSide, Start, register};
+use regrind_core::registration::{Method, ProbeSide, RegistrationOptions, Start, register};
 use regrind_core::surface::{DistanceModel, Nominal};
 use regrind_sim::Vec3;
 use regrind_sim::form::FormError;
@@ -50,7 +50,8 @@ fn register_undoes_large_displacement() {
         for distance in [DistanceModel::Curved, DistanceModel::Triangle] {
             let case = format!("{shift_mm:?} mm, {degrees:?} degrees, {distance:?}");
             let found =
-                register(&nominal, &measured, &RegistrationOptions { distance_model: distance, ..as_in_the_paper() }).expect(&case);
+                register(&nominal, &measured, &RegistrationOptions { distance_model: distance, ..as_in_the_paper() })
+                    .expect(&case);
             let pv_nm = 1e6 * found.quality.pv_mm;
             assert!(pv_nm <= 1e-6, "{case}: {pv_nm:e} nm");
             assert_eq!(found.quality.inliers, measured.len(), "{case}");
@@ -74,7 +75,8 @@ fn offset_centres_match_contacts() {
     let found = register(&nominal, &measured, &as_in_the_paper()).unwrap();
 
     let contacts: Vec<Point> = found.deviations.iter().map(|d| d.point).collect();
-    let again = register(&nominal, &contacts, &RegistrationOptions { method: Method::Contact, ..as_in_the_paper() }).unwrap();
+    let again =
+        register(&nominal, &contacts, &RegistrationOptions { method: Method::Contact, ..as_in_the_paper() }).unwrap();
     let pose = again.cmm_from_model;
     // The largest entries of eq. (18).
     assert!(pose.translation_mm.amax() <= 3.69e-5, "{}", pose.translation_mm);

@@ -10,7 +10,7 @@ use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
     Field, Form, Hyperparameters, Interval, ModelInputs, Observations, PartFit, PartPriors, Prior, farthest_points,
 };
-use regrind_core::registration::{RegistrationOptions, Registration, Start, register};
+use regrind_core::registration::{Registration, RegistrationOptions, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
@@ -43,7 +43,8 @@ impl Part {
             [c.x, c.y, c.z].map(|v| v + NOISE_MM * normal(&mut rng))
         };
         let touched: Vec<[f64; 3]> = farthest_points(&targets, TOUCHES).into_iter().map(&mut centre).collect();
-        let options = RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
+        let options =
+            RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&free_form(205, 125), &points(&placed(&placement, &touched)), &options).unwrap();
         Self { targets, form, registration: found }
     }

@@ -2,7 +2,9 @@
 
 use crate::common::{RADIUS_MM, centres, placed, points, pose};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{Method, RegistrationOptions, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{
+    Method, ProbeSide, Registration, RegistrationError, RegistrationOptions, Start, register,
+};
 use regrind_core::surface::{
     DefinedSurface, FacetIndex, Nominal, NominalKind, OffsetSurface, PlaneProjection, Side, SurfaceError,
 };
@@ -287,7 +289,8 @@ fn formula_and_points_agree() {
     cloud.retain(|c| (c[0] / 36.0).hypot(c[1] / 26.0) < 0.97);
     let cloud = points(&placed(&placement, &cloud));
     let from_formula = register(&analytic, &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
-    let from_points = register(&gridded(&shape, [80.0, 60.0], [801, 601]), &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
+    let from_points =
+        register(&gridded(&shape, [80.0, 60.0], [801, 601]), &cloud, &RegistrationOptions::new(RADIUS_MM)).unwrap();
     let lifted = Pose { translation_mm: Vector::new(0.0, 0.0, lift), ..Pose::identity() };
     // Both hold the rotation about the parent's axis where their own search left it, so the surfaces are compared.
     let between =
@@ -304,7 +307,8 @@ fn robust_losses_from_start_pose() {
     let placement = Placement::new([0.3, -0.2, 0.25], [0.2, 0.1, -0.3]);
     let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 3e-4);
     for loss in [regrind_core::registration::Loss::Huber, regrind_core::registration::Loss::Tukey] {
-        let options = RegistrationOptions { loss, start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
+        let options =
+            RegistrationOptions { loss, start: Start::Pose(Pose::identity()), ..RegistrationOptions::new(RADIUS_MM) };
         let found = register(&nominal, &cloud, &options).unwrap();
         let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]);
         assert!(error < 1e-4, "{loss:?}: {error} mm");

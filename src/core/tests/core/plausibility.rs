@@ -5,7 +5,9 @@ use std::sync::OnceLock;
 
 use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::{Point, Pose};
-use regrind_core::registration::{Method, RegistrationOptions, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::registration::{
+    Method, ProbeSide, Registration, RegistrationError, RegistrationOptions, Start, register,
+};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
@@ -88,7 +90,12 @@ fn plausibility_reports_contact_points() {
             right.deviations.iter().map(|d| right.cmm_from_model.transform_point(&d.point)).collect();
         let words = warnings(&with_radius(RADIUS_MM, &contacts));
         assert!(words.contains("look like contact points") && words.contains("`contact`"), "{words}");
-        let found = register(nominal(), &contacts, &RegistrationOptions { method: Method::Contact, ..RegistrationOptions::new(0.0) }).unwrap();
+        let found = register(
+            nominal(),
+            &contacts,
+            &RegistrationOptions { method: Method::Contact, ..RegistrationOptions::new(0.0) },
+        )
+        .unwrap();
         assert_eq!(warnings(&found), "");
     }
 }
@@ -99,7 +106,11 @@ fn refused_fit_reports_radius() {
     let told = register(nominal(), &whole(1), &options).unwrap_err();
     assert!(matches!(told, RegistrationError::DoesNotFit { .. }), "{told}");
     assert!(told.to_string().contains("a probe radius of about 1."), "{told}");
-    let told = register(nominal(), &whole(1), &RegistrationOptions { rms_limit_mm: Some(1e-4), ..RegistrationOptions::new(RADIUS_MM) });
+    let told = register(
+        nominal(),
+        &whole(1),
+        &RegistrationOptions { rms_limit_mm: Some(1e-4), ..RegistrationOptions::new(RADIUS_MM) },
+    );
     assert!(told.unwrap_err().to_string().contains("check part, units"));
 }
 
@@ -146,14 +157,22 @@ fn register_refuses_mirror_image() {
             .collect();
         for side in [ProbeSide::Auto, ProbeSide::Above] {
             for start in [Start::Search, Start::Pose(Pose::identity())] {
-                let told =
-                    register(nominal(), &mirrored, &RegistrationOptions { side, start, ..RegistrationOptions::new(RADIUS_MM) }).unwrap_err();
+                let told = register(
+                    nominal(),
+                    &mirrored,
+                    &RegistrationOptions { side, start, ..RegistrationOptions::new(RADIUS_MM) },
+                )
+                .unwrap_err();
                 assert!(matches!(told, RegistrationError::Mirrored { .. }), "axis {axis}, {side:?}, {start:?}: {told}");
             }
         }
     }
     // A cloud that lies elsewhere is no mirror image.
     let far = Pose { translation_mm: [400.0, 0.0, 0.0].into(), ..Pose::identity() };
-    let told = register(nominal(), &as_it_is, &RegistrationOptions { start: Start::Pose(far), ..RegistrationOptions::new(RADIUS_MM) });
+    let told = register(
+        nominal(),
+        &as_it_is,
+        &RegistrationOptions { start: Start::Pose(far), ..RegistrationOptions::new(RADIUS_MM) },
+    );
     assert!(!matches!(told, Err(RegistrationError::Mirrored { .. })), "{told:?}");
 }

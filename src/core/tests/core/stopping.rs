@@ -10,7 +10,7 @@ use regrind_core::model::{
     FIRST_BATCH, Form, FormFigures, Interval, MAX_BATCHES, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason,
     StoppingCriteria, StoppingDecision, decide, farthest_points, short_tour,
 };
-use regrind_core::registration::{RegistrationOptions, Registration, Start, register};
+use regrind_core::registration::{Registration, RegistrationOptions, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
@@ -64,7 +64,8 @@ impl Part {
             [c.x, c.y, c.z].map(|v| v + NOISE_MM * normal(&mut rng))
         };
         let centres: Vec<[f64; 3]> = touched.iter().map(centre).collect();
-        let options = RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
+        let options =
+            RegistrationOptions { start: Start::Pose(pose(&placement)), ..RegistrationOptions::new(RADIUS_MM) };
         register(&free_form(205, 125), &points(&placed(&placement, &centres)), &options).unwrap()
     }
 

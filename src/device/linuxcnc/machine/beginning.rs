@@ -12,7 +12,7 @@ use crate::linuxcnc::controller::{ControllerState, Interpreter};
 use crate::linuxcnc::program::{FramedProgram, ProgramRecord, RECORD, opening, path};
 use crate::linuxcnc::protocol::{ControllerMode, Set};
 use crate::linuxcnc::work::{ActiveJob, Stage};
-use crate::words::{Answer, Armed, MachineCommand, Fault, Job, MachineState, Status};
+use crate::words::{Answer, Armed, Fault, Job, MachineCommand, MachineState, Status};
 
 impl LinuxcncGrinder {
     pub(super) async fn prepare_program(&mut self, job: Job, program: Arc<FramedProgram>) -> DeviceResult<Armed> {

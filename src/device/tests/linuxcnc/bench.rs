@@ -7,7 +7,7 @@ use std::time::Duration;
 use regrind_core::geometry::Grid;
 use regrind_device::{
     Armed, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LinuxcncGrinder, LinuxcncSettings, Machine,
-    Pass, MachineState, Status, digest, hex,
+    MachineState, Pass, Status, digest, hex,
 };
 use tempfile::TempDir;
 

@@ -3,7 +3,7 @@
 use std::fs;
 use std::time::Duration;
 
-use regrind_device::{DeviceError, Fault, Grinder, Interrupt, Machine, Outcome, Reconciled, MachineState};
+use regrind_device::{DeviceError, Fault, Grinder, Interrupt, Machine, MachineState, Outcome, Reconciled};
 
 use crate::bench::{Bench, job, map, pass, program, to_and_fro, until};
 use crate::isolated::{Controller, Operator, PORT, give_away, with_controller};

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use regrind_device::{
-    Answer, Armed, DeviceError, Fault as Told, Grinder, Interrupt, LinuxcncGrinder, Machine, OperatorConfirmation,
-    Outcome, Reconciled, MachineState,
+    Answer, Armed, DeviceError, Fault as Told, Grinder, Interrupt, LinuxcncGrinder, Machine, MachineState,
+    OperatorConfirmation, Outcome, Reconciled,
 };
 use tokio::sync::Notify;
 

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind_disk::Disk;
-use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, RecordKind, Reader, Record, Verified, verify};
+use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, Reader, Record, RecordKind, Verified, verify};
 use rusqlite::{Connection, OpenFlags};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -171,7 +171,10 @@ impl<'d> Life<'d> {
                 let payload = json!({ "command": "register" });
                 let id = self.until_written(|| journal.intend(entry(RecordKind::Intent, payload.clone())));
                 assert!(Some(id) > self.id, "{}: command {id} after {:?}", self.at, self.id);
-                (AcknowledgedRecord { kind: RecordKind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
+                (
+                    AcknowledgedRecord { kind: RecordKind::Intent, mono_ns: number, command_id: Some(id), payload },
+                    Some(id),
+                )
             }
             Step::Outcome => {
                 let (payload, command_id) = (json!({ "event": "registered" }), self.id);
@@ -292,7 +295,8 @@ pub fn is_gone_on_with(folder: &Path, key: Option<&AuditKey>, at: &str) {
     let mut journal = Journal::open_with(folder, key.cloned()).unwrap_or_else(|error| panic!("{at}: {error}"));
     let open: Vec<_> = journal.open_intents().unwrap().iter().map(|record| record.command_id).collect();
     let answered = |id| before.iter().any(|record| record.kind == RecordKind::Outcome && record.command_id == id);
-    let intents: Vec<_> = before.iter().filter(|r| r.kind == RecordKind::Intent).map(|record| record.command_id).collect();
+    let intents: Vec<_> =
+        before.iter().filter(|r| r.kind == RecordKind::Intent).map(|record| record.command_id).collect();
     let unanswered: Vec<_> = intents.iter().copied().filter(|id| !answered(*id)).collect();
     assert_eq!(open, unanswered, "{at}");
     let id = journal.intend(Entry::new(RecordKind::Intent, 1000, 2, json!({ "command": "measure" }))).unwrap();

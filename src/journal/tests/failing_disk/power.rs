@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use regrind_disk::{Cut, Disk, Fault, Operation, Outcome, SeededNumbers};
-use regrind_journal::{AuditKey, Entry, Journal, JournalError, RecordKind, Reader, verify};
+use regrind_journal::{AuditKey, Entry, Journal, JournalError, Reader, RecordKind, verify};
 use rusqlite::Connection;
 use serde_json::json;
 

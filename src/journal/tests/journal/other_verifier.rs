@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use regrind_disk::SeededNumbers;
-use regrind_journal::{AuditKey, Entry, Journal, JournalError, RecordKind, Reader, verify};
+use regrind_journal::{AuditKey, Entry, Journal, JournalError, Reader, RecordKind, verify};
 use serde_json::{Value, json};
 
 use crate::tampering::{Tampering, copied, long_and_whole, place, tries};
@@ -72,8 +72,11 @@ fn verifiers_agree_on_sound_journals() {
     let words = "\"\\/\u{8}\t\n\u{c}\r\u{1}\u{1f}\u{7f}\u{85}\u{2028}\u{fffd}ü\u{1f600}";
     let driven = home.path().join("driven");
     let mut journal = Journal::create_with(&driven, header(), Some(AuditKey::new())).unwrap();
-    let entry =
-        Entry { actor: words.into(), reason: words.into(), ..Entry::new(RecordKind::Note, 7, 0, json!({ words: words })) };
+    let entry = Entry {
+        actor: words.into(),
+        reason: words.into(),
+        ..Entry::new(RecordKind::Note, 7, 0, json!({ words: words }))
+    };
     journal.append(entry).unwrap();
     journal.store("über/a b.csv", b"1,2\n", 8, 1).unwrap();
     let left = home.path().join("left");

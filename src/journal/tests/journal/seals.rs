@@ -7,8 +7,8 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
 use regrind_journal::{
-    Anchor, AuditKey, Entry, ExternalEvidence, Journal, JournalError, RecordKind, PublicKey, Reader, Record, SEALED_EVERY,
-    Verified, canonical_json, sha256_hex, verify, verify_against,
+    Anchor, AuditKey, Entry, ExternalEvidence, Journal, JournalError, PublicKey, Reader, Record, RecordKind,
+    SEALED_EVERY, Verified, canonical_json, sha256_hex, verify, verify_against,
 };
 use rusqlite::Connection;
 use serde_json::{Value, json};

@@ -4,7 +4,9 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind_journal::{AuditKey, Entry, ExternalEvidence, Journal, JournalError, RecordKind, Reader, verify, verify_against};
+use regrind_journal::{
+    AuditKey, Entry, ExternalEvidence, Journal, JournalError, Reader, RecordKind, verify, verify_against,
+};
 use rusqlite::Connection;
 use serde_json::json;
 

@@ -4,7 +4,7 @@ use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use ed25519_compact::{KeyPair, Seed};
-use regrind_journal::{Anchor, AuditKey, Entry, Header, Journal, RecordKind, Reader, canonical_json, sha256_hex};
+use regrind_journal::{Anchor, AuditKey, Entry, Header, Journal, Reader, RecordKind, canonical_json, sha256_hex};
 use rusqlite::Connection;
 use serde_json::{Value, json};
 use tempfile::TempDir;
