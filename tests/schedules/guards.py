@@ -61,7 +61,7 @@ GUARDS = {
     "what has not come on record is withdrawn while the disk is full": (
         "src/drive/mod.rs", "        if self.record_failure_reason.is_none() || self.ending.is_some() {\n", "        if true {\n"),
     "an abort of a lost I++ connection is given anew": (
-        "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == State::Aborting))", "saturating_sub(u64::from(state == State::Aborting && false))",
+        "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == MachineState::Aborting))", "saturating_sub(u64::from(state == MachineState::Aborting && false))",
         "device", "abort_is_first_after_reconnect"),
     "what an interrupted I++ job has left moving is aborted": (
         "src/device/ippdme/machine.rs", "moved.then_some(self.settings.silence_limit)", "moved.then_some(self.settings.silence_limit).filter(|_| false)"),
@@ -90,7 +90,7 @@ GUARDS = {
         "src/device/linuxcnc/machine/reconciling.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
         "linuxcnc", "ignored_start_unknown_until_reconcile"),
     "what is prepared is looked at before a START": (
-        "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode",
+        "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != MachineState::Prepared || seen.mode", "if seen.mode",
         "linuxcnc", "start_refuses_replaced_program"),
 }  # fmt: skip
 
