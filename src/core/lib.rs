@@ -19,7 +19,7 @@
 //!
 //! ```
 //! use regrind_core::geometry::Point;
-//! use regrind_core::registration::{Options, register};
+//! use regrind_core::registration::{RegistrationOptions, register};
 //! use regrind_core::surface::{Nominal, PlaneProjection};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -34,7 +34,7 @@
 //! let centres: Vec<Point> =
 //!     grid(20, 1.5).map(|(x, y)| Point::new(x + 250.0, y, height(dome_mm + probe_mm, x, y) - 40.0)).collect();
 //!
-//! let found = register(&nominal, &centres, &Options::new(probe_mm))?;
+//! let found = register(&nominal, &centres, &RegistrationOptions::new(probe_mm))?;
 //! assert!((found.cmm_from_model.translation_mm.x - 250.0).abs() < 1e-3);
 //! assert!(found.quality.rms_mm < 1e-5);
 //! // No measurement can determine the rotation of a sphere, and the verdict says so.

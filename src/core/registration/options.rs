@@ -89,7 +89,7 @@ impl Coordinate {
     }
 
     /// Returns one flag for each of x, y, z, rx, ry, rz, true if it is among `coordinates`; the form of
-    /// [`Options::locked`].
+    /// [`RegistrationOptions::locked`].
     pub fn locked_flags(coordinates: &[Self]) -> [bool; 6] {
         [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))
     }
