@@ -40,7 +40,7 @@ pub enum FormError {
     NoSlope { integration_mm: f64 },
 }
 
-/// Rejects samples that are too few or not finite.
+/// Returns an error if there are fewer than `least` samples, or if a number of a sample is not finite.
 pub(super) fn check(samples: &[DeviationSample], least: usize) -> Result<(), FormError> {
     if samples.len() < least {
         return Err(FormError::TooFewPoints { points: samples.len(), min_points: least });

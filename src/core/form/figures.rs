@@ -12,19 +12,19 @@ use crate::geometry::{Aperture, DeviationSample, bounds};
 
 /// Terms of the fit in PVr (Evans 2009: the first 36 Fringe Zernike polynomials).
 const PVR_TERMS: usize = 36;
-/// PV 99.8 % leaves out one point in this many at either end.
+/// Divisor of the number of points that PV 99.8 % omits at each end: 1 of 1000, see [`pv_998`].
 const PV_998_TRIM_DIVISOR: usize = 1000;
 /// Maximum number of cells for the coverage, along the longer side of the bounds.
 const MAX_CELLS: f64 = 64.0;
 /// Average number of points in a cell of the coverage.
 const POINTS_PER_CELL: f64 = 4.0;
 
-/// Options for the figures.
+/// Options of [`compute_figures`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct FormOptions {
     /// Aperture of the polynomials and the coverage. `None` for the bounds of the points.
     pub aperture: Option<Aperture>,
-    /// Forms to remove by least squares before anything else.
+    /// Forms to remove from the deviations by least squares before the figures are computed.
     pub removed: Vec<RemovedForm>,
     /// Wavelength that the ISO 10110-5 notation names.
     pub wavelength_nm: f64,
@@ -48,7 +48,7 @@ pub struct Extreme {
 /// Robust peak to valley (PVr): PV of a fit plus three times the rms of its residuals.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RobustPv {
-    /// PVr, the sum of both, in millimetres.
+    /// PVr: `fit_pv_mm` plus 3 times `residual_rms_mm`.
     pub value_mm: f64,
     /// PV of the fit at the points, in millimetres.
     pub fit_pv_mm: f64,
@@ -63,7 +63,7 @@ pub struct RobustPv {
 /// Measured part of the aperture.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Coverage {
-    /// Share of the cells within the aperture that hold a point.
+    /// Share of the cells within the aperture that contain a point, from 0 to 1.
     pub share: f64,
     /// Side of a cell, in millimetres.
     pub cell_mm: f64,
@@ -74,7 +74,7 @@ pub struct Coverage {
 pub struct DeviationFigures {
     /// Number of points.
     pub points: usize,
-    /// Forms removed before anything else.
+    /// Forms removed from the deviations before the figures were computed.
     pub removed: Vec<RemovedForm>,
     /// Largest minus smallest deviation.
     pub pv_mm: f64,
@@ -82,7 +82,7 @@ pub struct DeviationFigures {
     pub pvr: RobustPv,
     /// PV of all points without the outermost 0.2 %, by [`pv_998`].
     pub pv_998_mm: f64,
-    /// Root mean square about zero.
+    /// Root mean square of the deviations.
     pub rms_mm: f64,
     /// Mean deviation.
     pub mean_mm: f64,
@@ -165,9 +165,9 @@ fn robust_pv(fit: &PolynomialFit, samples: &[DeviationSample]) -> Result<RobustP
     })
 }
 
-/// Returns the peak to valley of all values without the outermost 0.2 %, half of them at either end: PV 99.8 %.
+/// Returns PV 99.8 %: the peak to valley of the values without the lowest 0.1 % and the highest 0.1 % of them.
 ///
-/// Only whole values are left out, never more than that share; with fewer than a thousand values, none is. Returns
+/// The number of values omitted at each end is rounded down: with fewer than 1000 values, none is omitted. Returns
 /// `None` if there are no values.
 pub fn pv_998(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
@@ -176,8 +176,9 @@ pub fn pv_998(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
-/// Computes the share of the cells within the aperture that hold a point. A cell has the size that four points take on
-/// average.
+/// Divides the bounds of the aperture into square cells, and computes the share of the cells within the aperture that
+/// contain a point. A cell has the area that contains four points on average, but its side is at least 1/64 of the
+/// longer side of the bounds.
 fn coverage(aperture: &Aperture, samples: &[DeviationSample]) -> Coverage {
     let [low, high] = aperture.bounds();
     let size: [f64; 2] = std::array::from_fn(|k| high[k] - low[k]);

@@ -1,10 +1,11 @@
 //! Least-squares fit of polynomials to the points at their measured positions.
 //!
-//! The rows [terms | deviation] are decomposed by QR in chunks. Only the small triangles R are kept. They are stacked
-//! in order and decomposed again, so the number of cores does not change the result. The last column of the final R
-//! contains Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram-Schmidt).
-//! Q^T d / sqrt(n) is the root mean square that each of them explains, whatever terms follow. R^-1 Q^T d are the
-//! coefficients of the terms themselves.
+//! The deviations d are the last column of the matrix [terms | d]. The rows of this matrix are decomposed by QR in
+//! chunks. Only the small triangles R are kept. They are stacked in order and decomposed again, so the number of cores
+//! does not change the result. The last column of the final R contains Q^T d. The columns of Q are the terms, each made
+//! orthogonal to those before it on the true aperture (Gram-Schmidt). Q^T d / sqrt(n), with n points, is the root mean
+//! square that each orthogonal term explains; later terms do not change it. R^-1 Q^T d are the coefficients of the
+//! terms themselves.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -16,9 +17,10 @@ use crate::geometry::DeviationSample;
 
 /// Number of rows in a chunk.
 const CHUNK_ROWS: usize = 512;
-/// Smallest share of a term that is independent of the terms before it. Below it the points do not determine the term.
+/// Minimum share of a term that is independent of the terms before it. With a smaller share, the points do not
+/// determine the term.
 const MIN_INDEPENDENT_SHARE: f64 = 1e-7;
-/// Fewest points per term of a fit that selects its number of terms.
+/// Minimum number of points per term in [`fit_determined_terms`].
 const POINTS_PER_TERM: usize = 4;
 
 /// Fit of polynomials to deviations.
@@ -26,10 +28,11 @@ const POINTS_PER_TERM: usize = 4;
 pub struct PolynomialFit {
     /// Polynomials of the fit.
     pub basis: PolynomialBasis,
-    /// Coefficient of each term in millimetres. The mean square of a term is 1 over the full disc or rectangle.
+    /// Coefficient of each term in millimetres. Each term is scaled to a mean square of 1 over the full disc or
+    /// rectangle.
     pub coefficients_mm: Vec<f64>,
-    /// Root mean square of the deviations that each term explains, in millimetres and with its sign, after the term is
-    /// made orthogonal on the points to those before it.
+    /// Signed contribution of each term to the root mean square of the deviations, in millimetres. Each term is first
+    /// made orthogonal, at the points, to the terms before it.
     pub orthogonal_mm: Vec<f64>,
     /// Root mean square of the residuals, in millimetres.
     pub residual_rms_mm: f64,
@@ -37,12 +40,13 @@ pub struct PolynomialFit {
     pub points: usize,
 }
 
-/// Fits the first terms of a basis to samples and returns the fit.
+/// Fits the first `terms` polynomials of a basis to samples by least squares.
 ///
 /// Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Fewer points than terms; a term that the points do not determine; a point that is not finite or far outside.
+/// Returns an error if the number of terms is out of range, if there are fewer points than terms, if the points do not
+/// determine a term, or if a point is not finite or lies more than 1.5 radii from the centre of a Zernike disc.
 pub fn fit_polynomials(
     basis: &PolynomialBasis,
     terms: usize,
@@ -64,10 +68,12 @@ pub fn fit_polynomials(
     })
 }
 
-/// Fits as many complete sets of terms as the points determine, with four points per term, and at most `most` terms.
+/// Fits as many polynomials as the points determine, at most `most`: complete orders only, with at least four points
+/// per term.
 ///
 /// # Errors
-/// Points that do not determine even one term, or that are not finite or far outside.
+/// Returns an error if the points do not determine even one term, or if a point is not finite or lies more than 1.5
+/// radii from the centre of a Zernike disc.
 pub fn fit_determined_terms(
     basis: &PolynomialBasis,
     most: usize,
@@ -87,7 +93,7 @@ impl PolynomialFit {
     /// Returns the value of the fit at every sample, in millimetres and in the order of the samples.
     ///
     /// # Errors
-    /// A sample far outside of the polynomials' domain.
+    /// Returns an error if a sample lies more than 1.5 radii from the centre of a Zernike disc.
     pub fn values_mm(&self, samples: &[DeviationSample]) -> Result<Vec<f64>, FormError> {
         let terms: Terms = self.basis.prepare_terms(self.coefficients_mm.len())?;
         let value = |row: &mut Vec<f64>, (index, sample): (usize, &DeviationSample)| {
@@ -107,11 +113,12 @@ pub(super) struct LeastSquaresSolution {
     pub(super) orthogonal: Vec<f64>,
     /// Root mean square of the residuals.
     pub(super) residual: f64,
-    /// First term that the points do not determine.
+    /// Index of the first term that the points do not determine; `None` if they determine all terms.
     pub(super) undetermined: Option<usize>,
 }
 
-/// Solves for the coefficients of functions whose values at a sample `row` writes.
+/// Fits a weighted sum of `terms` functions to the deviations by least squares. `row` is called with the index of a
+/// sample and the sample, and writes the values of all functions at that sample.
 pub(super) fn solve_least_squares(
     terms: usize,
     samples: &[DeviationSample],

@@ -18,7 +18,7 @@ use super::fit::solve_least_squares;
 use super::removed_forms::{RemovedForm, pv, remove_forms};
 use crate::geometry::{Aperture, DeviationSample};
 
-/// Half of the highest power of r of the symmetric part.
+/// Degree of the symmetric part as a polynomial in r^2; its highest power is r^12.
 pub(super) const MAX_SYMMETRIC_DEGREE: usize = 6;
 
 /// Power, irregularity and the related figures of the surface by ISO 10110-5, in nanometres.
@@ -32,11 +32,11 @@ pub struct Iso10110 {
     pub irregularity_nm: f64,
     /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric_nm: f64,
-    /// Root mean square of the total.
+    /// RMSt: root mean square of the deviations without piston and tilt.
     pub rms_total_nm: f64,
-    /// Root mean square of the irregularity.
+    /// RMSi: root mean square of the irregularity.
     pub rms_irregularity_nm: f64,
-    /// Root mean square of the part that is not symmetric.
+    /// RMSa: root mean square of the part of the irregularity that is not symmetric about the centre.
     pub rms_varying_nm: f64,
     /// Wavelength in the notation.
     pub wavelength_nm: f64,
@@ -44,7 +44,7 @@ pub struct Iso10110 {
     pub notation: String,
 }
 
-/// Computes the figures of ISO 10110-5 of deviations.
+/// Computes the ISO 10110-5 figures of deviations.
 ///
 /// Frame: model; symmetry is about the centre of the aperture's bounds. Units: samples in millimetres.
 ///
@@ -92,9 +92,10 @@ pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm
     Ok(found)
 }
 
-/// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 and returns the values of the fit at the samples. These
-/// polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer terms if the points do not
-/// determine all.
+/// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 to the samples and returns the values of the fit at the
+/// samples. `square` returns (r/R)^2 of a sample: r is its distance from the centre, R the largest distance of all
+/// samples. These polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer polynomials if the
+/// samples do not determine all of them.
 fn fit_symmetric_part(
     samples: &[DeviationSample],
     square: impl Fn(&DeviationSample) -> f64 + Sync,
@@ -115,7 +116,7 @@ fn fit_symmetric_part(
     }
 }
 
-/// Returns the values of the symmetric terms, given (r/R)^2.
+/// Returns the Legendre polynomials P_0 to P_6 at 2 `square` - 1: the terms of the symmetric part. `square` is (r/R)^2.
 pub(super) fn even_terms(square: f64) -> [f64; MAX_SYMMETRIC_DEGREE + 1] {
     let t = 2.0 * square - 1.0;
     let mut row = [1.0; MAX_SYMMETRIC_DEGREE + 1];
@@ -138,8 +139,8 @@ fn notation(found: &Iso10110) -> String {
     iso_10110_notation([power_nm, irregularity_nm, symmetric_nm], rms_nm, found.wavelength_nm)
 }
 
-/// Returns the indication of ISO 10110-5 with A, B and C, and with RMSt, RMSi and RMSa, every value rounded up. Units:
-/// nanometres.
+/// Returns the ISO 10110-5 notation of the values A, B, C, RMSt, RMSi and RMSa, each rounded up. All values and the
+/// wavelength are in nanometres.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
     let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(format_rounded_up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")

@@ -1,26 +1,28 @@
 //! ISO 10110-5 figures of many forms at the same places. The part that depends only on the places is computed once.
 //!
-//! The fits of [`super::iso_10110`] are projections: f minus its fit is f - Q Q'f, with Q the terms made orthogonal on
-//! the places. Q is computed once, and each form needs some twenty sums over the places.
+//! The fits of [`super::iso_10110`] are projections: the residual of a form f after a fit is f - Q Q'f, where the
+//! columns of Q are the terms, orthonormalised on the places. Q is computed once. Each form then needs some twenty sums
+//! over the places.
 
 use nalgebra::DMatrix;
 
 use super::iso::{MAX_SYMMETRIC_DEGREE, even_terms};
 
-/// Fewest places for a figure of an area.
+/// Minimum number of places for ISO 10110-5 figures.
 const MIN_PLACES: usize = 12;
-/// Smallest share of a term that is independent of the terms before it. Below it the places do not determine the term.
+/// Minimum share of a term that is independent of the terms before it. With a smaller share, the places do not
+/// determine the term.
 const MIN_INDEPENDENT_SHARE: f64 = 1e-7;
 
 /// Fits of ISO 10110-5 over a set of places.
 pub struct IsoFits {
-    /// Piston, x and y tilt and r^2, orthogonal, each with one value per place.
+    /// Piston, x tilt, y tilt and r^2, orthonormalised in this order, each with one value per place.
     quadric_terms: Vec<Vec<f64>>,
-    /// Coefficient of r^2 / R^2 for a unit of the last of these terms, and the peak to valley of r^2 / R^2 over the
-    /// places.
+    /// Coefficient of r^2 / R^2 per unit of the last quadric term, where R is the largest distance of a place from the
+    /// centre. The next field, `power_pv`, is the peak to valley of r^2 / R^2 over the places.
     power: f64,
     power_pv: f64,
-    /// Terms that are symmetric about the centre.
+    /// Terms that are symmetric about the centre, orthonormalised, each with one value per place.
     symmetric_terms: Vec<Vec<f64>>,
 }
 
@@ -35,11 +37,11 @@ pub struct IsoFormValues {
     pub irregularity_mm: f64,
     /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric_mm: f64,
-    /// Root mean square of the total.
+    /// RMSt: root mean square of the form without piston and tilt.
     pub rms_total_mm: f64,
-    /// Root mean square of the irregularity.
+    /// RMSi: root mean square of the irregularity.
     pub rms_irregularity_mm: f64,
-    /// Root mean square of the part that is not symmetric.
+    /// RMSa: root mean square of the part of the irregularity that is not symmetric about the centre.
     pub rms_varying_mm: f64,
 }
 
@@ -70,7 +72,7 @@ impl IsoFits {
         Some(Self { quadric_terms: base, power: 1.0 / scales[3], power_pv: most - least, symmetric_terms: even })
     }
 
-    /// Computes the figures of a form, given as one value per place, in their order.
+    /// Computes the figures of a form. `form` has one value in millimetres per place, in the order of the places.
     pub fn evaluate(&self, form: &[f64]) -> IsoFormValues {
         let n = form.len() as f64;
         let dot = |row: &[f64], with: &[f64]| row.iter().zip(with).map(|(a, b)| a * b).sum::<f64>();
@@ -103,8 +105,9 @@ impl IsoFits {
     }
 }
 
-/// Returns the terms made orthogonal in their order, and the diagonal of R: the independent part of each term, with its
-/// sign. Returns `None` if a term is not determined.
+/// Returns the orthonormalised columns of `rows` (the matrix Q of its QR decomposition) and the diagonal of R. Each
+/// diagonal element is the signed norm of the part of a column that is independent of the columns before it. Returns
+/// `None` if a column depends on those before it.
 fn orthogonalize(rows: &DMatrix<f64>) -> Option<(Vec<Vec<f64>>, Vec<f64>)> {
     let (q, r) = rows.clone().qr().unpack();
     let columns = q.column_iter().map(|column| column.iter().copied().collect()).collect();

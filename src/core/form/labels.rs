@@ -6,7 +6,7 @@ use super::figures::DeviationFigures;
 use super::removed_forms::RemovedForm;
 use super::slope::Slope;
 
-/// Direction of all figures.
+/// Direction label of all figures.
 pub const DIRECTION: &str = "along the outward normal of the nominal surface, positive where material stands proud";
 
 /// Figure with its label.
@@ -18,9 +18,9 @@ pub struct LabelledFigure {
     pub value: f64,
     /// Unit of the value.
     pub unit: &'static str,
-    /// Forms removed before.
+    /// Motions and forms removed from the deviations before the figure was computed, in words.
     pub removed: String,
-    /// Direction of the figure.
+    /// Direction of the deviations, in words: [`DIRECTION`].
     pub direction: &'static str,
     /// Part removed by the filter, or a note that there was no filter.
     pub cut_off: String,
@@ -40,14 +40,14 @@ pub struct RemovedParts {
 }
 
 impl RemovedParts {
-    /// Returns the words for the motion and for the removed forms, separated by commas.
+    /// Returns the removed motion and the names of the removed forms, separated by commas.
     pub fn describe(&self, forms: &[RemovedForm]) -> String {
         let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.name()));
         words.collect::<Vec<_>>().join(", ")
     }
 }
 
-/// Cut-off of figures that are computed from the points.
+/// Cut-off label of figures that are computed from the points, without a filter.
 pub const NO_CUT_OFF: &str = "none: every point used";
 
 /// Returns the figures of points with their labels, in the order of a report.

@@ -1,8 +1,8 @@
 //! Form figures of the deviations: PV, PVr, RMS, stock left and undercut, slopes, polynomials, ISO 10110-5.
 //!
 //! ```text
-//!  deviations (x, y, d) --+--> removed terms --> Figures    each with removed forms, direction and cut-off
-//!                         +--> Fit              Zernike or Legendre coefficients, orthogonal on the true aperture
+//!  deviations (x, y, d) --+--> RemovedForm --> DeviationFigures    each with removed forms, direction and cut-off
+//!                         +--> PolynomialFit     Zernike or Legendre coefficients, orthogonal on the true aperture
 //!  error map (on a grid) ----> Slope             over a stated integration length
 //! ```
 //!

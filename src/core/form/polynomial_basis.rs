@@ -30,7 +30,7 @@ pub enum PolynomialBasis {
     Legendre {
         /// Centre of the rectangle.
         centre_mm: [f64; 2],
-        /// Half of its size along x and y.
+        /// Half of the size of the rectangle along x and y.
         half_mm: [f64; 2],
     },
 }
@@ -75,7 +75,8 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the name of a term, counted from 0: index and degree with azimuthal order, or the two degrees.
+    /// Returns the name of the term with index `k`, from 0: `Z4 (2, 0)` for Zernike index 4 of degree 2 and azimuthal
+    /// order 0, or `L2(x) L1(y)` for a product of Legendre polynomials.
     pub fn term_name(&self, k: usize) -> String {
         match self {
             Self::Zernike { numbering, .. } => {
@@ -99,7 +100,7 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the largest complete number of terms up to `most`: no term lacks its companions of the same order.
+    /// Returns the largest number of terms, at most `most`, with which every order is complete; 0 if `most` is 0.
     pub(super) fn complete_terms(&self, most: usize) -> usize {
         let counts =
             |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
@@ -107,10 +108,10 @@ impl PolynomialBasis {
         counts(fringe).take_while(|count| *count <= most.min(self.max_terms())).last().unwrap_or(0)
     }
 
-    /// Prepares the first terms for evaluation.
+    /// Prepares the first `terms` polynomials for evaluation.
     ///
     /// # Errors
-    /// A number of terms out of range, and a domain without an area.
+    /// Returns an error if the number of terms is out of range, or if the disc or rectangle has no area.
     pub(super) fn prepare_terms(&self, terms: usize) -> Result<Terms, FormError> {
         if !(1..=self.max_terms()).contains(&terms) {
             return Err(FormError::Terms { terms, basis: self.name(), max_terms: self.max_terms() });
@@ -180,8 +181,8 @@ pub(super) struct AzimuthalOrder {
     m: u32,
     /// Number of radial polynomials needed.
     radial: usize,
-    /// For each term: its place in the row, (n - m) / 2, true if it is a sine, and the factor that makes its mean
-    /// square 1.
+    /// For each term: its index in the row, the index (n - m) / 2 of its radial polynomial, true if it is a sine, and
+    /// the factor that scales its mean square to 1.
     terms: Vec<(usize, usize, bool, f64)>,
 }
 
@@ -203,8 +204,9 @@ impl AzimuthalOrder {
     }
 }
 
-/// Writes the values of all terms. rho^m cos and rho^m sin are the parts of (u + i v)^m; the radial factor is P_k^(0,
-/// m)(2 rho^2 - 1).
+/// Writes the values of all Zernike terms at the point (u, v), in radii of the disc, to `row`. `q` is rho^2 = u^2 +
+/// v^2. The real and the imaginary part of (u + i v)^m are rho^m cos(m theta) and rho^m sin(m theta). The radial factor
+/// is the Jacobi polynomial P_k^(0, m)(2 rho^2 - 1).
 fn zernike(orders: &[AzimuthalOrder], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
     let mut power = [1.0, 0.0];
     let mut radial = [0.0; MAX_RADIAL_TERMS];
@@ -231,7 +233,8 @@ fn legendre(t: f64) -> [f64; DEGREES] {
     std::array::from_fn(|n| plain[n] * (2.0 * n as f64 + 1.0).sqrt())
 }
 
-/// Returns the degrees of a Legendre term in x and y: by rising total degree, then by falling degree of x.
+/// Returns the degrees in x and y of the Legendre term with index `k`. The terms are sorted by rising total degree,
+/// then by falling degree of x.
 fn degrees(k: usize) -> [usize; 2] {
     let sum = ((8 * k + 1).isqrt() - 1) / 2;
     let j = k - sum * (sum + 1) / 2;

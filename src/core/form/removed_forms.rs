@@ -1,4 +1,4 @@
-//! Simple forms that are removed from deviations before anything else.
+//! Simple forms that are removed from the deviations before figures are computed.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,22 +7,22 @@ use super::error::check;
 use super::fit::solve_least_squares;
 use crate::geometry::{DeviationSample, bounds};
 
-/// A simple form that is taken off before anything else.
+/// Simple form that is removed from the deviations before figures are computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum RemovedForm {
     /// A constant.
     Piston,
-    /// A tilt about any axis: x and y.
+    /// A tilt about any axis: the terms x and y.
     Tilt,
-    /// x^2 + y^2, as an error of the radius of curvature makes it.
+    /// The term x^2 + y^2: the effect of an error of the radius of curvature.
     Power,
-    /// x^2 - y^2 and 2 x y.
+    /// The terms x^2 - y^2 and 2 x y.
     Astigmatism,
-    /// (x^2 + y^2) x and (x^2 + y^2) y.
+    /// The terms (x^2 + y^2) x and (x^2 + y^2) y.
     Coma,
-    /// (x^2 + y^2)^2.
+    /// The term (x^2 + y^2)^2.
     Spherical,
 }
 

@@ -20,14 +20,14 @@ pub struct Slope {
     pub nodes: usize,
 }
 
-/// Returns the slopes of values on a grid. Each is the difference of two values an integration length apart, divided by
-/// that length.
+/// Computes the slopes of values on a grid. A slope is the difference of two values an integration length apart,
+/// divided by that length.
 ///
-/// Shapes: a value and a valid flag for every node. Units: millimetres. The length is rounded to an even number of
-/// steps, at least two. A node counts if its four neighbours at half the length are all valid.
+/// Shapes: a value and a valid flag for every node. Units: millimetres. The integration length is rounded to an even
+/// number of grid steps, at least two. A node has a slope if its four neighbours at half the length are all valid.
 ///
 /// # Errors
-/// A length that is not a finite number above 0, and a map without a node that counts.
+/// Returns an error if the length is not a finite number above 0, or if no node has a slope.
 pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
     if !(integration_mm > 0.0 && integration_mm.is_finite()) {
         return Err(FormError::Integration { integration_mm });

@@ -1,28 +1,29 @@
 //! Slopes of many forms at the same scattered places. The part that depends only on the places is computed once.
 //!
-//! The slope at a place is that of the least-squares plane through all places within R of it. This plane attenuates a
-//! wave by 1 - (k R)^2 / 12; a difference over a length L attenuates it by 1 - (k L)^2 / 24. So R = L / sqrt 2 has the
-//! integration length L.
+//! The slope at a place is the slope of the least-squares plane through the values at all places within a distance R.
+//! This plane attenuates a wave of wavenumber k by the factor 1 - (k R)^2 / 12. A difference over a length L attenuates
+//! the wave by 1 - (k L)^2 / 24. So a radius R = L / sqrt 2 gives the integration length L.
 
 use nalgebra::{Matrix2, SymmetricEigen, Vector2};
 
 use crate::geometry::bounds;
 
-/// Fewest places for a figure of an area, and fewest nodes at which the slopes represent the part.
+/// Minimum number of places, and minimum number of nodes (places with a slope), for slope figures.
 const MIN_PLACES: usize = 20;
 const MIN_NODES: usize = 6;
-/// Most nodes (places with a slope), and most places that each slope is computed from.
+/// Maximum number of nodes, and maximum number of places from which the slope of a node is computed.
 const MAX_NODES: usize = 1500;
 const MAX_NEIGHBOURS: usize = 24;
-/// Smallest radius, in mean distances between places: it reaches a little beyond the corners of a square.
+/// Minimum radius, in mean spacings of the places: a little more than the diagonal of a square with this spacing as
+/// side.
 const MIN_RADIUS_SPACINGS: f64 = 1.5;
-/// Limits and step for the radius. It grows by `LONGER` while less than `SHARE` of the nodes has a slope, up to
-/// `LONGEST` of the smaller side of the part.
+/// Limits and growth of the radius. The radius grows by the factor `RADIUS_GROWTH` while less than `MIN_NODE_SHARE` of
+/// the nodes have a slope. It is at most `MAX_RADIUS_SHARE` of the shorter side of the part.
 const MIN_NODE_SHARE: f64 = 0.25;
 const MAX_RADIUS_SHARE: f64 = 0.3;
 const RADIUS_GROWTH: f64 = 1.25;
-/// Smallest variance of the surrounding places along any direction, in squared radii, and largest offset of their
-/// centroid, in radii. Outside these limits a place lies at an edge.
+/// Minimum variance of the surrounding places along any direction, in squared radii, and maximum offset of their
+/// centroid, in radii. A place outside these limits lies at an edge and has no slope.
 const MIN_VARIANCE: f64 = 0.08;
 const MAX_CENTROID_OFFSET: f64 = 0.25;
 
@@ -32,15 +33,16 @@ pub struct SlopeOperator {
     pub integration_mm: f64,
     /// Number of nodes.
     pub nodes: usize,
-    /// Start of each node in `weights`, and the end of the last.
+    /// Index in `weights` at which each node starts, followed by the length of `weights`.
     node_starts: Vec<usize>,
-    /// Index of a place, and its weights for the slope along x and along y.
+    /// Index of a place near a node, and the weights of its value for the slopes of that node along x and y.
     weights: Vec<(usize, [f64; 2])>,
 }
 
 impl SlopeOperator {
-    /// Builds the weights for an integration length. If the places do not allow it, uses the shortest longer one that
-    /// they allow. Without a given length it uses the shortest possible. Returns `None` if the places allow no length.
+    /// Builds the weights for an integration length. `None` selects the shortest length that the places allow. If the
+    /// places are too far apart for the given length, it is increased. Returns `None` if the places are too few or
+    /// allow no length.
     ///
     /// Frame: model. Units: millimetres.
     pub fn new(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
@@ -82,8 +84,8 @@ impl SlopeOperator {
         Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, node_starts: begins, weights }
     }
 
-    /// Returns the root mean square and the largest of the slopes of a form, in radians. The form has one value per
-    /// place, in their order.
+    /// Returns the root mean square and the maximum of the slopes of a form, in radians. `form` has one value in
+    /// millimetres per place, in the order of the places.
     pub fn evaluate(&self, form: &[f64]) -> [f64; 2] {
         let (mut squares, mut most) = (0.0, 0.0_f64);
         for ends in self.node_starts.windows(2) {
@@ -100,8 +102,9 @@ impl SlopeOperator {
     }
 }
 
-/// Returns the weight of each place around one for the slope of a plane through them; `None` if they do not lie all
-/// around it.
+/// Returns the places within the radius around the place `of`, each as its index and the weights of its value for the
+/// slopes along x and y of a least-squares plane. `order` has the indices of all places, sorted by x. Returns `None` if
+/// there are fewer than four such places, or if they do not surround the place.
 fn plane_slope_weights(
     places: &[[f64; 2]],
     order: &[usize],

@@ -109,13 +109,13 @@ impl ApertureError {
 }
 
 impl Aperture {
-    /// Returns the rectangle between two corners, the lower and the upper.
+    /// Returns the rectangle with the corners `[x min, y min]` and `[x max, y max]`.
     pub(crate) fn from_corners([low, high]: [[f64; 2]; 2]) -> Self {
         let centre_mm = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])];
         Self::Rectangle { centre_mm, width_mm: high[0] - low[0], height_mm: high[1] - low[1] }
     }
 
-    /// Checks that the numbers describe an outline with an inside.
+    /// Checks that the numbers describe a closed outline with an area above 0.
     ///
     /// # Errors
     /// Returns an error if a coordinate or size is not finite or is too large, if a size is not positive, if a hole is
@@ -248,7 +248,8 @@ impl Aperture {
 
     /// Returns the distance from the origin to the aperture's farthest point.
     ///
-    /// Units: millimetres. An ellipse off the origin is evaluated at 720 places, which is within 1e-5 of the distance.
+    /// Units: millimetres. For an ellipse off the origin, the distance is the maximum over 720 points of the outline;
+    /// its relative error is at most 1e-5.
     pub fn reach_mm(&self) -> f64 {
         match self {
             Self::Circle { centre_mm: [x, y], radius_mm: r }
@@ -257,10 +258,11 @@ impl Aperture {
         }
     }
 
-    /// Returns fixed places spread over the aperture and along its outline, some hundred of each.
+    /// Returns a fixed set of places: those of 800 places spread over the bounds that lie in the aperture, then at
+    /// least 240 places along the outline.
     ///
-    /// Units: millimetres. Inside, the places follow the additive recurrence of the plastic number, which leaves no
-    /// gaps and forms no lattice.
+    /// Units: millimetres. The places inside follow the additive recurrence of the plastic number, a sequence that
+    /// leaves no gaps and forms no lattice.
     pub(crate) fn places_mm(&self) -> Vec<[f64; 2]> {
         let [least, most] = self.bounds();
         let plastic = 1.324_717_957_244_746_f64;
@@ -275,7 +277,7 @@ impl Aperture {
     }
 }
 
-/// Checks the coordinates of a point.
+/// Checks that the coordinates of a point are numbers of at most [`MAX_COORDINATE_MM`] in magnitude.
 fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
     match point.iter().find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_MM) {
         Some(&value_mm) => Err(ApertureError::Coordinate { key, value_mm }),
@@ -283,12 +285,12 @@ fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), Aperture
     }
 }
 
-/// Checks a size.
+/// Checks that a size is above 0 and at most [`MAX_COORDINATE_MM`].
 fn check_size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
     if value_mm > 0.0 && value_mm <= MAX_COORDINATE_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
 }
 
-/// Checks that corners in order make a simple polygon.
+/// Checks that the corners, in order, form a simple polygon.
 fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
     let count = corners.len();
     if !(3..=MAX_CORNERS).contains(&count) {
@@ -318,12 +320,13 @@ fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
     Ok(())
 }
 
-/// Returns the edges of a closed polygon, the last one back to the first corner.
+/// Returns the edges of a closed polygon. The last edge returns to the first corner.
 fn edges(corners: &[[f64; 2]]) -> impl Iterator<Item = [[f64; 2]; 2]> + '_ {
     corners.iter().zip(corners.iter().cycle().skip(1)).map(|(p, q)| [*p, *q])
 }
 
-/// Returns places along the edges of a closed polygon: each corner, and equally many places between on every edge.
+/// Returns at least `count` places along the edges of a closed polygon: each corner, and the same number of places on
+/// every edge between its corners.
 fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     let steps = count.div_ceil(corners.len()).max(1);
     let places = edges(corners).flat_map(|[p, q]| {
@@ -341,7 +344,7 @@ fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
     (p[1] > y) != (q[1] > y) && x < p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
 }
 
-/// Returns twice the signed area of a triangle.
+/// Returns twice the signed area of a triangle, positive if p, q and r are in anticlockwise order.
 fn orient2d(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
     (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
 }
@@ -371,11 +374,11 @@ fn segment_distance([p, q]: [[f64; 2]; 2], x: f64, y: f64) -> f64 {
     (x - p[0] - t * ex).hypot(y - p[1] - t * ey)
 }
 
-/// Returns the distance of a place outside an ellipse about the origin; 0 inside.
+/// Returns the distance of a place outside an ellipse about the origin with the semi-axes a and b; 0 inside.
 ///
-/// The foot of the perpendicular is (a^2 x / (t + a^2), b^2 y / (t + b^2)), with t >= 0 such that it lies on the
-/// ellipse. That condition is convex and decreases in t, so that Newton's steps from 0 approach the root from below and
-/// never pass it.
+/// The nearest point of the ellipse is (a^2 x / (t + a^2), b^2 y / (t + b^2)), where t >= 0 is chosen so that this
+/// point lies on the ellipse. The condition for t is convex and decreases in t. Therefore Newton's steps from 0
+/// approach the root from below and never pass it.
 fn ellipse_distance([a, b]: [f64; 2], x: f64, y: f64) -> f64 {
     if (x / a).hypot(y / b) <= 1.0 {
         return 0.0;

@@ -6,9 +6,10 @@ use super::Point;
 const MAX_MEDIAN_RATIO: f64 = 50.0;
 
 /// Returns the index of the point that is farthest from the middle of all points, and its distance, if that distance is
-/// more than `FAR` times the median distance. The middle is the median of each coordinate.
+/// more than [`MAX_MEDIAN_RATIO`] times the median distance. The middle is the median of each coordinate.
 ///
-/// Units: millimetres. Returns `None` for fewer than three points, or if half of them coincide.
+/// Units: millimetres. Returns `None` if no point is that far, if there are fewer than three points, or if half of the
+/// points coincide.
 pub(crate) fn find_far_off(points: &[Point]) -> Option<(usize, f64)> {
     if points.len() < 3 {
         return None;

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum number of nodes of a grid: a correction is read back over a wire.
+/// Maximum number of nodes of a grid. It limits the size of a correction, which is read back from the machine over a
+/// connection.
 const MAX_NODES: f64 = 4e6;
 
 /// Regular grid over x and y of the model frame; nodes run row by row, x fastest.
@@ -19,7 +20,7 @@ pub struct Grid {
     pub spacing_mm: [f64; 2],
 }
 
-/// Reason why a grid cannot be made.
+/// Reason why a grid cannot be built.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -110,7 +111,8 @@ impl Grid {
         Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
     }
 
-    /// Returns values on another grid, interpolated; if the grids are equal, the values are unchanged.
+    /// Interpolates values on this grid to the nodes of the grid `onto`. Returns the values unchanged if the grids are
+    /// equal.
     pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
         if self == onto {
             return values.to_vec();
@@ -118,8 +120,8 @@ impl Grid {
         (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
     }
 
-    /// Returns the cell that a place lies in, or the nearest cell: along x and along y, its lower node and the fraction
-    /// of the way to the next node.
+    /// Returns the cell that contains a place, or the nearest cell if the place lies outside the grid. For x and for y,
+    /// the result has the index of the lower node, and the position between this node and the next, from 0 to 1.
     pub fn cell(&self, place_mm: [f64; 2]) -> [(usize, f64); 2] {
         [0, 1].map(|k| {
             let nodes = self.counts()[k];
@@ -129,8 +131,8 @@ impl Grid {
         })
     }
 
-    /// Returns the bilinear value at a place between the nodes; beyond the border, the value at the nearest place on
-    /// it.
+    /// Returns the bilinear interpolation of values at a place. Beyond the border, returns the value at the nearest
+    /// place on the border.
     pub fn interpolate(&self, values: &[f64], place_mm: [f64; 2]) -> f64 {
         let [(i, u), (j, v)] = self.cell(place_mm);
         let at = |i: usize, j: usize| values[j.min(self.rows - 1) * self.columns + i.min(self.columns - 1)];

@@ -11,7 +11,7 @@ const NODE_TOLERANCE: f64 = 0.02;
 /// Marks a node that has no point.
 pub const NO_POINT: u32 = u32::MAX;
 
-/// Cloud as a grid over the xy plane: the point at each node.
+/// Point cloud that is a regular grid over x and y.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GriddedCloud {
     /// Number of nodes along x.
@@ -31,24 +31,23 @@ impl GriddedCloud {
     }
 }
 
-/// Cloud whose points are row by row, x fastest, without a hole.
+/// Point cloud in grid order: row by row, x fastest, without a hole.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct OrderedGrid {
     pub(crate) columns: usize,
     pub(crate) rows: usize,
-    /// First and last node, in x and y.
+    /// Lower and upper corner of the grid: x and y of the first and of the last node.
     pub(crate) corners: [[f64; 2]; 2],
 }
 
-/// Largest difference in x of two points of one column, as a share of the extent: a smaller one is rounding. It applies
-/// to y in a row too.
+/// Maximum difference in x between a point and its column, and in y between a point and its row, as a share of the
+/// extent. A smaller difference is rounding.
 const COLUMN_TOLERANCE: f64 = 5e-7;
 
-/// Recognises a whole regular grid whose points are row by row, x fastest, in one pass and without a copy of the
-/// points.
+/// Recognises a complete regular grid whose points are row by row, x fastest, in one pass and without a copy of the
+/// points. Returns `None` for all other points.
 ///
-/// Every grid that it recognises, [`recognise_grid`] recognises too. That one also recognises grids in another order
-/// and grids with holes.
+/// [`recognise_grid`] recognises all these grids too, and also grids in another order and grids with holes.
 pub(crate) fn recognise_ordered_grid(points: &[Point]) -> Option<OrderedGrid> {
     let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
     let rows = points.len() / columns;
@@ -117,8 +116,9 @@ struct UniformAxis {
 }
 
 impl UniformAxis {
-    /// Finds the spacing as the smallest gap between the sorted coordinates of a sample. The sample works for any order
-    /// of the points.
+    /// Finds the spacing of the coordinates: the smallest gap between the sorted coordinates of a sample of the points.
+    /// The sample works for any order of the points. Returns `None` if a coordinate is not finite, if all are equal, or
+    /// if the gap gives 60,000 steps or more.
     fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
         let (low, high) = points
             .par_chunks(8192)

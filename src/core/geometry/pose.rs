@@ -16,8 +16,8 @@ pub type Twist = Vector6<f64>;
 /// digits to cancellation there; four terms of the series are exact to the last bit.
 const SERIES_BELOW_RAD: f64 = 0.02;
 
-/// Largest deviation from a rotation at which a matrix from outside is orthonormalised; a matrix with a larger one is
-/// rejected.
+/// Maximum entry of |R R^T - 1| at which a matrix R from outside counts as a rotation and is orthonormalised. A matrix
+/// with a larger entry is rejected.
 const ROTATION_TOLERANCE: f64 = 1e-4;
 
 /// Rigid motion: a rotation followed by a translation.
@@ -52,7 +52,7 @@ pub enum PoseError {
 }
 
 impl Pose {
-    /// Returns the pose that moves nothing.
+    /// Returns the identity pose, which moves no point.
     pub fn identity() -> Self {
         Self { rotation: Matrix3::identity(), translation_mm: Vector::zeros() }
     }
@@ -94,7 +94,7 @@ impl Pose {
         Self { rotation, translation_mm: -(rotation * self.translation_mm) }
     }
 
-    /// Moves a point.
+    /// Transforms a point: rotates it about the origin, then translates it.
     #[inline]
     pub fn transform_point(&self, p: &Point) -> Point {
         Point::from(self.rotation * p.coords + self.translation_mm)
@@ -168,7 +168,7 @@ impl std::ops::Mul for Pose {
     }
 }
 
-/// Returns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3.
+/// Returns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 for t = `theta`, in radians.
 fn exponential_coefficients(theta: f64) -> [f64; 3] {
     let t2 = theta * theta;
     if theta < SERIES_BELOW_RAD {

@@ -12,11 +12,11 @@ use thiserror::Error;
 
 use super::{Point, Pose, Vector};
 
-/// Smallest ratio of the spread across a line to the spread along it; with a smaller ratio the points do not fix the
-/// rotation about the line.
+/// Minimum ratio of the spread of the points across their longest direction to the spread along it. With a smaller
+/// ratio the points nearly lie on a line, and do not determine the rotation about it.
 const MIN_WIDTH_SHARE: f64 = 1e-3;
-/// Smallest ratio of the spread out of a plane to the largest spread; with a smaller ratio the points cannot reveal a
-/// mirror image.
+/// Minimum ratio of the spread out of a plane to the largest spread. With a smaller ratio the points cannot show
+/// whether one set is a mirror image of the other.
 const MIN_DEPTH_SHARE: f64 = 1e-2;
 
 /// Result of a rigid fit.

@@ -9,9 +9,10 @@ use crate::surface::{FacetIndex, Nominal, OffsetSurface, Side};
 
 /// Maximum number of targets: more than a machine measures in a week.
 const MAX_TARGETS: f64 = 1e7;
-/// Largest distance beyond the edge, in millimetres, that counts as on the part: it is rounding.
+/// Maximum distance beyond the edge, in millimetres, at which a point counts as on the part. Such a distance is
+/// rounding.
 const EDGE_TOLERANCE_MM: f64 = 1e-6;
-/// Maximum number of iterations; after that a place counts as not on the surface.
+/// Maximum number of iterations in the search of a target; after that, the target counts as not on the surface.
 const MAX_ITERATIONS: usize = 50;
 
 /// Place to touch: a point of the nominal surface and its outward unit normal, in the model frame.
@@ -34,11 +35,11 @@ pub enum Layout {
     SpiralSpacing(f64),
     /// Spiral from the middle with about this number of points.
     SpiralPoints(u32),
-    /// The points of the nominal surface nearest to these.
+    /// Points of the nominal surface nearest to the given points, in the given order.
     Points(Vec<Point>),
 }
 
-/// Reason why there are no targets.
+/// Reason why no targets can be computed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -78,8 +79,8 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     Ok(found)
 }
 
-/// Returns targets spread evenly over the upper half of a reference sphere, for a probe that comes from above. They are
-/// in the frame of `centre`, in millimetres.
+/// Returns `count` targets spread evenly over the upper half of a reference sphere, for a probe that comes from above.
+/// The targets are in the frame of `centre`, in millimetres.
 pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target> {
     // Equal areas from the pole down to 80 degrees, each turned by the golden angle.
     let lowest = 80f64.to_radians().cos();
@@ -178,7 +179,8 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
     }
 }
 
-/// Walk over the surface from target to target.
+/// Search of targets on the surface, one after another. Each search starts at the facet and the height of the target
+/// before.
 struct SurfaceWalk<'a> {
     surface: OffsetSurface<'a>,
     facet: FacetIndex,
@@ -194,8 +196,9 @@ impl<'a> SurfaceWalk<'a> {
         Self { surface, facet: FacetIndex::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
-    /// Finds the point of the surface over x and y by Newton's method on the height: each step intersects the vertical
-    /// line with the tangent plane at the foot.
+    /// Finds the point of the surface over x and y by Newton's method on the height. Each step intersects the vertical
+    /// line through x and y with the tangent plane at the projection of the current point. Returns `None` if the
+    /// surface is nearly vertical, if the iteration does not converge, or if the point lies beyond the edge.
     fn target_at(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
         let mut p = Point::new(x, y, self.z);
         for _ in 0..MAX_ITERATIONS {
@@ -224,7 +227,8 @@ impl<'a> SurfaceWalk<'a> {
         (foot.beyond_edge_mm <= EDGE_TOLERANCE_MM && near).then_some(target)
     }
 
-    /// Returns true if the surface continues for the margin in every direction.
+    /// Returns true if the target lies within the outline, and if the surface extends at least `margin_mm` around it,
+    /// in eight directions.
     fn is_inside(&self, target: &Target, margin_mm: f64) -> bool {
         let outline = self.surface.nominal().outline();
         let (u, _) = frame(&target.normal);
@@ -241,7 +245,8 @@ impl<'a> SurfaceWalk<'a> {
     }
 }
 
-/// Returns two unit vectors perpendicular to a normal; the first is close to x unless the normal is.
+/// Returns two unit vectors perpendicular to a normal and to each other. The first is the projection of the x axis, or
+/// of the y axis if the normal is close to x.
 fn frame(normal: &Vector) -> (Vector, Vector) {
     let x = if normal.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
     let u = (x - normal * normal.dot(&x)).normalize();

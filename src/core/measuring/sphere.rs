@@ -38,7 +38,8 @@ pub enum SphereFitError {
 /// Minimum number of points: one more than the unknowns, so that the fit can be judged.
 const MIN_POINTS: usize = 5;
 
-/// Fits a sphere by least squares of the distances from it, by Gauss-Newton starting from the algebraic fit.
+/// Fits a sphere by least squares of the distances of the points from the sphere: Gauss-Newton, starting from the
+/// algebraic fit.
 ///
 /// # Errors
 /// Returns an error if there are fewer than five points, if the points lie on a plane, or if a coordinate is not
@@ -72,8 +73,8 @@ pub fn fit_sphere(points: &[Point]) -> Result<SphereFit, SphereFitError> {
     if finite && radius > 0.0 { Ok(fit) } else { Err(SphereFitError::Degenerate) }
 }
 
-/// Returns centre and radius of the algebraic fit: solves |p|^2 = 2 p.c + (r^2 - |c|^2), which is linear, about the
-/// centroid of the points.
+/// Returns centre and radius of the algebraic fit. It solves |p|^2 = 2 p.c + (r^2 - |c|^2), which is linear, about the
+/// centroid of the points. Returns `None` if the points lie on a plane.
 fn algebraic(points: &[Point], middle: &nalgebra::Vector3<f64>) -> Option<(nalgebra::Vector3<f64>, f64)> {
     let (mut normal, mut right) = (Matrix4::zeros(), Vector4::zeros());
     let size = points.iter().map(|p| (p.coords - middle).norm()).fold(0.0, f64::max);

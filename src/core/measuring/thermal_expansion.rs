@@ -8,18 +8,19 @@ pub const REFERENCE_TEMPERATURE_C: f64 = 20.0;
 /// Thermal expansion of the part and of the scales that measure it. Both have the reported temperature.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ThermalExpansion {
-    /// Expansion of the part, per kelvin.
+    /// Coefficient of thermal expansion of the part, per kelvin.
     pub part_per_k: f64,
-    /// Standard uncertainty of the expansion of the part, per kelvin.
+    /// Standard uncertainty of `part_per_k`, per kelvin.
     pub part_sigma_per_k: f64,
-    /// Expansion of the scales that the machine does not correct itself, per kelvin.
+    /// Coefficient of thermal expansion of the scales, as far as the machine does not compensate it, per kelvin.
     pub scales_per_k: f64,
     /// Standard uncertainty of the reported temperature, in kelvins.
     pub temperature_sigma_k: f64,
 }
 
 impl ThermalExpansion {
-    /// Returns the measured value of a length of 1 at a temperature in degrees Celsius.
+    /// Returns the measured length of a part at `temperature_c` (degrees Celsius) divided by its length at 20 degrees
+    /// Celsius.
     pub fn length_factor(&self, temperature_c: f64) -> f64 {
         1.0 + (self.part_per_k - self.scales_per_k) * (temperature_c - REFERENCE_TEMPERATURE_C)
     }
@@ -30,11 +31,12 @@ impl ThermalExpansion {
         by_temperature.hypot(self.part_sigma_per_k * (temperature_c - REFERENCE_TEMPERATURE_C))
     }
 
-    /// Returns points of a part at a temperature as they would be at 20 degrees Celsius, scaled about their centroid.
+    /// Converts points of a part, measured at `temperature_c` (degrees Celsius), to their positions at 20 degrees
+    /// Celsius, by scaling about their centroid.
     ///
-    /// Frame: any. The scaling also moves a probe centre nearer to the surface by the same factor, so its radius is the
-    /// radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the ball itself is already in the radius
-    /// that was found on the reference sphere.
+    /// Frame: any. If the points are probe centres, the scaling also moves them nearer to the surface. Their distance
+    /// from the surface is then the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of
+    /// the ball itself is already in the radius that was found on the reference sphere.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;
         let middle = Point::from(points.iter().map(|p| p.coords).sum::<crate::geometry::Vector>() / n);

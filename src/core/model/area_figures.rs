@@ -15,22 +15,22 @@ use crate::form::{IsoFits, IsoFormValues, SlopeOperator};
 pub struct AreaOptions {
     /// Centre of symmetry, x and y of the model frame; `None` for the centre of the bounds of the places.
     pub middle_mm: Option<[f64; 2]>,
-    /// Length over which slopes are taken; it is increased if the places are too far apart for it. `None` for the
+    /// Integration length of the slopes. It is increased if the places are too far apart for it. `None` for the
     /// shortest length that the places allow.
     pub integration_mm: Option<f64>,
 }
 
-/// Slopes of the smooth form; their uncertainty includes those of its pose and of the noise of the probe. Form that is
-/// too narrow to be distinguished from noise has a height but no measurable slope, so it is not included.
+/// Slopes of the smooth form. Their uncertainty includes the uncertainty of the pose and the noise of the probe. Form
+/// that is too narrow to be distinguished from noise is not included, because its slope cannot be measured.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct SlopeFigures {
     /// Root mean square of the length of the gradient.
     pub rms: AngleInterval,
     /// Maximum length of the gradient.
     pub largest: AngleInterval,
-    /// Length over which the slopes were taken.
+    /// Integration length of the slopes.
     pub integration_mm: f64,
-    /// Number of places at which a slope was taken; edges have none.
+    /// Number of places with a slope; places at an edge have none.
     pub places: usize,
 }
 
@@ -56,7 +56,7 @@ pub struct IsoFigures {
     pub irregularity: Interval,
     /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric: Interval,
-    /// RMSt: root mean square of the total.
+    /// RMSt: root mean square of the form without piston and tilt.
     pub rms_total: Interval,
     /// RMSi: root mean square of the irregularity.
     pub rms_irregularity: Interval,
@@ -65,8 +65,9 @@ pub struct IsoFigures {
 }
 
 impl SlopeFigures {
-    /// Computes the figures of smooth forms, a column each: the first matrix is for the figures, the second one raises
-    /// the upper ends of the maximum.
+    /// Computes the slope figures from sampled forms. Each matrix has one column per form. The first matrix gives the
+    /// intervals. The second matrix only raises the upper end of the maximum slope. If `is_seen` is false, the lower
+    /// ends are 0.
     pub(super) fn from_forms(
         slopes: &SlopeOperator,
         forms: &[DMatrix<f64>; 2],
@@ -88,8 +89,9 @@ impl SlopeFigures {
 }
 
 impl IsoFigures {
-    /// Computes the figures of forms, a column each: the first matrix is for the figures, the second one raises the
-    /// upper ends of extremes.
+    /// Computes the figures from sampled forms. Each matrix has one column per form. The first matrix gives the
+    /// intervals. The second matrix only raises the upper ends of the PV of irregularity and symmetric part. If
+    /// `is_seen` is false, the lower ends are 0, except that of `power_rim`.
     pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| fits.evaluate(form)));
         let values = |k: usize, of: fn(&IsoFormValues) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
@@ -113,7 +115,7 @@ impl IsoFigures {
     }
 }
 
-/// Applies `make` to each column and returns the results in their order.
+/// Calls `make` for each column and returns the results in the order of the columns.
 fn map_columns<T: Send>(forms: &DMatrix<f64>, make: impl Fn(&[f64]) -> T + Send + Sync) -> Vec<T> {
     forms.as_slice().par_chunks(forms.nrows().max(1)).map(make).collect()
 }

@@ -33,9 +33,9 @@ pub(super) struct Basis {
     middle_mm: [f64; 2],
     halves_mm: [f64; 2],
     degree: usize,
-    /// Degrees of each polynomial along and across.
+    /// Degrees of each polynomial along u and v.
     degrees: Vec<[usize; 2]>,
-    /// Orders a and b of each cosine.
+    /// Orders a and b of each cosine along u and v.
     orders: Vec<[usize; 2]>,
     /// Highest order along each axis, plus one.
     counts: [usize; 2],
@@ -208,10 +208,11 @@ impl BasisGrid {
     }
 }
 
-/// Returns the spectral density of a field of variance 1, in mm^2.
+/// Returns the spectral density of a field of variance 1, in mm^2, at the squared wavenumber `number2` = w^2, in 1 /
+/// mm^2.
 ///
-/// The covariance is exp(-2 (r / range)^2), or Matern's with kappa^2 = 8 nu / range^2. The density of the latter is 4
-/// pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
+/// The covariance is exp(-2 (r / range)^2), or Matern's with kappa^2 = 8 nu / range^2. The spectral density of Matern's
+/// covariance is 4 pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
 fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return 0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp();
@@ -220,7 +221,8 @@ fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> 
     2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
 }
 
-/// Returns the share of the variance in waves of a larger wavenumber: the integral of the density outside a circle.
+/// Returns the share of the variance of a field in waves whose squared wavenumber is above `number2`, in 1 / mm^2: the
+/// integral of the spectral density outside a circle.
 fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return (-number2 * range_mm.powi(2) / 8.0).exp();

@@ -1,8 +1,8 @@
 //! Uncertainty budget of the figures, source by source.
 //!
-//! Near the sampled forms, a figure is approximated by a sum over places of the form times its mean derivative there.
-//! The variance of that sum is decomposed exactly, for the most probable field. The uncertainty of the figure itself,
-//! from the sampled forms, is divided in that proportion.
+//! Near the sampled forms, a figure is approximated by a sum over places of the form times the mean derivative of the
+//! figure at that place. The variance of that sum is decomposed exactly, for the most probable field. The standard
+//! uncertainty of the figure itself, from the sampled forms, is divided in the same proportions.
 
 use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
@@ -19,15 +19,15 @@ use super::{Observations, orthonormal_base};
 pub struct BudgetEntry {
     /// Source of the contribution.
     pub source: UncertaintySource,
-    /// True if the size of the source is known; if not, it counts as 0.
+    /// True if the standard uncertainty of the source is stated; if not, the source counts as 0.
     pub is_stated: bool,
     /// Contribution to the standard uncertainty of the root mean square, in mm.
     pub rms_mm: f64,
-    /// Contribution to that of PV 99.8 % (without the outermost 0.1 % at either end), in mm.
+    /// Contribution to the standard uncertainty of PV 99.8 % (without the outermost 0.1 % at either end), in mm.
     pub pv_99_8_mm: f64,
 }
 
-/// Components of a variance.
+/// Components of a variance, by source.
 struct VarianceComponents {
     /// Noise of the points.
     noise: f64,
@@ -39,11 +39,11 @@ struct VarianceComponents {
     random_effects: Vec<f64>,
 }
 
-/// Decomposes the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per source; empty if the
-/// decomposition fails.
+/// Decomposes `uncertainties_mm`, the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per
+/// source; empty if the decomposition fails.
 ///
-/// `ground_in` is the form that each random effect has ground into the part, after its own best fit: a row per place, a
-/// column per effect. It is `None` before the first correction.
+/// `ground_in` has one row per place and one column per random effect: the form that one standard uncertainty of the
+/// effect has ground into the part, after its best fit. It is `None` before the first correction.
 pub(super) fn decompose(
     (observed, sources): (&Observations, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -75,12 +75,14 @@ pub(super) fn decompose(
     UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
-/// Decomposes the variance of a sum a'f over places. The coefficients of the field are sigma D z, with z of variance 1;
-/// the coordinates of the points are sigma B z.
+/// Decomposes the variance of the sum a'f, where f is the form at `places` and a are the given `slopes`. The
+/// coefficients of the field are sigma D z: D are the standard deviations of the node, and z is independent with
+/// variance 1. The coordinates of the points are sigma B z, with B from [`FieldHypotheses::with_effects`].
 ///
-/// If the motions are known, w'd estimates the sum. In the variance of its error, the noise has the part s^2 w'w, a
-/// random effect (w'e)^2, and the field the remainder. The increase of the variance when the motions are unknown is the
-/// part of the pose.
+/// If the motions were known, w'd would estimate the sum, with the observed coordinates d and weights w. The variance
+/// of the error of this estimate has three parts: s^2 w'w from the noise s, (w'e)^2 from each random effect e, and the
+/// remainder from the field. The pose contributes the increase of the variance when the motions are unknown. Returns
+/// `None` if there is no hypothesis or a covariance is singular.
 fn parts(
     observed: &Observations,
     fields: &FieldHypotheses,
@@ -142,11 +144,11 @@ fn parts(
 }
 
 /// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the
-/// sampled forms. Also returns, for each column of `ground_in`, the mean square of the derivative along it. Components
-/// along the motions are removed, because a best fit removes the motions.
+/// sampled forms. Also returns, for each column of `ground_in`, the mean square of the derivative along that column.
+/// Components along the motions are removed, because a best fit removes the motions.
 ///
-/// An effect that was ground in is itself a form: its derivative is as often positive as negative over the samples, so
-/// the mean is 0, but the mean square is not.
+/// An effect that was ground into the part is itself form. The derivative along it is as often positive as negative
+/// over the samples, so its mean is 0, but its mean square is not.
 fn slopes(drawn: &SampledForms, ground_in: Option<&DMatrix<f64>>) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let forms = &drawn.forms[0];
     let (n, count) = forms.shape();

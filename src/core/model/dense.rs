@@ -4,8 +4,9 @@
 //! the probe is autocorrelated along a path, R is the autocorrelation to the power of the number of steps between two
 //! points (an autoregression of the first order).
 //!
-//! The fixed effects b follow by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and the field by kriging
-//! (Rasmussen and Williams 2006, 2.7, with a vague prior of b). With r = h - H'K^-1 k:
+//! The fixed effects b follow by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, with their columns H and the
+//! deviations d. The field follows by kriging (Rasmussen and Williams 2006, 2.7, with a vague prior of b). At a place
+//! with the covariances k to the points and the row h of effects, and with r = h - H'K^-1 k:
 //!
 //! ```text
 //!  mean = h'b + k'K^-1 (d - H b)        variance = k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r
@@ -34,9 +35,9 @@ pub struct DensePosterior {
     hyperparameters: Hyperparameters,
     places: Vec<[f64; 2]>,
     factor: Llt<f64>,
-    /// K^-1 (d - H b).
+    /// Weights K^-1 (d - H b) of the points in the kriging mean.
     weights: Vec<f64>,
-    /// K^-1 H.
+    /// Matrix K^-1 H: one row for each point, one column for each effect.
     effects: Mat<f64>,
     /// The estimated effects b, and their covariance.
     estimates: DVector<f64>,
@@ -49,13 +50,13 @@ impl DensePosterior {
     ///
     /// # Errors
     /// Returns an error if the numbers of rows differ, a number is not finite, a hyperparameter is not above 0, or the
-    /// points cannot tell the effects apart.
+    /// points do not separate the effects.
     pub fn fit(observed: &Observations, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
         Self::with_shared_covariance(observed, hyperparameters, |_, _| 0.0)
     }
 
-    /// Fits like [`Self::fit`], with a further covariance `shared_mm2` of each pair of observed points, by their
-    /// indices. The places of a prediction have no part in it.
+    /// Fits like [`Self::fit`], and adds `shared_mm2(a, b)` to the covariance of the observed points with the indices a
+    /// and b. [`Self::predict`] does not add it to the covariances of a place with the points.
     pub(super) fn with_shared_covariance(
         observed: &Observations,
         hyperparameters: Hyperparameters,
@@ -103,7 +104,7 @@ impl DensePosterior {
         self.likelihood
     }
 
-    /// Returns the sum of squares of the whitened residuals, d'K^-1 (d - H b).
+    /// Returns the sum of squares of the whitened residuals, d'K^-1 (d - H b), with the observed deviations d.
     pub(super) fn whitened_squares(&self, observed: &Observations) -> f64 {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
@@ -149,7 +150,8 @@ impl DensePosterior {
     }
 }
 
-/// Returns the lower triangle of the covariance K of the points, without the effects.
+/// Returns the lower triangle of the covariance K of the points, without the effects. `shared_mm2(a, b)` is added for
+/// the points with the indices a and b.
 fn covariance_mm2(
     observed: &Observations,
     hyperparameters: &Hyperparameters,

@@ -24,14 +24,14 @@ pub struct EffectEstimates {
 
 impl EffectEstimates {
     /// Estimates the effects by generalised least squares (Aitken 1935), b = (H'K^-1 H)^-1 H'K^-1 d with the covariance
-    /// (H'K^-1 H)^-1.
+    /// (H'K^-1 H)^-1. The columns of H are the effects, and d are the deviations.
     ///
     /// K is the covariance of one field. The result is the average over the fields, weighted with their posterior
-    /// probabilities, which do not depend on the effects. Its covariance is the mean of theirs, plus the covariance of
-    /// their estimates.
+    /// probabilities, which do not depend on the effects. The covariance of the average is the mean of the covariances,
+    /// plus the covariance of the estimates over the fields.
     ///
     /// # Errors
-    /// Returns an error if there are too few points, columns are collinear, or the numbers of rows differ.
+    /// Returns an error if there are too few points, if effects are collinear, or if the numbers of rows differ.
     pub fn estimate(observed: &Observations, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();

@@ -10,12 +10,12 @@ use super::matern::Correlation;
 pub struct Field {
     /// Standard deviation of the field about 0.
     pub sigma_mm: f64,
-    /// Distance at which the correlation has fallen to 0.14. If the field has a lay, the geometric mean of the ranges
-    /// along and across it.
+    /// Distance at which the correlation has fallen to 0.14. If the field is anisotropic, the geometric mean of this
+    /// distance along and across the anisotropy.
     pub range_mm: f64,
     /// Smoothness of the field.
     pub smoothness: Smoothness,
-    /// Direction along which the field is wider.
+    /// Direction along which the range is longest, and ratio of the ranges along and across it.
     pub anisotropy: Anisotropy,
 }
 
@@ -30,7 +30,7 @@ pub enum Smoothness {
     SquaredExponential,
 }
 
-/// Direction along which a field is wider than across, as the tracks of a wheel make it.
+/// Anisotropy of a field: its range along one direction is longer than across it, as in the tracks of a grinding wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Anisotropy {
     /// Direction, a unit vector.
@@ -49,7 +49,7 @@ impl Smoothness {
         }
     }
 
-    /// Returns the name.
+    /// Returns the name of the smoothness: how many times the field can be differentiated.
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "never",
@@ -68,7 +68,7 @@ impl Anisotropy {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
-    /// Rotates a place to the axes along and across the anisotropy.
+    /// Returns the coordinates of a place along and across the direction of the anisotropy.
     pub(super) fn rotated(self, [x, y]: [f64; 2]) -> [f64; 2] {
         let [c, s] = self.along;
         [c * x + s * y, c * y - s * x]
@@ -109,7 +109,7 @@ impl Field {
         [along / root, across * root]
     }
 
-    /// Checks that strength, range and lay are possible.
+    /// Checks that standard deviation, range and anisotropy are possible.
     ///
     /// # Errors
     /// Returns [`ModelError::Hyperparameter`] or [`ModelError::Anisotropy`] with the wrong value.
@@ -128,7 +128,7 @@ impl Field {
 /// Field, prepared for the covariance of many pairs of places.
 #[derive(Clone, Copy)]
 pub(super) struct PairCovariance {
-    /// Images of the axes in the plane in which the field is isotropic and has a range of 1.
+    /// Images of the unit vectors along x and y in the plane in which the field is isotropic and has a range of 1.
     x: [f64; 2],
     y: [f64; 2],
     variance_mm2: f64,

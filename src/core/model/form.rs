@@ -28,12 +28,12 @@ use crate::registration::{Deviation, MIN_SIGMA_MM, PointStatus, Registration, ro
 pub struct Form {
     /// Standard deviation and range of the form, and noise of the probe.
     pub hyperparameters: Hyperparameters,
-    /// Covariance of the pose as the place of the nominal frame: of the twist [v; omega] in the model frame. It has the
-    /// layout of the covariance of the registration. The latter describes only how well the same pose would be found
-    /// again. Units mm^2, mm rad, rad^2. Locked directions have zero variance.
+    /// Covariance of the pose of the nominal frame, as the twist [v; omega] in the model frame. It includes the
+    /// uncertainty due to the form. Its layout is that of the covariance of the registration, which describes only how
+    /// well the same pose would be found again. Units mm^2, mm rad, rad^2. Locked directions have zero variance.
     pub frame_covariance: Matrix6<f64>,
-    /// Form after its own best fit at every used point, in the given order. A scan of more than 6,000 points is reduced
-    /// to as many, evenly spaced.
+    /// Form after its own best fit at every used point, in the order of the points. A scan of more than 6,000 points is
+    /// reduced to 6,000, evenly spaced.
     pub points: Vec<FormPoint>,
     /// Figures of the form.
     pub figures: FormFigures,
@@ -45,13 +45,13 @@ pub struct Form {
     pub rms_smooth_sigma_mm: f64,
     /// Sources of the standard uncertainties of the figures; empty if these cannot be decomposed.
     pub budget: Vec<BudgetEntry>,
-    /// Hyperparameters from the points alone, without the given prior. They are used to learn the prior of later parts.
+    /// Hyperparameters from the points alone, without the given prior. The prior of later parts is learned from them.
     /// None if no form is detectable.
     pub hyperparameters_without_prior: Option<Hyperparameters>,
     /// True if the points show a form. If false, only upper bounds of the figures are given, and their intervals begin
     /// at 0.
     pub is_detected: bool,
-    /// Degrees of freedom that the fit leaves to the points from which the field is estimated.
+    /// Number of points from which the field is estimated, minus the number of fixed effects.
     pub degrees_of_freedom: f64,
     /// True if the degrees of freedom are too few to separate the form from the noise, and the noise of the probe is
     /// unknown. The upper bounds then assume that the deviations are entirely form.
@@ -74,7 +74,8 @@ pub struct FormPoint {
 pub struct FormFigures {
     /// Root mean square.
     pub rms: Interval,
-    /// Peak to valley over the places of the form. For a whole pattern these are the touched points.
+    /// Peak to valley over the places of [`Form::points`]. If the whole pattern was measured, these are the touched
+    /// points.
     pub pv: Interval,
     /// PV 99.8 %: peak to valley over the aperture, including the places between. The outermost 0.1 % at either end are
     /// left out, but never a touched place.
@@ -90,11 +91,12 @@ pub struct Interval {
     pub low_mm: f64,
     /// 97.5 % quantile.
     pub high_mm: f64,
-    /// Lower bound for repeated looks at a growing measurement: the quantile of the probability
+    /// Lower bound for a decision that is repeated while the measurement grows: the quantile of the probability
     /// [`ModelInputs::decision_risk`].
     #[serde(skip)]
     pub least_mm: f64,
-    /// Upper bound for repeated looks: the quantile of the probability 1 - [`ModelInputs::decision_risk`].
+    /// Upper bound for a decision that is repeated while the measurement grows: the quantile of the probability 1 -
+    /// [`ModelInputs::decision_risk`].
     #[serde(skip)]
     pub most_mm: f64,
     /// Bound for acceptance: the quantile of the probability [`ModelInputs::acceptance_probability`].
@@ -120,7 +122,7 @@ const SAMPLES_PER_BLOCK: usize = 50;
 /// Minimum logarithm of the likelihood ratio of the best field and no field for a form to count as detected. Without a
 /// form one part in a hundred exceeds it.
 const MIN_EVIDENCE: f64 = 3.0;
-/// Limit of the distance from the field, in robust sigmas: a larger distance is not noise.
+/// Maximum distance of a point from the field, in robust sigmas, that counts as noise.
 const OUTLIER_SIGMAS: f64 = 6.0;
 /// Maximum share of points that can stand out from the field. If more stand out, they are part of the form itself.
 const MAX_OUTLIER_SHARE: f64 = 0.1;
@@ -131,7 +133,7 @@ const FEW_POINTS: usize = 200;
 /// Factor of the values below the median if there are few points. In simulations of a drift at 25, 50 and 100 points,
 /// factor 1 covers the RMS in 91, 83 and 89 of 100 parts, this factor in 92 and more.
 const FEW_LOW_FACTOR: f64 = 0.75;
-/// Share of the largest variance below which a direction counts as locked.
+/// Maximum share of the largest variance at which a direction counts as locked.
 const MAX_LOCKED_SHARE: f64 = 1e-13;
 
 impl Form {
@@ -175,11 +177,11 @@ impl Form {
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
-    /// Estimates the form at given places of the part, touched or not, and returns it with the figures of all of them.
+    /// Estimates the form at given places of the part, touched or not, and its figures over all these places.
     ///
-    /// The places are points of the nominal surface with their normals, in the model frame. Form that is narrower than
-    /// the spacing of the points is separated from the noise of the probe by [`ModelInputs::probe_noise_mm`] alone. Its
-    /// width is unknown, so every place has an independent value of it.
+    /// The places are points of the nominal surface with their normals, in the model frame. Only
+    /// [`ModelInputs::probe_noise_mm`] separates form that is narrower than the spacing of the points from the noise of
+    /// the probe. The width of such form is unknown, so it has an independent value at every place.
     ///
     /// # Errors
     /// Those of [`Form::estimate`].
@@ -192,7 +194,7 @@ impl Form {
     }
 
     /// Estimates the form as [`Form::estimate_at`] does. If `is_whole` is false, it omits slopes, ISO figures and the
-    /// budget, which cost most if few points were touched.
+    /// budget. These take most of the computing time if few points were touched.
     pub(super) fn estimate_with(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -218,37 +220,39 @@ impl Form {
     }
 }
 
-/// Registration in the terms of the model, with the field hypotheses.
+/// Observations of a registration, with the field hypotheses.
 struct FittedModel {
     motions: FreeMotions,
     /// Observations at all used points.
     all: Observations,
-    /// Indices of the points that no field explains, ascending. They count as form nevertheless.
+    /// Indices of the points that no field explains, ascending. They count as form.
     unexplained: Vec<usize>,
-    /// Those of them that neighbouring touches confirm.
+    /// Indices of those unexplained points that neighbouring touches confirm.
     confirmed: Vec<usize>,
     /// True if there are so many isolated points that two of them can be neighbours by chance.
     is_chance: bool,
-    /// Indices of the other points, and the observations there.
+    /// Indices of all other used points, and the observations at these points.
     inliers: Vec<usize>,
     observed: Observations,
-    /// Effects of the machine, its probe, the temperature and the datum on all points together.
+    /// Effects of the machine, its probe, the temperature and the datum that are common to all points.
     machine_effects: MachineEffects,
-    /// Columns of these effects that are ground into the part, at all used points; None before the first correction.
+    /// Columns of the machine effects that are ground into the part, at all used points; None before the first
+    /// correction.
     ground_in: Option<DMatrix<f64>>,
     fields: FieldHypotheses,
 }
 
 impl FittedModel {
-    /// Builds the hypotheses without the points that no field explains.
+    /// Builds the field hypotheses in rounds. Each round finds points that no field explains and leaves them out. If
+    /// `at_points` is true, the noise can be autocorrelated along the path of the points.
     fn fit(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
-        /// Number of rounds. Each round estimates the hyperparameters again. Without the tallest points of a defect,
-        /// its flanks stand out.
+        /// Number of rounds. Each round estimates the hyperparameters again. Once the tallest points of a defect are
+        /// left out, its flanks stand out too.
         const ROUNDS: usize = 3;
         if let Some(priors) = &inputs.prior {
             priors.check()?;
         }
-        /// Number of touches around one.
+        /// Number of touches that are direct neighbours of one touch.
         const AROUND: f64 = 8.0;
         let mut seen = Self::from_fitted_points(registration, inputs, at_points)?;
         for _ in 0..ROUNDS {
@@ -275,8 +279,8 @@ impl FittedModel {
         Posterior::new(&self.fields, &self.observed, inputs.prior.as_ref(), noise_prior(inputs))
     }
 
-    /// Evaluates the samples at the places, in the frame of the registration. Each sample contains the motion that fits
-    /// it best to the observations.
+    /// Evaluates the samples at the places, in the frame of the registration; if `is_between` is true, also between the
+    /// places. Each sample contains the motion that fits it best to the observations.
     fn evaluate_samples(
         &self,
         draws: PosteriorSamples,
@@ -324,9 +328,9 @@ impl FittedModel {
         chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
-    /// Adds points that no field explains to the samples, each with its measured deviation minus the noise of a touch.
-    /// At measured points they are inserted in the order of the points. At other places each replaces the nearest
-    /// place.
+    /// Adds the points `apart`, which no field explains, to the samples. Each has its measured deviation minus a sample
+    /// of the noise of a touch. If the places of the samples are measured points, the points are inserted in the order
+    /// of the points. Otherwise each point replaces the nearest place.
     fn with_unexplained_points(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.indices_of_all(&drawn.chosen);
@@ -346,7 +350,8 @@ impl FittedModel {
         if at_points { drawn.joined_with(found) } else { drawn.replaced_by(&found) }
     }
 
-    /// Returns samples of the form at the points, from their deviations: one column for each given sample.
+    /// Returns samples of the form at points that no field explains: the measured deviation minus effects and noise of
+    /// each given sample. The result has one row for each point, one column for each sample.
     fn samples_at_points(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
         let of_probe = |mm: f64| noise_prior(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
@@ -417,15 +422,17 @@ impl FittedModel {
         })
     }
 
-    /// Computes the slopes of the samples, before form without a slope is added to them.
+    /// Computes the slopes of the samples. `drawn` must not yet contain narrow form, which has no measurable slope.
+    /// Returns `None` if the places allow no slopes.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
         Some(SlopeFigures::from_forms(&slopes, &smooth, (is_form_detected(posterior), inputs)))
     }
 
-    /// Builds the form from the samples, without slopes. `ground_in` has the columns of the effects that are ground
-    /// into the part, at the places of the samples.
+    /// Builds the form from the samples, without slopes. `ends` are the figures of the samples for the lower and for
+    /// the upper bounds. `ground_in` has the columns of the effects that are ground into the part, at the places of the
+    /// samples. If `is_whole` is false, ISO figures and budget are omitted.
     fn form(
         &self,
         inputs: &ModelInputs,
@@ -486,8 +493,8 @@ fn is_form_detected(posterior: &Posterior) -> bool {
     posterior.evidence > MIN_EVIDENCE
 }
 
-/// Returns the inputs for the lower bounds of the form: if the noise is consistent with that of the probe, all of it
-/// counts as noise of the probe.
+/// Returns the inputs for the lower bounds of the form. If the estimated noise is consistent with the noise of the
+/// probe, all of it counts as noise of the probe.
 ///
 /// A reference sphere with some twenty touches determines the noise of the probe to 15 %. The excess of the noise over
 /// that value is not necessarily form.
@@ -535,7 +542,7 @@ fn xy((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
-/// Returns at most [`MAX_PLACES`] indices below `of`, evenly spaced.
+/// Returns at most [`MAX_PLACES`] of the indices 0 to `of` - 1, evenly spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
     let most = of.min(MAX_PLACES);
     (0..most).map(move |k| k * of / most)
@@ -548,26 +555,26 @@ pub struct ModelInputs {
     pub prior: Option<Prior>,
     /// Uncertainty of the machine that is common to all points, from its cell file.
     pub machine: MachineUncertainty,
-    /// Standard uncertainty of the calibrated radius of the probe, in mm. It moves every point along its normal by the
-    /// same amount.
+    /// Standard uncertainty of the calibrated radius of the probe, in mm. An error of the radius moves every point
+    /// along its normal by the same amount.
     pub radius_sigma_mm: f64,
     /// Relative standard uncertainty of all lengths, from temperature and expansion.
     pub scale_sigma: f64,
-    /// Standard uncertainties of the pose in the directions that the registration locked: along x, y and z of the model
-    /// in mm, and of the turns about them through the centroid of the points in rad. 0 in directions that are known
-    /// exactly or that the registration found. None if the registration locked no direction.
+    /// Standard uncertainties of the pose in the directions that the registration locked: of the shifts along x, y and
+    /// z of the model in mm, and of the rotations about these axes through the centroid of the points in rad. 0 in
+    /// directions that are known exactly or that the registration found. None if the registration locked no direction.
     pub locked_sigmas: Option<[f64; 6]>,
-    /// True if the part was corrected by a measurement of the same machine in the same clamping. Then all effects of
-    /// uncertain size (machine, probe, temperature, datum) are ground into the part, and the points no longer show
+    /// True if the part was corrected by a measurement of the same machine in the same clamping. The effects of the
+    /// machine, the probe, the temperature and the datum are then ground into the part, and the points no longer show
     /// them.
     pub is_corrected: bool,
-    /// Noise of the probe itself: its standard deviation in mm, and the relative standard uncertainty of that. Noise
-    /// beyond it is form that is too narrow to be resolved. If the first is 0, the value is unknown: all noise then
-    /// counts as the probe's.
+    /// Noise of the probe itself: its standard deviation in mm, and the relative standard uncertainty of this standard
+    /// deviation. Any further noise is form that is too narrow to be resolved. A standard deviation of 0 means that it
+    /// is unknown: all noise then counts as noise of the probe.
     pub probe_noise_mm: [f64; 2],
     /// Probability that a figure is beyond each of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
     pub decision_risk: f64,
-    /// Probability of being within the limit that a figure needs for acceptance.
+    /// Minimum probability that a figure is within its limit, for the part to be accepted.
     pub acceptance_probability: f64,
     /// Options of the figures over an area.
     pub area: AreaOptions,
@@ -593,7 +600,8 @@ impl Default for ModelInputs {
 /// Returns the covariance of the motions as the registration finds them.
 ///
 /// This is the covariance of least squares with correlated deviations: A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (Aitken
-/// 1935). K is the mean of the covariances of all fields. The covariance of the effects common to all points is added.
+/// 1935). H are the fixed effects, s is the noise, and K is the mean of the covariances of all fields. `alike` has the
+/// columns of the effects that are common to all points; their covariance is added.
 fn best_fit_covariance(
     observed: &Observations,
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -617,25 +625,27 @@ fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
 
 /// Samples of the form at a set of places, one column for each sample.
 pub(super) struct SampledForms {
-    /// Samples by the posterior, and by fields of the second variance. The second bounds the extremes.
+    /// Samples of the posterior, and samples of fields with the second variance factor, which bound the extremes.
     pub(super) forms: [DMatrix<f64>; 2],
-    /// Samples that take the deviations entirely as form, apart from the noise; only if there are few points.
+    /// Samples that count the measured deviations entirely as form. None unless the points are too few to separate form
+    /// from noise, and the noise of the probe is unknown.
     all_form: Option<DMatrix<f64>>,
     pub(super) places: Vec<[f64; 2]>,
     /// Motions that a best fit removes, at the places.
     pub(super) effects: DMatrix<f64>,
-    /// Indices of the points that are the places; empty if the places are not measured points.
+    /// Index of the measured point at each place; empty if the places are not measured points.
     chosen: Vec<usize>,
     /// Indices of the places that were not touched; empty if the places are measured points.
     untouched: Vec<usize>,
     /// Standard uncertainty of the smooth form at each place.
     smooth_sigma_mm: Vec<f64>,
-    /// Noise of each sample, and for each variance the standard deviation of waves shorter than those of the basis.
+    /// Standard deviation of the noise of each sample. `truncated_mm` is, for each variance factor, the standard
+    /// deviation of the waves shorter than those of the basis.
     noise_mm: Vec<f64>,
     truncated_mm: [Vec<f64>; 2],
     /// Random effects of each sample, in standard uncertainties.
     random_effects: DMatrix<f64>,
-    /// The same samples between the places.
+    /// The same samples between the places; None if they were not evaluated there.
     intermediate: Option<IntermediateForms>,
 }
 
@@ -647,7 +657,8 @@ struct IntermediateForms {
 }
 
 impl SampledForms {
-    /// Evaluates the samples at the places, adds the motions `moved`, and does the same between the places if asked to.
+    /// Evaluates the samples at the places and adds the motions `moved`. If `is_between` is true, does the same between
+    /// the places.
     fn evaluate(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
@@ -708,8 +719,8 @@ impl SampledForms {
         }
     }
 
-    /// Keeps the second variance at the touched places only. Elsewhere such fields are nearly unconstrained, so the
-    /// samples of the posterior replace them.
+    /// Replaces the samples with the second variance factor by the samples of the posterior at every place that was not
+    /// touched. Fields with the second factor are nearly unconstrained there.
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
@@ -722,8 +733,9 @@ impl SampledForms {
         self
     }
 
-    /// Sets the standard uncertainty of the smooth form. The random effects also move the part, and so do motions at
-    /// other places. Neither is form, so in these cases the best fit is removed first.
+    /// Sets the standard uncertainty of the smooth form at each place. The samples contain motions of the part if there
+    /// are random effects, or if the places are not measured points. Motions are not form, so in both cases the best
+    /// fit of each sample is removed first.
     fn with_smooth_sigma(self, observed: &Observations) -> Self {
         let at_points = !self.chosen.is_empty();
         let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
@@ -733,10 +745,11 @@ impl SampledForms {
         Self { smooth_sigma_mm, ..self }
     }
 
-    /// Adds to the samples the share of the noise that is form too narrow to be resolved.
+    /// Adds form that is too narrow to be resolved to the samples, at the measured points and between them.
     ///
-    /// The residuals of a smooth form are the noise of the probe and, beyond that, form. This share of the residual at
-    /// a point is added. Its uncertainty follows from the noise of the probe.
+    /// The residuals of a smooth form consist of the noise of the probe and of narrow form. The share of narrow form in
+    /// the variance gives the share of each residual that is added. The uncertainty of the added form follows from the
+    /// noise of the probe and is added as random numbers.
     fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
@@ -780,8 +793,9 @@ impl SampledForms {
         self
     }
 
-    /// Adds form that is too narrow to be resolved to places that were not touched: the excess of the noise over that
-    /// of the probe, and short waves.
+    /// Adds form that is too narrow to be resolved to places that are not measured points, and between them. Its
+    /// variance is that of the noise beyond the noise of the probe, plus that of the waves shorter than those of the
+    /// basis.
     fn with_narrow_form(mut self, inputs: &ModelInputs) -> Self {
         add_narrow(&mut self.forms, (&self.noise_mm, &self.truncated_mm), inputs, 4);
         self.add_narrow_between(inputs);
@@ -794,10 +808,12 @@ impl SampledForms {
         }
     }
 
-    /// Subtracts the effects that are ground in: each column times a standard normal number.
+    /// Subtracts the effects that are ground into the part from each sample: each column of `ground_in` times a
+    /// standard normal number.
     ///
-    /// A part that was corrected by a measurement has the errors of the machine as its form, d = (f - E t) + E t + e.
-    /// The points do not show t. It is as uncertain as before any measurement.
+    /// With the columns E and the standard normal numbers t, E t are the errors of the machine. A part that was
+    /// corrected by a measurement has the form f - E t. The next measurement has the same errors, so its deviations are
+    /// d = (f - E t) + E t + e, with the noise e. They do not show t, which is as uncertain as before any measurement.
     fn without_ground_in(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
         let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
@@ -816,7 +832,7 @@ impl SampledForms {
         self
     }
 
-    /// Joins the samples of both, in the order of the points.
+    /// Joins the rows of both sets of samples, sorted by the index of the measured point.
     fn joined_with(self, other: Self) -> Self {
         let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
@@ -840,7 +856,7 @@ impl SampledForms {
         }
     }
 
-    /// Replaces the rows of the places that are nearest to those of `other` by its rows.
+    /// Replaces, for each place of `other`, the row of the nearest place by the row of `other`.
     fn replaced_by(mut self, other: &Self) -> Self {
         let square = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
         for (r, place) in other.places.iter().enumerate() {
@@ -897,19 +913,21 @@ impl SampledForms {
         self.places.iter().enumerate().map(of).collect()
     }
 
-    /// Returns the RMS over all places of the standard uncertainty of the smooth form, in mm.
+    /// Returns the root mean square, over all places, of the standard uncertainty of the smooth form, in mm.
     fn rms_smooth_sigma_mm(&self) -> f64 {
         let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
-    /// Returns the figures of each sample at the places alone: RMS by the first variance, extremes by the second.
+    /// Returns RMS, PV and PV 99.8 % of each sample over the places alone: RMS of the samples of the posterior, PV and
+    /// PV 99.8 % of the samples with the second variance factor.
     fn figures_at_places(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// Returns the figures with their intervals. If no form is detectable, only upper bounds are given.
+    /// Returns the figures with their intervals. `least` and `most` are figures of samples that extend the intervals
+    /// downwards and upwards. If `is_seen` is false, no form is detectable, and only upper bounds are given.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
@@ -924,7 +942,7 @@ impl SampledForms {
         FormFigures { rms: interval(0), pv: interval(1), pv_998: interval(2) }
     }
 
-    /// Returns the root mean square, the peak to valley and that of the aperture for each sample.
+    /// Returns for each sample: RMS and PV over the places, and PV 99.8 % over the places and the nodes `between` them.
     fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
         let rows = forms.nrows();
         let mut is_touched = vec![true; rows];
@@ -953,7 +971,8 @@ fn min_and_max(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// Adds to every place of each sample form that is too narrow to be resolved.
+/// Adds narrow form (too narrow to be resolved) to every place of each sample, as independent normal numbers. `stream`
+/// is the seed of these numbers.
 fn add_narrow(
     forms: &mut [DMatrix<f64>; 2],
     (scatter_mm, narrow_mm): (&[f64], &[Vec<f64>; 2]),
@@ -973,8 +992,9 @@ fn add_narrow(
     }
 }
 
-/// Samples the noise of the probe, and returns it with the standard deviation of the form that is too narrow. If the
-/// noise of the probe is unknown, all noise counts as the probe's.
+/// Returns a sample of the noise of the probe, and the standard deviation of the form that is too narrow to be
+/// resolved. `scatter_mm` is the total noise, `narrow_mm` the standard deviation of short waves. If the noise of the
+/// probe is unknown, all noise counts as noise of the probe.
 fn split_noise(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut NormalGenerator) -> [f64; 2] {
     let Some([probe_mm, probe_u]) = noise_prior(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
@@ -1004,9 +1024,9 @@ impl Interval {
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Builds the interval of equally probable values. Below the median each quantile is the lower of its own and that
-    /// of `lower`. Above the median it is the highest of its own and those of `higher`. Without `has_low`, the
-    /// quantiles below the median are 0.
+    /// Builds the interval of a figure from equally probable values. Below the median, each quantile is the smaller of
+    /// the quantiles of `values` and of `lower`. Above the median, it is the largest of the quantiles of `values` and
+    /// of each set in `higher`. If `has_low` is false, the quantiles below the median are 0.
     pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1016,7 +1036,8 @@ impl Interval {
         Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
     }
 
-    /// Builds the interval as [`Interval::from_samples`] does, and multiplies the values below the median by a factor.
+    /// Builds the interval as [`Interval::from_samples`] does, and multiplies the quantiles below the median by
+    /// `low_factor`.
     fn with_low_factor(
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1054,7 +1075,8 @@ impl Interval {
     }
 }
 
-/// Motions that the registration was free to make, about the centroid of the points and in units of their size.
+/// Motions that the registration was free to make, about the centroid of the points. Rotations are in mm at the RMS
+/// distance of the points from the centroid.
 pub(super) struct FreeMotions {
     centre: Point,
     size_mm: f64,
@@ -1123,8 +1145,8 @@ impl FreeMotions {
     }
 }
 
-/// Returns the matrix that converts a twist about the origin to the motion of a centre and the turn about it, the
-/// latter in mm at the distance `size_mm`.
+/// Returns the matrix that converts a twist about the origin to the shift of the point `centre` and the rotation about
+/// it. The rotation is in mm at the distance `size_mm`.
 fn motion_about(centre: Point, size_mm: f64) -> Matrix6<f64> {
     let mut about = Matrix6::identity();
     // v + omega x c

@@ -1,5 +1,8 @@
 //! Hypotheses of the field over the points of a measurement: everything that does not depend on the deviations.
 //!
+//! The deviations d of n points have p fixed effects H with coefficients b, random effects E with factors t, the field
+//! f, and the noise e:
+//!
 //! ```text
 //!  W d = W H b + W E t + W f + e        e of variance s^2; W subtracts what noise shares with the touch before
 //!  R K R = U diag(l) U'                 R = 1 - Q Q', Q an orthonormal base of W H; K: covariance of W f for one node
@@ -84,8 +87,8 @@ pub(super) struct FieldHypotheses {
     pub(super) kind: NoiseKind,
     pub(super) basis: Basis,
     places: Vec<[f64; 2]>,
-    /// Coefficients of the whitening: the factor of the point's own row, and that of the row before, which is
-    /// subtracted.
+    /// Coefficients of the whitening of each point: the factor of its own row, and the factor of the row before, which
+    /// is subtracted.
     whitening: Vec<[f64; 2]>,
     /// Orthonormal base Q of the whitened fixed effects.
     base: DMatrix<f64>,
@@ -94,12 +97,12 @@ pub(super) struct FieldHypotheses {
     /// Term ln |W| - 1/2 ln |H'W'W H|, which makes likelihoods with and without noise autocorrelation comparable.
     pub(super) log_whitened: f64,
     reduced: Reduced,
-    /// Products Q'W phi: the part of the basis functions that the best fit removes.
+    /// Products Q'W phi: the part of the basis functions phi that the best fit removes.
     removed_by_fit: Mat<f64>,
     pub(super) hypotheses: Vec<FieldHypothesis>,
 }
 
-/// Basis functions at the points, in the smallest number of coordinates that distinguishes them.
+/// Basis functions at the points, reduced to the smallest number of coordinates that distinguishes the basis functions.
 struct Reduced {
     /// One row for each coordinate, one column for each basis function.
     rows: Mat<f64>,
@@ -192,7 +195,8 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// Computes R W phi with each point as a coordinate, and Q'W phi.
+    /// Computes the basis functions phi at the points, whitened and without the part that the best fit removes (R W
+    /// phi): one row for each point. Also returns the removed part Q'W phi.
     fn individual_points(&self) -> (Reduced, Mat<f64>) {
         let mut rows = self.rows_of(0..self.places.len());
         let (n, p) = self.base.shape();
@@ -202,8 +206,8 @@ impl FieldHypotheses {
         (Reduced { rows, pivots: None }, taken)
     }
 
-    /// Computes the products of the basis functions over all points, with the best fit removed, and factorizes them
-    /// until the remaining variance is negligible. Also returns Q'W phi.
+    /// Computes the products of the whitened basis functions over all points, without the part that the best fit
+    /// removes, and factorizes them until the remaining variance is negligible. Also returns the removed part Q'W phi.
     fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
         let (p, count) = (self.base.ncols(), self.basis.len());
         let of = |points: Range<usize>| {
@@ -218,7 +222,8 @@ impl FieldHypotheses {
         (pivoted_cholesky(&products), taken)
     }
 
-    /// Sums matrices of the given shapes over blocks of points, in parallel.
+    /// Sums the matrices that `of` returns for each block of points, in parallel. `shapes` are the shapes of these
+    /// matrices.
     ///
     /// The blocks are added in their order, so that the sum has the same bits on any number of threads.
     fn sum_over_blocks<const N: usize>(
@@ -236,7 +241,8 @@ impl FieldHypotheses {
         sums
     }
 
-    /// Computes W phi for the given points.
+    /// Computes the whitened basis functions W phi at the points with the given indices: one row for each point, one
+    /// column for each basis function.
     fn rows_of(&self, points: Range<usize>) -> Mat<f64> {
         let first = points.start;
         let before = first.saturating_sub(1);
@@ -253,8 +259,8 @@ impl FieldHypotheses {
         rows
     }
 
-    /// Projects columns with one row for each point: returns R W times the columns in the coordinates, and the products
-    /// of all pairs of the projected columns.
+    /// Whitens columns that have one row for each point, and removes the best fit from them (R W times the columns).
+    /// Returns the result in the coordinates of [`Reduced`], and the products of all pairs of the resulting columns.
     pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
         let mut columns = whitened(&self.whitening, columns);
         let taken = &self.base * self.base.tr_mul(&columns);
@@ -323,8 +329,8 @@ impl FieldHypotheses {
         })
     }
 
-    /// Converts coordinates to coefficients of the basis functions for a node: D C' with C the rows of the coordinates
-    /// and D the standard deviations.
+    /// Converts coordinates to coefficients of the basis functions for a node: D C' times the coordinates, with C the
+    /// rows of [`Reduced`] and D the standard deviations of the node.
     pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
@@ -338,7 +344,8 @@ impl FieldHypotheses {
         coefficients
     }
 
-    /// Converts coefficients of the basis functions to coordinates for a node: C D.
+    /// Converts coefficients of the basis functions to coordinates for a node: C D times the coefficients, with C the
+    /// rows of [`Reduced`] and D the standard deviations of the node.
     pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
@@ -350,13 +357,13 @@ impl FieldHypotheses {
         self.base.ncols()
     }
 
-    /// Projects columns with one row for each point onto the fixed effects: Q'W times the columns.
+    /// Projects columns that have one row for each point onto the fixed effects: returns Q'W times the columns.
     pub(super) fn project_onto_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
-    /// Returns the rows C D, which convert a node's coefficients to coordinates, followed by the rows Q'W phi D, which
-    /// the best fit removes.
+    /// Returns the rows C D, which convert the coefficients of a node to coordinates, followed by the rows Q'W phi D,
+    /// which are the part that the best fit removes.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.removed_by_fit.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
@@ -384,11 +391,11 @@ impl FieldHypotheses {
     }
 }
 
-/// Returns the logarithm of J / (1 + J) for every variance ratio.
+/// Returns the logarithm of the prior J / (1 + J) of every variance ratio.
 ///
-/// J^2 is the Fisher information on ln tau with the noise unknown: (sum q^2 - (sum q)^2 / (n - p)) / 2 with
-/// q = l tau / (1 + l tau). A field that cannot be distinguished from noise has no information. The prior saturates
-/// once the points determine about one coefficient.
+/// J^2 is the Fisher information on ln tau with the noise unknown: (sum q^2 - (sum q)^2 / (n - p)) / 2 with q = l tau /
+/// (1 + l tau). A field that cannot be distinguished from noise has no information. The prior saturates once the points
+/// determine about one coefficient. `free` is n - p.
 fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);
@@ -406,7 +413,7 @@ fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     variance_ratios().map(of).collect()
 }
 
-/// Adds the lower triangle of rows' rows to the products.
+/// Adds the lower triangle of the product of the transposed `rows` and `rows` to `products`.
 fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     triangular::matmul(
         products.as_mut(),
@@ -421,7 +428,8 @@ fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     );
 }
 
-/// Returns the pivoted Cholesky factor of a matrix that is given by its lower triangle.
+/// Returns the pivoted Cholesky factor of a matrix that is given by its lower triangle, up to the last pivot above
+/// [`MIN_PIVOT_SHARE`] of the largest.
 fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let count = products.nrows();
     let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
@@ -452,8 +460,8 @@ fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     Reduced { rows: Mat::from_fn(rows.len(), count, |r, c| rows[r][c]), pivots: Some(pivots) }
 }
 
-/// Returns the whitening: for each point the factors of its own row and of the row before. The whitened noise is
-/// independent and has the same variance.
+/// Returns the whitening: for each point the factor of its own row, and the factor of the row before, which is
+/// subtracted. The whitened noise is independent and has the same variance. `drift` is the noise autocorrelation.
 fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     if drift == 0.0 || path.is_empty() {
         return vec![[1.0, 0.0]; points];

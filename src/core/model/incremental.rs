@@ -202,7 +202,7 @@ impl IncrementalPosterior {
         (l, mean_mm, left_mm2.max(noise_mm2).sqrt())
     }
 
-    /// Adds the row of one point to the factor L. Without a deviation the point has the expected one.
+    /// Adds the row of one point to the factor L. If `deviation_mm` is `None`, the point gets the predicted deviation.
     fn append_point(&mut self, place: Place, deviation_mm: Option<f64>) -> Result<(), ModelError> {
         let (mut l, mean_mm, d) = self.predicted(&place);
         if !(d.is_finite() && d > 0.0) {

@@ -9,7 +9,7 @@ use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
 use crate::geometry::{Point, PointTree, bounds};
 
-/// Maximum number of grid points, and grid points per spacing of the touched points where that maximum allows it.
+/// Maximum number of nodes of the grid, and number of nodes per spacing of the touched points within this maximum.
 const MAX_NODES: f64 = 3000.0;
 const NODES_PER_SPACING: f64 = 2.0;
 /// Maximum degree of the polynomials that interpolate a smooth column between the points.
@@ -29,7 +29,8 @@ pub(super) struct IntermediateNodes {
 }
 
 impl IntermediateNodes {
-    /// Lays a grid along the axes of some waves; returns `None` if it would have no node.
+    /// Creates a grid along the axes u and v of the basis `waves`, with the nodes that touched places surround. Returns
+    /// `None` if there is no such node.
     pub(super) fn new(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
         let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.anisotropy.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
@@ -59,10 +60,11 @@ impl IntermediateNodes {
     }
 
     /// Interpolates columns with a row per touched place to the nodes: by a fit of polynomials, and by weighted means
-    /// of its residuals at the nearby touched places.
+    /// of the residuals of this fit at the nearby touched places.
     ///
-    /// The polynomials are needed for the motions of a curved part, which are removed from forms that can be thousands
-    /// of times larger: linear interpolation alone would leave a part of that.
+    /// The polynomials are needed for the motions of a curved part. A best fit removes the motions from samples that
+    /// can be thousands of times larger than the remaining form. The errors of a linear interpolation alone would be
+    /// too large.
     pub(super) fn interpolate(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();
@@ -77,8 +79,8 @@ impl IntermediateNodes {
     }
 }
 
-/// Returns the three nearest touched places and their weights; `None` if touched places within `near_mm` do not
-/// surround the place.
+/// Returns the indices of the three nearest touched places and their weights; `None` if the touched places within
+/// `near_mm` do not surround the place `at`.
 fn surrounding_places(
     at: [f64; 2],
     places: &[[f64; 2]],

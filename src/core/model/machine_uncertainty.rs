@@ -3,7 +3,8 @@
 //!
 //! Each is an effect on the deviations of unknown size with a stated standard uncertainty: a column of E, scaled so
 //! that its factor has the variance 1. The covariance of the deviations is K + s^2 R + E E', and the form is the field
-//! alone. So an error of the machine enters the figures once, in the measurement, and is not added to them again.
+//! alone. So an error of the machine enters the figures once, in the measurement, and is not added to them again. K, s
+//! and R are those of [`super::DensePosterior`].
 
 use nalgebra::{DMatrix, Matrix3};
 
@@ -18,19 +19,19 @@ pub struct MachineUncertainty {
     pub scale: [f64; 3],
     /// Standard uncertainty of the deviations of the angles xy, xz and yz between the axes from a right angle.
     pub squareness_rad: [f64; 3],
-    /// Standard uncertainty of the probe's error in any one direction, without that of its radius.
+    /// Standard uncertainty of the error of the probe in any one direction, without the error of its radius.
     pub probe_mm: f64,
     /// Standard uncertainty of the radius of the reference sphere on which the probe is qualified.
     pub reference_sphere_mm: f64,
 }
 
-/// Source of a part of an uncertainty.
+/// Source of a contribution to the uncertainty of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UncertaintySource {
     /// Noise of each touch.
     Scatter,
-    /// Form between the touches, and form that is smaller than their noise.
+    /// Form between the touches, and form that is smaller than the noise of the touches.
     Form,
     /// Pose of the part.
     Pose,
@@ -63,7 +64,7 @@ impl UncertaintySource {
     ];
 }
 
-/// Random effects common to all points, as far as their standard uncertainty is above 0.
+/// Random effects common to all points. Effects with a standard uncertainty of 0 are left out.
 #[derive(Clone, Debug)]
 pub(super) struct MachineEffects {
     machine: MachineUncertainty,
@@ -90,7 +91,7 @@ impl MachineEffects {
         Self { machine, radius_mm, temperature, locked_sigmas: datum, centre, model_from_machine }
     }
 
-    /// Returns the source of each column.
+    /// Returns the source of each column of [`Self::columns`].
     pub(super) fn sources(&self) -> Vec<UncertaintySource> {
         self.all().into_iter().map(|(source, ..)| source).collect()
     }
@@ -105,7 +106,7 @@ impl MachineEffects {
         DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].2 * all[c].1.of_unit(placed[r].0, placed[r].1))
     }
 
-    /// Returns the effects with their source and standard uncertainty, as far as that is above 0.
+    /// Returns the effects whose standard uncertainty is above 0, each with its source and this uncertainty.
     fn all(&self) -> Vec<(UncertaintySource, Effect, f64)> {
         let MachineUncertainty { scale, squareness_rad, probe_mm, .. } = self.machine;
         let radius = (UncertaintySource::Radius, Effect::Radius, self.radius_mm);
@@ -123,7 +124,7 @@ impl MachineEffects {
     }
 }
 
-/// Effect of one unit.
+/// Effect on the deviations, with a size of one unit.
 #[derive(Clone, Copy, Debug)]
 enum Effect {
     /// Shift along the normal, the same everywhere.

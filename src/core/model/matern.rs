@@ -11,20 +11,21 @@ use std::sync::OnceLock;
 
 use super::Smoothness;
 
-/// Steps of the table per unit of x, and its last x: the correlation and its slope are below 1e-14 there.
+/// Number of steps of the table per unit of x, and largest x of the table. The correlation and its slope are below
+/// 1e-14 there.
 const STEPS: usize = 256;
 const LAST: usize = 45;
 const STEPS_PER_RANGE: f64 = 4.0 * STEPS as f64;
 
-/// Table of the correlation and its slope.
+/// Table of the Matern correlation for nu = 2 and of its slope, in equal steps of x.
 type Table = OnceLock<Vec<[f64; 2]>>;
 
 /// Correlation over the distance for one smoothness, the same for every pair of places.
 #[derive(Clone, Copy)]
 pub(super) struct Correlation {
-    /// Table from which the correlation is interpolated; `None` if it is an exponential.
+    /// Table from which the correlation is interpolated; `None` if the correlation is an exponential function.
     table: Option<&'static [[f64; 2]]>,
-    /// True if the exponential is one of the distance, not of its square.
+    /// True if the exponent is proportional to the distance; false if it is proportional to the square of the distance.
     is_rough: bool,
 }
 
@@ -37,7 +38,7 @@ impl Correlation {
         }
     }
 
-    /// Returns the correlation at a distance; the argument is the square of the distance divided by the range.
+    /// Returns the correlation at a distance r; `ranges2` is (r / range)^2.
     #[inline]
     pub(super) fn at(&self, ranges2: f64) -> f64 {
         let Some(table) = self.table else {

@@ -152,7 +152,8 @@ fn orthonormal_base(columns: DMatrix<f64>) -> DMatrix<f64> {
     if columns.ncols() > 0 { columns.qr().q() } else { columns }
 }
 
-/// Returns the typical spacing of the points, in mm: the root of the area of the rectangle around them per point.
+/// Returns the typical spacing of the points, in mm: the square root of the area of their bounding rectangle divided by
+/// their number.
 fn spacing_mm(places: &[[f64; 2]]) -> f64 {
     let [low, high] = bounds(places.iter().copied());
     ((high[0] - low[0]) * (high[1] - low[1]) / places.len() as f64).sqrt()
@@ -173,7 +174,7 @@ impl Hyperparameters {
         Ok(posterior::Posterior::new(&fields, observed, priors, None).mean_hyperparameters())
     }
 
-    /// Returns the correlation of the noise of two points that are this many steps of the path apart.
+    /// Returns the correlation of the noise of two points that are `steps` steps of the path apart.
     fn noise_correlation(&self, steps: f64) -> f64 {
         // A correlation below exp(-36) is below the rounding error of a double, and counts as zero.
         const MAX_STEPS: f64 = 36.0;

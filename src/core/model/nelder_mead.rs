@@ -1,10 +1,10 @@
 //! Maximization of a function of two variables.
 
-/// Maximizes a function of two variables by the simplex method (Nelder and Mead 1965); returns the best place and the
-/// value there.
+/// Maximizes the function `height` of two variables by the simplex method (Nelder and Mead 1965). Returns the best
+/// argument and the value of the function there.
 ///
-/// The first simplex has the edges `steps` from `start`. The search ends when the simplex is smaller than `near`, or
-/// after 120 iterations.
+/// The corners of the first simplex are `start`, and `start` moved by each of the `steps` along its axis. The search
+/// ends when the simplex is smaller than `near`, or after 120 iterations.
 pub(super) fn maximize(
     start: [f64; 2],
     steps: [f64; 2],

@@ -13,36 +13,39 @@ use super::nelder_mead::maximize;
 use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observations, Prior, spacing_mm};
 use crate::geometry::bounds;
 
-/// Maximum number of points of a block, and of blocks.
+/// Maximum number of points of a block, and maximum number of blocks.
 const POINTS_PER_BLOCK: usize = 48;
 const MAX_BLOCKS: usize = 24;
 /// Maximum number of points that are spread over the whole part.
 const SPREAD: usize = 150;
-/// Start values of the noise autocorrelation, steps of its refinement, its maximum, and the gain of the log-likelihood
-/// over no autocorrelation that it needs.
+/// Start values of the noise autocorrelation, steps of its refinement, its maximum value, and the minimum gain of the
+/// log-likelihood over that without autocorrelation.
 const START_AUTOCORRELATIONS: [f64; 3] = [0.3, 0.6, 0.85];
 const AUTOCORRELATION_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MAX_AUTOCORRELATION: f64 = 0.97;
 const MIN_AUTOCORRELATION_EVIDENCE: f64 = 2.0;
-/// Logarithm of the stretch at which the search of an anisotropy begins, maximum stretch, and the gain of the
-/// log-likelihood over isotropy that it needs.
+/// Logarithm of the stretch at which the search of an anisotropy starts, maximum stretch, and minimum gain of the
+/// log-likelihood over that of an isotropic field.
 const START_LOG_STRETCH: f64 = 0.6;
 const MAX_STRETCH: f64 = 10.0;
 const MIN_ANISOTROPY_EVIDENCE: f64 = 4.0;
-/// Start values of the search: ranges in spacings of the points, and noise in strengths of the field.
+/// Start values of the search: ranges in spacings of the points, and noise as a ratio to the standard deviation of the
+/// field.
 const RANGES: [f64; 4] = [3.0, 6.0, 12.0, 24.0];
 const RATIOS: [f64; 4] = [0.01, 0.1, 0.6, 3.0];
 /// Minimum range in spacings of the points: a narrower field cannot be distinguished from noise.
 const MIN_RANGE_SPACINGS: f64 = 2.5;
 
-/// Factor by which the field can be stronger than the observed deviations (one standard deviation of its logarithm).
+/// Factor by which the standard deviation of the field can exceed the RMS of the observed deviations (one standard
+/// deviation of its logarithm).
 const STRONGER: f64 = 2.0;
 
-/// Logarithms of range and ratio, and the log-likelihood there.
+/// Result of a search: the two variables at the maximum, and the log-likelihood there. The variables are the logarithms
+/// of the range and of the noise ratio, except in the search of an anisotropy.
 type Maximum = ([f64; 2], f64);
 
-/// Returns the kinds of field that the points support: one without noise autocorrelation, and one with it if neighbours
-/// give enough evidence.
+/// Returns the kinds of noise and field that the points support: one without noise autocorrelation, and one with it.
+/// The latter is `None` if neighbouring points give too little evidence.
 pub(super) fn candidates(observed: &Observations) -> (NoiseKind, Option<NoiseKind>) {
     let blocks = CompositeLikelihood::new(observed);
     let plain = blocks.find_maximum(NoiseKind::PLAIN, None);
@@ -86,8 +89,8 @@ impl CompositeLikelihood {
         Self { all, distance_mm: spacing_mm(&observed.places), priors, rms_mm: (squares / n).sqrt() }
     }
 
-    /// Computes the log-likelihood of a kind of field with its most probable scale, plus the log prior density. The
-    /// arguments `range` and `ratio` are logarithms.
+    /// Computes the log-likelihood of a kind of field with its most probable scale, plus the log prior density. `range`
+    /// is the logarithm of the range in mm, `ratio` the logarithm of the ratio of noise to field.
     fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
         if range < (MIN_RANGE_SPACINGS * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
@@ -125,7 +128,8 @@ impl CompositeLikelihood {
         maximize(start.0, [0.3, 0.6], 0.05, |place| self.log_likelihood(kind, place))
     }
 
-    /// Returns the most likely noise autocorrelation; `None` if it has too little evidence over none.
+    /// Returns the most likely noise autocorrelation; `None` if the log-likelihood exceeds `plain`, the maximum without
+    /// autocorrelation, by too little.
     fn most_likely_autocorrelation(&self, plain: Maximum) -> Option<(NoiseKind, Maximum)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
@@ -149,7 +153,8 @@ impl CompositeLikelihood {
         Some((of(best.0), best.1))
     }
 
-    /// Returns the most likely anisotropy of the field; `None` if it has too little evidence over isotropy.
+    /// Returns the most likely anisotropy of the field; `None` if the log-likelihood exceeds `without`, the maximum for
+    /// an isotropic field, by too little.
     fn most_likely_anisotropy(&self, kind: NoiseKind, without: Maximum) -> Option<Anisotropy> {
         // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
         // logarithm of the stretch are polar coordinates of the search plane.
@@ -170,7 +175,7 @@ fn higher(a: Maximum, b: Maximum) -> Maximum {
     if b.1 > a.1 { b } else { a }
 }
 
-/// Returns some of the points, with both large and small distances between them.
+/// Returns at most [`SPREAD`] of the points, with both large and small distances between them.
 fn spread(observed: &Observations) -> Observations {
     let n = observed.places.len();
     // Steps of the golden section cover the whole sequence evenly, without a repeating pattern.

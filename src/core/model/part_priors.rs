@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Hyperparameters, Prior};
 
-/// Prior factor by which parts differ, and number of parts that this prior counts for.
+/// Factor by which parts differ according to the prior, and number of parts that this prior counts for.
 const PART_FACTOR: f64 = 2.5;
 const PRIOR_PARTS: f64 = 2.0;
 /// Minimum factor of the prior: the points of a part that differs can still overrule it.
@@ -40,35 +40,36 @@ pub struct PartPriors {
 /// Statistics of the fields of several parts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartFit {
-    /// Median of the range, in millimetres, and factor by which parts differ: one standard deviation of its logarithm.
+    /// Median of the range, in millimetres, and factor by which the ranges of parts differ: one standard deviation of
+    /// the logarithm.
     pub range_mm: [f64; 2],
-    /// Median and factor of the ratio of the noise to the field.
+    /// Median and factor of the ratio of the noise to the standard deviation of the field.
     pub scatter_ratio: [f64; 2],
     /// Number of parts in the statistics; at most twenty, and later parts replace earlier ones gradually.
     pub parts: u32,
 }
 
 impl PartPriors {
-    /// Returns the statistics of passes of this kind.
+    /// Returns the statistics of passes with or without a correction; `None` if there is no such part.
     pub fn fit(&self, is_corrected: bool) -> Option<PartFit> {
         if is_corrected { self.with_correction } else { self.without_correction }
     }
 
-    /// Adds the hyperparameters of a further part after a pass of this kind.
+    /// Adds the hyperparameters of a further part, after a pass with or without a correction.
     pub fn update(&mut self, is_corrected: bool, hyperparameters: &Hyperparameters) {
         let lesson = if is_corrected { &mut self.with_correction } else { &mut self.without_correction };
         *lesson = Some(PartFit::updated(*lesson, hyperparameters));
     }
 
-    /// Returns the pooled statistics of other machines. Each counts as one part: this machine can differ from them as
-    /// much as they differ from each other.
+    /// Returns the pooled statistics of other machines. Each machine counts as one part, because this machine can
+    /// differ from the others as much as they differ from each other.
     #[must_use]
     pub fn pooled(machines: &[Self]) -> Self {
         let of = |is_corrected| PartFit::pooled(machines.iter().filter_map(|of| of.fit(is_corrected)));
         Self { without_correction: of(false), with_correction: of(true) }
     }
 
-    /// Returns true if every number is possible; for values that were read from a file.
+    /// Returns true if every number is possible. Use it for values that were read from a file.
     pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
         let is_sound = |lesson: PartFit| {
@@ -79,7 +80,7 @@ impl PartPriors {
 }
 
 impl PartFit {
-    /// Returns the statistics after a further part.
+    /// Returns the statistics `before` with a further part added. Without `before`, they contain this part alone.
     pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
@@ -118,7 +119,7 @@ impl PartFit {
         })
     }
 
-    /// Returns the prior of the next part.
+    /// Returns the prior of the next part, by the formula of the module.
     pub fn prior(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {

@@ -44,7 +44,8 @@ pub(super) fn select_hypotheses(observed: &Observations) -> Result<FieldHypothes
     Ok(if with > without { other } else { fields })
 }
 
-/// Prior of the noise of the probe: its standard deviation in mm, and the standard deviation of the logarithm of that.
+/// Prior of the noise of the probe: its standard deviation in mm, and the standard deviation of the logarithm of this
+/// value.
 pub(super) type NoisePrior = Option<[f64; 2]>;
 
 /// Field hypotheses with their probabilities.
@@ -63,20 +64,21 @@ pub(super) struct Posterior<'f> {
 
 /// Projections for one node: the first column is that of the deviations, the others are those of the random effects.
 struct Projected {
-    /// Projections U' of the columns.
+    /// Projections U' of the columns: one row for each eigenvector.
     v: Mat<f64>,
-    /// Products of all pairs of columns, less the products of their projections V.
+    /// Products of all pairs of columns, minus the products of all pairs of their projections `v`.
     rest: DMatrix<f64>,
 }
 
 /// Set of fields to sample from.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum HypothesisSet {
-    /// All fields; the second variance follows the points more closely.
+    /// All fields. The second variance factor is above 1, so that the samples follow the points more closely.
     All,
-    /// Smooth fields; the second variance shrinks peaks. Noise that is not normal looks like a rough field.
+    /// Smooth fields only, because noise that is not normal looks like a rough field. The second variance factor is
+    /// below 1, so that peaks are lower.
     Smooth,
-    /// Rough fields.
+    /// Rough fields only. The second variance factor is above 1.
     Rough,
 }
 
@@ -90,7 +92,7 @@ impl HypothesisSet {
         }
     }
 
-    /// Returns the two factors on the variance of the field that the samples use.
+    /// Returns the two factors by which the variance of a field of this smoothness is multiplied in the samples.
     fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
@@ -102,11 +104,11 @@ impl HypothesisSet {
 
 /// Samples of the field.
 pub(super) struct PosteriorSamples {
-    /// Coefficients of the basis functions, one column for each sample, for each of the two variances.
+    /// Coefficients of the basis functions, one column for each sample, for each of the two variance factors.
     pub(super) coefficients: [Mat<f64>; 2],
     /// Standard deviation of the noise of each sample.
     pub(super) noise_mm: Vec<f64>,
-    /// Standard deviation of the waves shorter than those of the basis, for each of the two variances.
+    /// Standard deviation of the waves shorter than those of the basis, for each of the two variance factors.
     pub(super) truncated_mm: [Vec<f64>; 2],
     /// Random effects in standard uncertainties, one column for each sample.
     pub(super) random_effects: DMatrix<f64>,
@@ -193,13 +195,14 @@ impl<'f> Posterior<'f> {
         NoiseLikelihood::new(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
-    /// Returns the most probable node and variance ratio.
+    /// Returns the index of the most probable node, and its variance ratio; `None` if there is no node.
     fn most_probable(&self) -> Option<(usize, f64)> {
         let all = self.probabilities(HypothesisSet::All);
         all.into_iter().max_by(|a, b| a.2.total_cmp(&b.2)).map(|(node, tau, _)| (node, tau))
     }
 
-    /// Returns the most probable node and variance ratio, with the most probable noise for them, in mm.
+    /// Returns the most probable node and variance ratio, with the most probable noise for them, in mm; `None` if there
+    /// is no node.
     pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
         let (number, tau) = self.most_probable()?;
         Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
@@ -258,8 +261,8 @@ impl<'f> Posterior<'f> {
 
     /// Returns the hyperparameters of each node at its most probable variance ratio, with their relative probabilities.
     ///
-    /// Only nodes of the smoothnesses that `is_of` accepts are included. The most probable one comes first, with weight
-    /// 1.
+    /// Only nodes of the smoothnesses for which `is_of` is true are included. The most probable node comes first, with
+    /// weight 1.
     pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
             let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
@@ -277,8 +280,8 @@ impl<'f> Posterior<'f> {
         all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
     }
 
-    /// Returns the hyperparameters as one value each: the geometric means over the nodes as smooth as the most probable
-    /// one.
+    /// Returns the hyperparameters as one value each: the geometric means over the nodes that have the same smoothness
+    /// as the most probable node.
     ///
     /// Rough fields are not included, because their variance cannot be separated from the noise.
     pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
@@ -345,7 +348,11 @@ impl<'f> Posterior<'f> {
         draws
     }
 
-    /// Draws samples for one node: z = sigma z0 + D R' U (w - sigma V'z0) / sqrt l.
+    /// Draws samples for one node: z = sigma z0 + D C' U (w - sigma V'z0) / sqrt l. The sample sigma z0 of the prior is
+    /// corrected so that its projections V'z on the eigenvectors are w, which is drawn from the posterior.
+    ///
+    /// `chosen` has the node, the variance ratio and the number of each sample. D are the standard deviations of the
+    /// node, and C are the rows of the coordinates.
     fn samples_of(
         &self,
         number: usize,
@@ -424,11 +431,11 @@ impl<'f> Posterior<'f> {
         (waves, stated)
     }
 
-    /// Returns the means over all fields of A K A' and of the variance of the noise in mm^2.
+    /// Returns the means over all fields of A K A', and of the variance of the noise in mm^2.
     ///
     /// A are the given `sums`: one row for each sum, one column for each basis function. K is the covariance of the
     /// coefficients of the cosines. The variance of the noise includes the waves shorter than those of the basis.
-    /// Fields stronger than the residuals have less weight.
+    /// Fields that are stronger than the residuals have less weight.
     pub(super) fn mean_covariance(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
@@ -461,7 +468,9 @@ impl<'f> Posterior<'f> {
 ///  -2 ln p(s) = 2 m ln s + logs + sum ln(1 + u / s^2) + (S - sum b^2 / (s^2 + u)) / s^2
 /// ```
 ///
-/// u are the eigenvalues of E'K0^-1 E. b are the components of E'K0^-1 d along the eigenvectors.
+/// K0 is the covariance of field and noise for s = 1 without random effects, S is d'K0^-1 d, and `logs` is the
+/// logarithm of the determinant of K0. u are the eigenvalues of E'K0^-1 E. b are the components of E'K0^-1 d along the
+/// eigenvectors.
 struct NoiseLikelihood {
     degrees_of_freedom: f64,
     logs: f64,
@@ -492,7 +501,7 @@ impl NoiseLikelihood {
         }
     }
 
-    /// Returns the logarithm of the density over ln s.
+    /// Returns the logarithm of the density of ln s at `log_mm`, including the prior of the noise of the probe.
     fn density(&self, log_mm: f64) -> f64 {
         let s2 = (2.0 * log_mm).exp();
         let mut value = 2.0 * self.degrees_of_freedom * log_mm + self.logs;
@@ -507,8 +516,8 @@ impl NoiseLikelihood {
         -0.5 * (value + below * below)
     }
 
-    /// Evaluates the density in equal steps of ln s that cover all of it: returns the first ln s, the step, and the
-    /// logarithm of the density at each step.
+    /// Evaluates the density in equal steps of ln s that cover all of the distribution. Returns the first ln s, the
+    /// step, and the logarithm of the density at each step.
     fn steps(&self) -> (f64, f64, Vec<f64>) {
         const COARSE: usize = 24;
         const FINE: usize = 41;
@@ -594,7 +603,7 @@ impl NoiseLikelihood {
         (first + step * (at.unwrap_or(0) as f64 + normals.uniform() - 0.5)).exp()
     }
 
-    /// Returns the most probable random effects, each in units of its standard uncertainty.
+    /// Returns the most probable random effects for the noise `scatter_mm`, each in units of its standard uncertainty.
     fn random_effects_mode(&self, scatter_mm: f64) -> DVector<f64> {
         let along = self.random_effect_terms.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
         &self.axes * DVector::from_iterator(self.random_effect_terms.len(), along)

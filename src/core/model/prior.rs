@@ -1,4 +1,4 @@
-//! Prior of a field's hyperparameters, before anything is measured.
+//! Prior of the hyperparameters of a field, before anything is measured.
 
 use super::ModelError;
 
@@ -8,7 +8,7 @@ use super::ModelError;
 pub struct Prior {
     /// Median and factor of the range; the median in mm.
     pub range_mm: [f64; 2],
-    /// Median and factor of the ratio of the noise to the field.
+    /// Median and factor of the ratio of the noise to the standard deviation of the field.
     pub noise_ratio: [f64; 2],
 }
 

@@ -8,7 +8,7 @@ pub(super) struct NormalGenerator {
 }
 
 impl NormalGenerator {
-    /// Creates the stream of this number for a seed.
+    /// Creates the stream with the number `stream` of a seed. The same seed and number give the same random numbers.
     pub(super) fn new(seed: u64, stream: u64) -> Self {
         let mut mixed = Self { state: seed, spare: None };
         let state = mixed.bits() ^ stream.wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17);

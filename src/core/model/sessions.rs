@@ -36,7 +36,7 @@ pub struct BetweenSessionVariance {
     pub hyperparameters: Hyperparameters,
     /// Field of a single session.
     pub session_field: Field,
-    /// Standard uncertainty of the logarithm of the session field's standard deviation.
+    /// Standard uncertainty of the logarithm of the standard deviation of `session_field`.
     pub session_log_sigma_u: f64,
     /// Number of sessions in the estimate.
     pub sessions: usize,
@@ -47,9 +47,9 @@ pub struct BetweenSessionVariance {
 pub struct PredictionInterval {
     /// Most probable deviation, after the best fit of that session.
     pub mean_mm: f64,
-    /// Standard uncertainty of the deviation that will be found, including the session's field and the noise.
+    /// Standard uncertainty of the deviation that will be found, including the field of the session and the noise.
     pub sigma_mm: f64,
-    /// Degrees of freedom of that standard uncertainty.
+    /// Degrees of freedom of `sigma_mm`.
     pub degrees_of_freedom: f64,
 }
 
@@ -62,8 +62,8 @@ const MIN_SESSIONS: usize = 2;
 /// the prior median of each range.
 const SHARES: [f64; 3] = [0.1, 0.5, 2.0];
 const RANGES: [f64; 3] = [0.3, 1.0, 3.0];
-/// Rounds of the search: each searches the hyperparameters of one field with those of the other fixed, and then the
-/// reverse.
+/// Number of rounds of the search: each searches the hyperparameters of the common field with those of the session's
+/// field fixed, and then the reverse.
 const ROUNDS: usize = 4;
 /// Prior of the session's field, as the median and the factor of one standard deviation of the logarithm: its strength
 /// as a share of that of the part's field, and its range divided by the prior median of the part's range.
@@ -88,9 +88,9 @@ impl Sessions {
         Ok(Self { observed, session_numbers: of })
     }
 
-    /// Joins the used points of registrations, each with the number of the session of every measured point. The motions
-    /// that a registration was free to make are fixed effects of its own. Outliers are left out: only points with
-    /// [`PointStatus::Inlier`] count.
+    /// Joins the used points of several registrations. Each registration comes with the session number of every
+    /// measured point. The motions that a registration was free to make are its own fixed effects. Outliers are left
+    /// out: only points with [`PointStatus::Inlier`] count.
     ///
     /// # Errors
     /// Those of [`Sessions::new`]; also if a registration has no used point.
@@ -150,8 +150,9 @@ impl Sessions {
         })
     }
 
-    /// Searches the maximum from the best of several start values: over the common field, then over the session's
-    /// field, in turns.
+    /// Searches the most probable hyperparameters from the best of several start values, in turns over those of the
+    /// common field and over those of the session's field. Returns the arguments of [`Self::scaled`] at the maximum,
+    /// and its value there.
     fn search_maximum(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
@@ -324,12 +325,13 @@ impl BestFitBasis {
         values.iter().zip(fitted.iter()).map(|(value, fitted)| value - fitted).collect()
     }
 
-    /// Returns the share of the variance of independent points that the best fit leaves at one of them.
+    /// Returns the share of the variance at a point that remains after the best fit, if the points are independent.
     fn remaining_share(&self, point: usize) -> f64 {
         1.0 - self.q.row(point).norm_squared()
     }
 
-    /// Returns the diagonal of P V P with P = 1 - Q Q'.
+    /// Returns the variance of each point after the best fit: the diagonal of P V P. V is the given covariance, and P
+    /// is 1 - Q Q'.
     fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
         let (n, p) = self.q.shape();
         let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);

@@ -40,7 +40,7 @@ pub struct PartialMeasurement<'a> {
     pub targets: &'a [(Point, Vector)],
     /// Number of the batch in which each target was tried; `None` if it was not tried yet.
     pub tried: &'a [Option<u32>],
-    /// Target index of each deviation of the registration.
+    /// Index of the target of each deviation of the registration.
     pub touched: &'a [usize],
 }
 
@@ -63,7 +63,8 @@ pub enum Reason {
     WithinLimits,
     /// The part has to be corrected, and the form is known well enough for the correction.
     FormKnown,
-    /// The part has to be corrected, and further touches would cost more than the error that another pass corrects.
+    /// The part has to be corrected. Its form is not known well enough yet, but another pass is worth more than further
+    /// touches.
     CorrectionPreferred,
     /// All targets were tried.
     AllTargetsTried,
@@ -71,7 +72,7 @@ pub enum Reason {
     TooFewTouches,
     /// The innovations of the last batch are larger than expected.
     LargeInnovations,
-    /// A touch is an outlier, and too few of its neighbours were tried.
+    /// A touch is an outlier, and too few of its neighbouring targets were tried to confirm or reject it.
     UnconfirmedOutlier,
     /// The part has a narrow feature: only the whole pattern shows its size.
     NarrowFeature,
@@ -85,12 +86,12 @@ pub enum Reason {
     MaxBatchesReached,
 }
 
-/// Number of touches of the first batch: enough to check that it is the right part, and where it lies.
+/// Number of touches of the first batch: enough to check that the right part is clamped, and to find its pose.
 pub const FIRST_BATCH: usize = 10;
 /// Minimum number of touches of a decision.
 pub const MIN_TOUCHES: usize = 40;
-/// Maximum number of batches of a measurement, without a last one of all remaining targets. The number of a batch must
-/// fit into the few bits that a field bus has for it.
+/// Maximum number of batches of a measurement, without a last batch of all remaining targets. A field bus has only a
+/// few bits for the number of a batch.
 pub const MAX_BATCHES: u32 = 60;
 /// Minimum and maximum number of touches of a batch.
 const BATCH: [usize; 2] = [20, 100];
@@ -100,13 +101,13 @@ const RANDOM_INTERVAL: usize = 10;
 /// examined around an outlier.
 const OUTLIER_SIGMAS: f64 = 4.5;
 const NEIGHBOURS: usize = 6;
-/// Number of these neighbours that must have been tried.
+/// Minimum number of tried neighbours of an outlier. With fewer, its other neighbours are touched next.
 const MIN_TRIED_NEIGHBOURS: usize = 4;
 /// Normal quantile of 99.9 %: by chance, the mean square of the innovations exceeds its bound in one batch of a
 /// thousand.
 const INNOVATION_QUANTILE: f64 = 3.09;
-/// If the part is not accepted and another pass can help, the measurement ends at this share of the pattern, but not
-/// before this number of touches.
+/// Minimum share of the pattern, and minimum number of touches, at which the measurement ends if the part is not
+/// accepted and another pass can help.
 const GIVE_UP_LIMITS: (f64, usize) = (1.0 / 6.0, 120);
 
 /// Returns the indices of at most `most` targets that lie as far apart as possible: each is the target farthest from
@@ -176,7 +177,8 @@ pub fn decide(
     Ok(StoppingDecision { form, next, reason: why })
 }
 
-/// Returns the reason that follows from the figures and from the uncertainty of the form.
+/// Returns the reason that follows from the figures and from the uncertainty of the form. `count` is the number of
+/// touches so far, `pattern` the number of targets.
 fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
@@ -248,7 +250,7 @@ impl ExpectedTouches {
         Ok(Self { posterior: growing, last_innovations: of_targets.into_iter().zip(off).collect(), outliers })
     }
 
-    /// Returns true if the innovations of the last batch without its outliers are larger than expected by chance.
+    /// Returns true if the innovations of the last batch, without its outliers, are larger than chance explains.
     fn has_large_innovations(&self) -> bool {
         let squares: Vec<f64> =
             self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
@@ -263,7 +265,7 @@ impl ExpectedTouches {
         off.chain(self.outliers.iter().copied())
     }
 
-    /// Returns the untried neighbours of outliers of which too few neighbours were tried.
+    /// Returns the untried neighbours of those outliers that have too few tried neighbours.
     fn untried_neighbours(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.all_outliers() {
@@ -277,13 +279,14 @@ impl ExpectedTouches {
         around
     }
 
-    /// Returns true if two neighbours are both outliers: dust makes a single outlier.
+    /// Returns true if two neighbouring targets are both outliers. A particle of dust causes only a single outlier.
     fn has_feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
-    /// Chooses the targets to touch next: `around` first, then random ones, then those of largest weighted variance.
+    /// Chooses the targets to touch next: the targets `around` first, then random targets, then those with the largest
+    /// weighted variance.
     fn choose_next(
         &mut self,
         so_far: &PartialMeasurement,
@@ -315,8 +318,8 @@ impl ExpectedTouches {
         Ok(chosen)
     }
 
-    /// Returns the open target with the largest weighted variance. The weight is 2 where the maximum or the minimum of
-    /// the form can lie, otherwise 1.
+    /// Returns the open target with the largest weighted variance; `None` if no target is open. The weight is 2 where
+    /// the maximum or the minimum of the form can lie, otherwise 1.
     fn max_variance_target(&self, open: &[bool]) -> Option<usize> {
         let known: Vec<Prediction> = self.posterior.predictions().collect();
         let surely =
@@ -333,7 +336,7 @@ impl ExpectedTouches {
     }
 }
 
-/// Returns the indices of the nearest other targets.
+/// Returns the indices of the [`NEIGHBOURS`] other targets that are nearest to the target `of`.
 fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     let apart = |k: usize| (targets[k].0 - targets[of].0).norm_squared();
     let mut others: Vec<usize> = (0..targets.len()).filter(|&k| k != of).collect();
@@ -345,7 +348,8 @@ fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     others
 }
 
-/// Sorts targets into a short tour: always to the nearest next target, then crossings are removed (2-opt).
+/// Sorts targets into a short tour: it starts at the smallest x and always goes to the nearest remaining target. Then
+/// crossings are removed (2-opt).
 pub fn short_tour(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize> {
     let apart = |a: usize, b: usize| (targets[a].0 - targets[b].0).norm();
     let mut open = chosen;
