@@ -1,4 +1,4 @@
-//! Interface of the physics behind a machine's registers; the handshake tells it when to move.
+//! Interface of the physics behind a machine's registers. The handshake calls it when the machine has to move.
 
 use std::fmt;
 
@@ -51,7 +51,7 @@ impl fmt::Display for Refusal {
 pub struct Progress {
     /// Points measured, or thousandths of the path.
     pub done: u32,
-    /// Total number of them.
+    /// Total number of points, or 1000 for a path.
     pub total: u32,
     /// True if nothing is left to do.
     pub finished: bool,
@@ -111,7 +111,8 @@ pub trait Physics: Send {
     fn has_partial_result(&self) -> bool {
         false
     }
-    /// Returns the final part of the result of a running job; `None` if the machine gives its result only at the end.
+    /// Returns the part of the result that will not change any more while the job runs; `None` if the machine gives its
+    /// result only at the end.
     fn partial_result(&self) -> Option<ResultData> {
         None
     }

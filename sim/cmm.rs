@@ -61,7 +61,8 @@ impl CmmSpec {
     }
 }
 
-/// Returns the way of the centre of a ball with the given radius to a target; the machine steers by the stated radius.
+/// Returns the path of the centre of a ball with radius `radius_mm` to a target. The machine controls its motion with
+/// the stated radius of the plan.
 fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
@@ -86,7 +87,7 @@ struct Run {
     unexpected: u32,
     fault: u16,
     elapsed_s: f64,
-    /// Time at which each target has been touched, in s.
+    /// Time in s, from the begin of the job, at which the touch of each target is finished.
     due_s: Vec<f64>,
     noise: Rng,
     outliers: Rng,
@@ -122,8 +123,8 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns the time at which each target has been touched, travel included. The first targets take longer if the
-    /// plan requires it.
+    /// Returns the time in s at which the touch of each target is finished, travel included. The first targets take
+    /// longer if the plan requires it.
     fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
         let (slowly, speed_mm_s) = plan.careful;
         let each_s = |k: usize| {
@@ -146,7 +147,7 @@ impl Run {
         self.records.len() == self.plan.targets.len()
     }
 
-    /// Returns the result with the present records, as the machine reports it.
+    /// Returns the points measured so far as a result of the machine.
     fn to_result(&self, state: &WorldState) -> ResultData {
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
         let scale = spec.scaled_points.then_some(COUNT_MM);
@@ -215,7 +216,8 @@ impl Run {
         }
     }
 
-    /// Draws noise and outlier of a touch; it draws the same numbers whether or not they are used.
+    /// Draws the noise and the outlier of a touch. The number of drawn random numbers does not depend on whether the
+    /// touch is an outlier.
     fn disturbance(&mut self, spec: &CmmSpec) -> Vec3 {
         let normal = |rng: &mut Rng| -> f64 { StandardNormal.sample(rng) };
         let noise: Vec3 = std::array::from_fn(|_| 1e-3 * spec.noise_um * normal(&mut self.noise));
@@ -293,8 +295,8 @@ impl TouchProbe {
         locked(&self.world).spec.cmm.seconds_per_point
     }
 
-    /// Touches at a point along its normal, with radius, approach and search. The first touch after the part was away
-    /// begins a new measurement.
+    /// Touches the part at a point, along its normal. The last argument is the probe radius, the approach and the
+    /// search distance in mm. The first touch after the part was away begins a new measurement.
     pub fn touch(
         &mut self,
         point_mm: Vec3,
@@ -341,7 +343,8 @@ impl TouchProbe {
     }
 }
 
-/// Returns the feature of a point: the reference sphere, if the point is on it, otherwise the part.
+/// Returns the feature to which a point belongs: the reference sphere if the point is close to its surface, otherwise
+/// the part.
 fn feature(spec: &CmmSpec, point_mm: Vec3) -> Feature {
     let away_mm = (0..3).map(|k| (point_mm[k] - spec.sphere_centre_mm[k]).powi(2)).sum::<f64>().sqrt();
     if (away_mm - spec.sphere_radius_mm).abs() < 0.5 * spec.sphere_radius_mm {
@@ -371,7 +374,7 @@ impl Physics for Cmm {
 
     fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal> {
         if kind != 1 {
-            return Err(Refusal { answer: BROKEN, reason: format!("a CMM has no use for a payload of kind {kind}") });
+            return Err(Refusal { answer: BROKEN, reason: format!("a CMM does not accept payloads of kind {kind}") });
         }
         let plan = Plan::decode(&payload.bytes)?;
         locked(&self.world).spec.cmm.check_travel(&plan)

@@ -152,7 +152,8 @@ impl CommandFrame {
         words
     }
 
-    /// Reads the 20 registers; `None` if the CRC or the copies disagree, or the number is 0.
+    /// Reads the 20 registers. Returns `None` if the CRC is wrong, the two copies of the sequence number differ, or the
+    /// sequence number is 0.
     pub fn read(order: WordOrder, words: &[u16; 20]) -> Option<Self> {
         let u32_at = |at: usize| order.to_u32([words[at], words[at + 1]]);
         let sound = words[16] == crc16(&bytes_of(&words[..16])) && u32_at(0) == u32_at(18) && u32_at(0) != 0;

@@ -30,7 +30,7 @@ use crate::shape::project_onto;
 use crate::spec::{SpecError, WorldSpec};
 use crate::truth::{ExecutedPass, Source, WorldState, locked, stream};
 
-/// Maximum height over the part at which the wheel is at the part, in mm.
+/// Maximum height over the nominal surface at which the wheel counts as being at the part, in mm.
 const NEAR_MM: f64 = 1.0;
 /// Depth beyond which the wheel has run into the part, in mm: no pass cuts so deep at once.
 const TOO_DEEP_MM: f64 = 2.0;
@@ -43,7 +43,7 @@ const OUTER_STRIP_MM: f64 = 1.5;
 #[derive(Clone, Copy, Debug)]
 struct WheelProjection {
     position_mm: [f64; 2],
-    /// Height that the wheel would leave over the nominal surface, in mm.
+    /// Height over the nominal surface that the wheel would leave, in mm.
     height_mm: f64,
     seconds: f64,
 }
@@ -62,7 +62,8 @@ struct PassState {
     bend: Option<HeightGrid>,
     began_s: f64,
     heat_at_begin: f64,
-    /// Number of nodes on the part, and of nodes that the wheel has passed.
+    /// Number of nodes on the part. `visits` is the number of visits of the wheel to nodes, `in_air` the number of
+    /// visits at which the wheel cut air.
     nodes: f64,
     visits: u64,
     in_air: u64,
@@ -78,12 +79,14 @@ pub struct Wheel {
     guess_mm: [f64; 2],
     pass: Option<PassState>,
     projections: Vec<WheelProjection>,
-    /// Track that waits for the next one.
+    /// Last track that has ended. It is ground when the next track has ended, because its strip depends on the next
+    /// track.
     waiting_track: Option<Track>,
-    /// Half the spacing of the tracks, once there are two, and the side on which they follow each other.
+    /// Half the spacing of the tracks, known after the second track. `side` is the direction in y in which the tracks
+    /// follow each other, 1 or -1.
     half_mm: Option<f64>,
     side: f64,
-    /// y up to which the strips have come, in mm.
+    /// y of the border up to which strips are ground, in mm.
     reached_mm: Option<f64>,
 }
 
@@ -122,7 +125,8 @@ impl Wheel {
         }
     }
 
-    /// Handles an unknown position, as before homing or after power-off: the wheel does not touch the part.
+    /// Handles an unknown position, for example before homing or after power-off: the wheel counts as lifted off the
+    /// part.
     pub fn set_position_unknown(&mut self) {
         self.last = None;
         let world = Arc::clone(&self.world);
@@ -135,8 +139,8 @@ impl Wheel {
         locked(&self.world).part_unknown = true;
     }
 
-    /// Grinds the waiting track as one without a next neighbour. If the wheel is at the part, its present track
-    /// continues.
+    /// Grinds the waiting track as a track without a successor. Does nothing while the wheel is at the part, because
+    /// its present track is the successor.
     pub fn finish_waiting_track(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
@@ -145,7 +149,7 @@ impl Wheel {
         }
     }
 
-    /// Projects the wheel's centre onto the part, if it is near it.
+    /// Projects the wheel's centre onto the part. Returns `None` if the wheel is not near the part.
     fn project(
         &mut self,
         state: &mut WorldState,
@@ -223,7 +227,7 @@ impl Wheel {
         state.executed_passes.push(ExecutedPass::default());
     }
 
-    /// Ends the track after the wheel has lifted off or turned back.
+    /// Ends the track after the wheel has lifted off or turned back, and grinds the track before it.
     fn end_track(&mut self, state: &mut WorldState) {
         let feet = std::mem::take(&mut self.projections);
         let [half_x, half_y] = state.part.aperture.half_mm();
@@ -239,7 +243,7 @@ impl Wheel {
         }
     }
 
-    /// Grinds the waiting track, half way to the next one.
+    /// Grinds the strip of the waiting track, which reaches half way to the next track at y = `next_mm`.
     fn grind_waiting(&mut self, state: &mut WorldState, next_mm: Option<f64>) {
         let Some(track) = self.waiting_track.take() else { return };
         let Some(mut pass) = self.pass.take() else { return };
@@ -279,8 +283,8 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     })
 }
 
-/// Updates the grooves: they lie at the tracks of this pass. Where it has not come, those of the pass before keep their
-/// height.
+/// Updates the grooves, which lie at the tracks of this pass. Where this pass has not ground, the grooves of the
+/// previous pass keep their height.
 fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
@@ -298,8 +302,8 @@ fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_
     state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
 }
 
-/// Lets a track grind the nodes of its strip and, next to it where there is no other track, those that its own curve
-/// reaches.
+/// Grinds the nodes in the strip of a track. On each side in `beside`, where there is no other track, also grinds the
+/// nodes that the curve of the wheel reaches.
 fn grind(
     state: &mut WorldState,
     pass: &mut PassState,
@@ -340,8 +344,8 @@ fn grind(
     }
 }
 
-/// Returns the nodes of a track within a strip of y, with the height that the wheel would leave at each: that at the
-/// track's own y.
+/// Returns the nodes of a track within a strip of y: the index of each node, its position, and the height in mm that
+/// the wheel would leave at the track's own y.
 fn nodes_in_strip(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
     let mut nodes = Vec::new();
     for pair in track.projections.windows(2) {

@@ -1,16 +1,17 @@
-//! Faults of a machine that is controlled line by line; each happens once. The faults of Modbus requests differ, see
-//! [`crate::wire::faults`]: those are drawn and can repeat, and several can meet in one request.
+//! Faults of a machine that is controlled line by line; each fault happens once. They differ from the faults of Modbus
+//! requests in [`crate::wire::faults`], which are drawn at random, can repeat, and can coincide in one request.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 struct Rule<Place, Fault> {
     place: Place,
-    /// Number of matching places that pass first without a fault.
+    /// Number of matching lines or commands that pass without a fault before the fault happens.
     skip: u32,
     fault: Fault,
 }
 
-/// Pending faults, each at a place as the machine names it. Clones share them.
+/// Pending faults. The place of a fault is the number, the beginning or the name of a line or command. Clones share
+/// them.
 pub struct PendingFaults<Place, Fault>(Arc<Mutex<Vec<Rule<Place, Fault>>>>);
 
 impl<Place, Fault> PendingFaults<Place, Fault> {
@@ -19,7 +20,7 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         Self(Arc::default())
     }
 
-    /// Adds a fault for a place, after `skip` matching places without it.
+    /// Adds a fault at a place. The first `skip` matches of the place pass without the fault.
     pub fn add(&self, place: impl Into<Place>, skip: u32, fault: Fault) {
         self.rules().push(Rule { place: place.into(), skip, fault });
     }
@@ -29,8 +30,9 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         self.rules().clear();
     }
 
-    /// Returns the fault that happens now, if any, at a place that matches. The first of several is taken, and the
-    /// others wait.
+    /// Returns the fault that happens now at a place for which `is_meant` returns true, and removes it from the pending
+    /// faults. If several faults are due, only the first happens and the others stay pending. Returns `None` if none is
+    /// due.
     pub(crate) fn next_at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

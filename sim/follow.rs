@@ -10,23 +10,24 @@ const SAMPLE_SPACING_MM: f64 = 0.15;
 /// Maximum distance of the ball from the nominal contact at which it grinds, in mm.
 const NEAR_MM: f64 = 1.0;
 
-/// Place where the ball touches or would touch, and its height over the nominal surface, in mm.
+/// Projection of the centre of the ball onto the nominal surface: position (x, y), and height of the ball over the
+/// nominal surface, in mm.
 #[derive(Clone, Copy, Debug)]
 struct BallSample {
     at_mm: [f64; 2],
     height_mm: f64,
 }
 
-/// Returns at every node of a part the height over the nominal surface that a ball of this radius leaves, in mm; NaN
-/// where the ball does not come.
+/// Returns, for every node of a part, the height in mm over the nominal surface that a ball of this radius leaves; NaN
+/// where the ball does not come. `track_mm` is the spacing of the tracks.
 pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
     let reach_mm = (1.6 * track_mm).max(2.0 * SAMPLE_SPACING_MM);
     let cells = SampleIndex::new(touches(part, program, radius_mm), reach_mm);
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
-/// Returns a place on the part unchanged. For a place outside, returns the last place on the part on the way to its
-/// middle: outside, the wheel has lifted off, and the height at the edge is used.
+/// Returns a position on the part unchanged. For a position outside, returns the last position on the part in the
+/// direction of its middle, because the wheel has lifted off outside and the height at the edge is used there.
 fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     let at = |share: f64| at_mm.map(|v| share * v);
     let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
@@ -60,7 +61,7 @@ fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<BallSample> {
     (height_mm.abs() < NEAR_MM).then_some(BallSample { at_mm, height_mm })
 }
 
-/// Touches, indexed by their place.
+/// Samples of the ball, indexed by their position.
 struct SampleIndex {
     reach_mm: f64,
     samples: std::collections::HashMap<[i64; 2], Vec<BallSample>>,
@@ -79,8 +80,8 @@ impl SampleIndex {
         at_mm.map(|v| (v / self.reach_mm).floor() as i64)
     }
 
-    /// Returns the height at a place, from a plane fitted to the touches around it; their weight falls to 0 at the
-    /// reach.
+    /// Returns the height at a position, from a plane fitted to the contacts around it. The weight of a contact falls
+    /// to 0 at the reach.
     fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
         let [i, j] = self.cell(at_mm);
         // Normal equations of h = c0 + c1 u + c2 v.
@@ -102,7 +103,7 @@ impl SampleIndex {
     }
 }
 
-/// Returns the first unknown of three equations by Cramer's rule; NaN if the system is singular.
+/// Returns the first unknown of three linear equations `m` x = `b`, by Cramer's rule; NaN if the system is singular.
 fn solve_first(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
     let of = |c: [f64; 3]| {
         c[0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (c[1] * m[2][2] - m[1][2] * c[2])

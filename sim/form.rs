@@ -12,7 +12,7 @@ use crate::Rng;
 /// exp(-(s/l)^2), whose wave numbers have the standard deviation sqrt(2)/l on each axis.
 #[derive(Clone, Debug)]
 pub struct FormError {
-    /// Wave vector, phase and amplitude of each wave.
+    /// Wave vector (two numbers), phase and amplitude of each wave.
     waves: Vec<[f64; 4]>,
 }
 

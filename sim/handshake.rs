@@ -1,4 +1,5 @@
-//! Machine's side of the handshake of docs/modbus.md: one state, commands as values, and time as an input.
+//! Machine's side of the handshake of docs/modbus.md: one state, commands that are values and not pulses, and time as
+//! an input.
 //!
 //! For every frame, the number and the answer are latched before anything moves. A (job, cycle) moves the machine only
 //! once in its life. Nothing here knows the address of a register, or a clock.
@@ -65,9 +66,9 @@ pub(crate) struct Handshake {
     begun: BTreeSet<(u32, u16)>,
     trusting: bool,
     gives_ahead: bool,
-    /// True if the next payload in force is changed after it has been checked.
+    /// True if the identities in force are to be changed after the next payload has come into force and was read.
     spoils: bool,
-    /// True if such a payload is in force and has not been read yet.
+    /// True if the identities in force are to be changed at the next read of the slots in force.
     spoils_soon: bool,
     last_begun: (u32, u16),
     done: u32,
@@ -154,7 +155,7 @@ impl Handshake {
         self.hear();
     }
 
-    /// Handles a sign of life of the owner.
+    /// Restarts the measurement of the owner's silence.
     fn hear(&mut self) {
         self.silent = Duration::ZERO;
     }
@@ -242,7 +243,7 @@ impl Handshake {
         Some(hasher.finalize())
     }
 
-    /// Carries out an accepted command; its number and answer are latched already.
+    /// Carries out an accepted command. Its sequence number and its answer are already stored.
     fn act(&mut self, command: Command, frame: &CommandFrame) {
         match command {
             Command::Claim => {
@@ -292,7 +293,7 @@ impl Handshake {
         self.retract(State::Holding);
     }
 
-    /// Moves clear of the part, and enters a state that lasts some time.
+    /// Moves clear of the part and enters `acting`, a transitional state that lasts some time.
     fn retract(&mut self, acting: State) {
         self.token = 0;
         self.acting_left = self.acting;
@@ -300,7 +301,7 @@ impl Handshake {
         self.body.retract();
     }
 
-    /// Shows a fault, ends a running job as failed, and waits for CLEAR.
+    /// Reports a fault, ends a running job as failed, and waits for CLEAR.
     pub(crate) fn fail(&mut self, fault: u16) {
         self.token = 0;
         self.show(fault);
@@ -327,7 +328,7 @@ impl Handshake {
         }
     }
 
-    /// Ends a running job; returns false if its result cannot be encoded.
+    /// Ends a running job with this result. Returns false if the result data cannot be encoded, otherwise true.
     fn end(&mut self, result: u16) -> bool {
         if !std::mem::take(&mut self.running) {
             return true;
@@ -455,7 +456,8 @@ impl Handshake {
         self.body.interlocks() & interlock::ALL & !self.opened
     }
 
-    /// Opens interlocks whatever the physics reports; 0 returns them to the physics.
+    /// Opens the interlocks in `bits`, even if the physics reports them closed. With `bits` = 0, the interlocks are
+    /// those of the physics again.
     pub(crate) fn open(&mut self, bits: u16) {
         self.opened = bits;
         if self.state == State::Prepared && !self.is_safe(interlock::ALL) {
@@ -494,12 +496,13 @@ impl Handshake {
         }
     }
 
-    /// Makes the next payload in force differ from what was sent.
+    /// Changes the identities in force after the next payload has come into force and a client has read the slots.
     pub(crate) fn spoil(&mut self) {
         self.spoils = true;
     }
 
-    /// Notes that a client has read what is in force.
+    /// Handles a read of the slots in force by a client: changes the identities in force if [`Self::spoil`] requested
+    /// it.
     pub(crate) fn slots_were_read(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;
@@ -524,8 +527,8 @@ impl Handshake {
         }
     }
 
-    /// Takes another boot id and forgets everything except the jobs that it began; returns true if a motion was
-    /// interrupted.
+    /// Takes another boot id, and clears the memory except the jobs that the machine has begun. Returns true if a
+    /// motion was interrupted.
     fn lose_memory(&mut self) -> bool {
         let cut_off = std::mem::take(&mut self.running);
         if cut_off {

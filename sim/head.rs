@@ -26,7 +26,7 @@ pub struct Head {
 }
 
 impl Head {
-    /// Returns the centre of the wheel for positions of slides and scale.
+    /// Returns the centre of the wheel, for positions of the slides in mm and an angle on the scale in degrees.
     pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
         let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
         let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();
@@ -37,8 +37,8 @@ impl Head {
         std::array::from_fn(|k| pivot[k] - arm[k])
     }
 
-    /// Returns the centre of the wheel at a share of the way from a stop to the next; the head turns in proportion to
-    /// the way of the slides.
+    /// Returns the centre of the wheel on a move, after the fraction `share` of it, from 0 to 1. The head turns in
+    /// proportion to the travel of the slides.
     pub fn centre_on_move_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> Vec3 {
         let slides = to.position_at(from.at_mm, share);
         let ends = from.rotary_deg.or(to.rotary_deg).zip(to.rotary_deg);
@@ -52,10 +52,10 @@ impl Head {
             return Some(format!("the program turns {letter}, and this machine has {}", self.letter));
         }
         if self.pivot_mm.is_some() && program.keeps_centre {
-            return Some("the program has the wheel's centre kept, and this control leads its slides alone".into());
+            return Some("the program uses tool centre point control, and this control moves only the slides".into());
         }
         if self.pivot_mm.is_none() && !(program.keeps_centre || program.by_kinematics) {
-            return Some("the program leads the slides, and this control keeps the wheel's centre".into());
+            return Some("the program moves only the slides, and this control keeps the wheel's centre".into());
         }
         let [least, most] = self.range_deg;
         let turns = program.waypoints.iter().filter_map(|stop| stop.rotary_deg);

@@ -69,7 +69,7 @@ pub mod wire;
 pub mod words;
 pub mod world;
 
-/// A position or a direction in space.
+/// Position or direction in space.
 pub type Vec3 = [f64; 3];
 
 /// Random generator of the whole crate: portable across machines and releases.

@@ -36,39 +36,39 @@ pub const NODE_SPACING_MM: f64 = 0.5;
 /// Number of nodes beyond the aperture on every side, so that interpolation at the edge has its neighbours.
 const MARGIN_NODES: usize = 2;
 
-/// The part and its blank, as the world's table says.
+/// Specification of the part and its blank.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PartSpec {
     /// Nominal shape of the part.
     pub shape: ShapeSpec,
-    /// Where it is.
+    /// Outline of the part.
     pub aperture: Aperture,
     /// Height of the blank over the nominal surface before the first pass.
     pub stock_um: f64,
     /// Peak to valley of the blank's form error.
     pub form_error_um: f64,
-    /// Its correlation length.
+    /// Correlation length of the blank's form error.
     pub form_error_correlation_mm: f64,
-    /// A job number that the grinder has not seen last means that somebody has put in a new blank.
+    /// True if each new job number at the grinder means that a person has clamped a new blank.
     pub fresh_per_job: bool,
-    /// Damage that comes to it after passes.
+    /// Defects that appear after passes.
     pub defects: Vec<DefectSpec>,
 }
 
-/// A place of the part that stands out: a piece that breaks off, a pit, a scratch, or what sticks to it.
+/// Local defect of the part: a broken-off piece, a pit, a scratch, or a deposit.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct DefectSpec {
-    /// Its middle.
+    /// Middle of the defect in the model frame.
     pub at_mm: [f64; 2],
-    /// How far it goes along x and y in all.
+    /// Total size of the defect along x and y.
     pub size_mm: [f64; 2],
-    /// How far it stands over the surface; what is missing has a negative height.
+    /// Height of the defect over the surface; negative where material is missing.
     pub height_um: f64,
-    /// Whether it is an ellipse with a round bottom; else it is a rectangle that is flat but for its flanks.
+    /// True for an ellipse with a round bottom; false for a rectangle that is flat except for its flanks.
     pub round: bool,
-    /// After which pass it appears, before the part is measured.
+    /// Number of the pass after which the defect appears, before the part is measured.
     pub after_pass: u32,
 }
 
@@ -107,7 +107,7 @@ impl Default for PartSpec {
     }
 }
 
-/// A nominal surface by its numbers.
+/// Nominal surface, given by its parameters.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum ShapeSpec {
@@ -240,14 +240,14 @@ impl HeightGrid {
         Self { first_mm, step_mm, columns, rows, heights_mm: vec![height_mm; columns * rows] }
     }
 
-    /// Returns the places of the nodes, in the order of the heights.
+    /// Returns the positions (x, y) of the nodes, in the order of the heights.
     pub fn nodes(&self) -> impl Iterator<Item = [f64; 2]> + '_ {
         (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
     }
 
-    /// Returns the nodes from x0 up to x1 and from y0 up to y1, in whichever order those are given, each with its
-    /// index. A border belongs to what lies above it, so that each node of adjacent rectangles is in exactly one of
-    /// them.
+    /// Returns the nodes between two limits in x and two limits in y, each with its index. The two limits can be in
+    /// either order. A node on the lower limit is included, a node on the upper limit is not, so that each node of
+    /// adjacent rectangles is in exactly one of them.
     pub(crate) fn within(&self, x_mm: [f64; 2], y_mm: [f64; 2]) -> impl Iterator<Item = (usize, [f64; 2])> + '_ {
         let from = |k: usize, place: f64| ((place - self.first_mm[k]) / self.step_mm[k]).ceil().max(0.0) as usize;
         let range =
@@ -290,9 +290,10 @@ impl HeightGrid {
     }
 }
 
-/// Returns the first of the four nodes about a place, their weights, and the derivatives of the weights.
+/// Returns the index of the first of the four nodes around the coordinate `t`, the weights of the four nodes, and the
+/// derivatives of the weights.
 ///
-/// Beyond the innermost cells, the place is clamped to the border, and the derivatives are 0.
+/// Beyond the innermost cells, the coordinate is clamped to the border, and the derivatives are 0.
 fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f64; 4]) {
     let place = (t - first) / step;
     let held = place.clamp(1.0, (nodes - 2) as f64);
@@ -318,13 +319,15 @@ pub struct Grooves {
     pub spacing_mm: f64,
     /// Radius of the wheel across the tracks, in mm.
     pub wheel_radius_mm: f64,
-    /// Curvature of the wheel across the track minus that of the part, over y, in 1/mm; 0 where nothing was ground.
+    /// Difference of two curvatures in the direction across the track: curvature of the wheel minus curvature of the
+    /// part, in 1/mm; 0 where nothing was ground.
     pub bend: HeightGrid,
 }
 
 impl Grooves {
-    /// Returns the curvature of a wheel across tracks along x minus that of the part at (x, y), over y, from the
-    /// minimum gap between both along the track.
+    /// Returns the curvature of a wheel across tracks along x, minus the curvature of the part at (x, y), in 1/mm. It
+    /// is the curvature of the gap between wheel and part over y, where the gap is minimal along the track. Returns 0
+    /// where the wheel leaves no groove.
     pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
         let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -361,13 +364,13 @@ pub enum Contact {
         /// Projection of the contact onto the plane (x, y), in mm.
         contact_mm: [f64; 2],
     },
-    /// The ball was in the material already where the search begins.
+    /// The ball is already in the material where the search begins.
     Unexpected,
-    /// The search ended without a touch, or the place is beyond the part's edge.
+    /// The search ended without a touch, or the contact is beyond the part's edge.
     Missed,
 }
 
-/// Way of a ball's centre, in the model frame.
+/// Straight path of a ball's centre, in the model frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Approach {
     /// Target point, in mm.
@@ -376,9 +379,9 @@ pub struct Approach {
     pub direction: Vec3,
     /// Radius of the ball, in mm.
     pub radius_mm: f64,
-    /// Distance of the centre from the target, along the direction, where the search begins, in mm.
+    /// Distance from the target, along the direction, at which the centre begins its search, in mm.
     pub from_mm: f64,
-    /// Distance of the centre from the target, along the direction, where the search ends, in mm.
+    /// Distance from the target, along the direction, at which the centre ends its search, in mm.
     pub to_mm: f64,
 }
 
@@ -432,7 +435,7 @@ impl Part {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.nearest(y))
     }
 
-    /// Returns the height and its gradient, in the groove of a track.
+    /// Returns the height and its gradient at (x, y), in the groove of track number `track`.
     fn height_and_gradient(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (h, slope) = self.height.at(x, y);
         let Some(grooves) = &self.grooves else { return (h, slope) };
@@ -447,7 +450,8 @@ impl Part {
         (point, unit_normal(tx, ty))
     }
 
-    /// Returns the point and its derivatives by x and y, in the groove of a track continued without end.
+    /// Returns the point of the surface and its derivatives by x and y, in the groove of track number `track`, as if
+    /// this groove had no border.
     fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
         let (h, [hx, hy]) = self.height_and_gradient(x, y, track);
@@ -465,9 +469,10 @@ impl Part {
         ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], tx, ty)
     }
 
-    /// Moves a ball along its way until it touches.
+    /// Moves a ball along its path until it touches.
     ///
-    /// A touch whose contact lies beyond the aperture is a miss: the part's side and rim are not modelled.
+    /// A touch whose contact lies beyond the aperture is a miss, because the side and the rim of the part are not
+    /// modelled.
     pub fn touch(&self, way: &Approach) -> Contact {
         let start = way.centre(way.from_mm);
         let Some(t) = self.near_contact(way) else { return Contact::Missed };
@@ -484,14 +489,16 @@ impl Part {
         }
     }
 
-    /// Returns the distance of a centre from the real surface minus the radius, to first order.
+    /// Returns the distance of a centre from the real surface at the bottom of the grooves, minus the radius, to first
+    /// order, in mm.
     fn gap(&self, c: Vec3, radius_mm: f64) -> f64 {
         let [p, q] = self.shape.gradient(c[0], c[1]);
         let vertical = c[2] - self.shape.height(c[0], c[1]);
         vertical / (1.0 + p * p + q * q).sqrt() - self.height.at(c[0], c[1]).0 - radius_mm
     }
 
-    /// Moves down the way in steps of the free distance until the ball is near contact.
+    /// Moves the ball along its path in steps of its distance from the surface, until it is near contact. Returns its
+    /// position on the path, in mm from the target; `None` if the ball does not come near contact.
     fn near_contact(&self, way: &Approach) -> Option<f64> {
         let mut t = way.from_mm;
         for _ in 0..100 {
@@ -507,7 +514,8 @@ impl Part {
         Some(t)
     }
 
-    /// Returns the contact from a start nearby; `None` if none is found.
+    /// Returns the contact (x, y) and the position on the path, by an iteration that begins at `t`; `None` if it finds
+    /// no contact.
     fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
         let centre = way.centre(t);
         let [p, q] = self.shape.gradient(centre[0], centre[1]);
@@ -613,7 +621,8 @@ fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Solves the three equations with the given columns by Cramer's rule.
+/// Solves three linear equations by Cramer's rule: the columns a, b, c of the matrix, and the right side. Returns
+/// `None` if the matrix is singular.
 fn solve([a, b, c]: [Vec3; 3], right: Vec3) -> Option<Vec3> {
     let determinant = dot(a, cross(b, c));
     let x = [dot(right, cross(b, c)), dot(a, cross(right, c)), dot(a, cross(b, right))].map(|d| d / determinant);

@@ -53,7 +53,7 @@ pub struct Plan {
     pub probe_radius_mm: f64,
     /// Distance of the ball's surface from the target where the search begins, in millimetres.
     pub approach_mm: f64,
-    /// Distance beyond the target where the search ends, in millimetres.
+    /// Distance beyond the target at which the search ends, in mm.
     pub search_mm: f64,
     /// Speed of the search in millimetres per second.
     pub speed_mm_s: f64,
@@ -72,7 +72,7 @@ pub struct Map {
     pub columns: u32,
     /// Nodes along y.
     pub rows: u32,
-    /// Place of the first node in the model frame, in millimetres.
+    /// Position of the first node in the model frame, in mm.
     pub first_mm: [f64; 2],
     /// Spacing of the nodes along x and y, in mm.
     pub spacing_mm: [f64; 2],
@@ -110,7 +110,7 @@ pub enum Status {
     Touched = 1,
     /// The search ended without a touch.
     NotFound = 2,
-    /// The probe did not reach the place where the search begins.
+    /// The probe did not reach the position at which the search begins.
     NotReached = 3,
 }
 
@@ -142,9 +142,9 @@ pub struct PassRecord {
     pub volume_mm3: f64,
     /// Largest depth taken off in millimetres.
     pub depth_mm: f64,
-    /// Share of the path that cut nothing.
+    /// Fraction of the path on which the wheel cut air, from 0 to 1.
     pub air_share: f64,
-    /// Spindle load, as a share of 1.
+    /// Spindle load; 1 is full load.
     pub spindle_load: f64,
     /// Radius of the wheel that the machine assumes, in mm.
     pub wheel_radius_mm: f64,
@@ -207,7 +207,7 @@ impl Reader<'_> {
     }
 }
 
-/// Refuses bytes whose length is not exactly that of the header and the records.
+/// Returns an error unless the length of the bytes is exactly `header` + `records` times `size`.
 fn exact(bytes: &[u8], header: u64, records: u64, size: u64) -> Result<(), Refusal> {
     let expected = header + records * size;
     if bytes.len() as u64 == expected {
@@ -312,7 +312,7 @@ impl Map {
             return Err(outside("number of nodes", nodes as f64, &format!("up to {MAX_NODES}")));
         }
         if columns < 2 || rows < 2 {
-            return Err(broken(format!("a net of {columns} by {rows} nodes spans no area")));
+            return Err(broken(format!("a grid of {columns} by {rows} nodes spans no area")));
         }
         exact(bytes, 96, nodes, 8)?;
         let first_mm = reader.vector("place of the first node")?;

@@ -66,7 +66,8 @@ fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
     v.map(|c| c / norm)
 }
 
-/// Returns the centre of a ball that touches the ground surface at its point on the nominal normal of (x, y).
+/// Returns the centre of a ball that touches the ground surface at its point S + e n over (x, y). S is the nominal
+/// point, n the nominal unit normal and e the form error.
 ///
 /// The ground surface is S + e n. The ball touches along the normal of that surface, not along the nominal one. With
 /// the nominal normal n and the surface gradient of e the offset is exact, so the second-order term of the paper's eq.
@@ -97,8 +98,8 @@ pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     }
 }
 
-/// Moves a share of the points by `least_mm` to `most_mm` in random directions; returns their indices, in ascending
-/// order.
+/// Moves the fraction `share` of the points by `least_mm` to `most_mm` in random directions. Returns the indices of the
+/// moved points, in ascending order.
 pub fn add_outliers(rng: &mut Rng, points: &mut [Vec3], share: f64, least_mm: f64, most_mm: f64) -> Vec<usize> {
     let mut moved = Vec::new();
     for (index, point) in points.iter_mut().enumerate() {

@@ -96,7 +96,7 @@ pub(crate) fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> 
     if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
 }
 
-/// Stroke over the whole part.
+/// Stroke of the wheel over the whole part.
 #[derive(Clone, Copy, Debug)]
 struct Stroke {
     begin_s: f64,
@@ -112,7 +112,7 @@ struct Run {
     map_identity: [u8; 32],
     map_largest_mm: f64,
     pass: Pass,
-    /// Positions along one stroke, each with the node ground there, in order.
+    /// Positions along one stroke, in mm, each with the index of the node that is ground there, in order.
     order: Vec<(f64, u32)>,
     /// Error that does not change along the path, for every node, in mm.
     fixed_mm: Vec<f64>,
@@ -207,8 +207,8 @@ impl Run {
     }
 }
 
-/// Moves the wheel over a node where a stiff machine would leave `cmd_mm`, and returns true if it cut. `bend` is the
-/// curvature of the groove that it leaves, if any.
+/// Moves the wheel over a node where a stiff machine would leave the height `cmd_mm`. Returns true if the wheel removed
+/// material. `bend` is the curvature of the groove that the wheel leaves, if it leaves grooves.
 pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
     let h = &mut state.part.height.heights_mm[node];
     if state.spec.faults.no_part || *h <= cmd_mm {
@@ -234,7 +234,8 @@ fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     }
 }
 
-/// Returns the nodes on the path of the wheel with their positions along it, and the length of the path in mm.
+/// Returns the indices of the nodes on the path of the wheel, each with its position along the path in mm, and the
+/// length of the path in mm.
 fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
     let [x0, x1, y0, y1] = grown(pass.extent_mm);
     let (length, spacing) = (x1 - x0, pass.track_spacing_mm);
@@ -255,7 +256,7 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
     [x0 - OVERTRAVEL_MM, x1 + OVERTRAVEL_MM, y0 - OVERTRAVEL_MM, y1 + OVERTRAVEL_MM]
 }
 
-/// Returns the height that the machine steers to at every node, without wear and growth, in mm.
+/// Returns, for every node, the height in mm that the machine aims at, without wear and growth.
 fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
@@ -298,7 +299,7 @@ fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
-/// Returns the value that this machine, with its faults, uses for the map at (x, y).
+/// Returns the displacement in mm that this machine, with its faults, uses at (x, y) of the map.
 fn displaced(state: &WorldState, map: &Map, x: f64, y: f64) -> f64 {
     let faults = &state.spec.faults;
     let (x, y) = match faults.map_mirrored {
@@ -325,7 +326,7 @@ pub struct Programs {
 }
 
 impl Programs {
-    /// Finds and reads the program that names a map.
+    /// Finds and reads the program whose comment names the map with this identity.
     fn read_for_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
         let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
         let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
@@ -436,7 +437,7 @@ fn run(
     let proud_mm = order.iter().map(within).fold(0.0, f64::max);
     let needed = (proud_mm / pass.depth_of_cut_mm).ceil().max(1.0);
     if needed + f64::from(pass.spark_out) > f64::from(MAX_STROKES) {
-        let limit = format!("up to {MAX_STROKES}; the part stands {proud_mm:.4} mm proud");
+        let limit = format!("up to {MAX_STROKES}; the part is {proud_mm:.4} mm above the commanded height");
         return Err(outside("number of strokes", needed + f64::from(pass.spark_out), &limit));
     }
     let (strokes, total_s) = strokes(needed as u32 - 1, &pass, stroke_mm);
@@ -494,7 +495,7 @@ impl Physics for Grinder {
                 Self::check_part_identity(&state, &pass.nominal, None)
             }
             other => {
-                Err(Refusal { answer: BROKEN, reason: format!("a grinder has no use for a payload of kind {other}") })
+                Err(Refusal { answer: BROKEN, reason: format!("a grinder does not accept payloads of kind {other}") })
             }
         }
     }

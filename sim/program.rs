@@ -42,7 +42,8 @@ pub struct CircularArc {
 }
 
 impl CircularArc {
-    /// Computes the arc from one place to another.
+    /// Computes the arc from one position to another. `takes_mm` is the maximum difference of the radii at both ends
+    /// that the control accepts, in mm.
     ///
     /// # Errors
     /// The radii at the beginning and at the end differ by more than a control accepts, or the arc has no length.
@@ -68,7 +69,7 @@ impl CircularArc {
         Ok(Self { axes, centre_mm, sweep_rad })
     }
 
-    /// Returns the place at a share of the arc that begins at `from`.
+    /// Returns the position on the arc from `from` to `to` after the fraction `share` of its angle, from 0 to 1.
     fn position_at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
         let [a, b, c] = self.axes;
         let (u, v) = (from[a] - self.centre_mm[0], from[b] - self.centre_mm[1]);
@@ -107,7 +108,8 @@ pub struct Waypoint {
 }
 
 impl Waypoint {
-    /// Returns the place at a share of the way from the previous stop.
+    /// Returns the position on the move after the fraction `share` of its length, from 0 to 1. The move begins at
+    /// `from_mm`.
     pub fn position_at(&self, from_mm: [f64; 3], share: f64) -> [f64; 3] {
         match &self.arc {
             Some(turn) => turn.position_at(from_mm, self.at_mm, share),
@@ -115,7 +117,7 @@ impl Waypoint {
         }
     }
 
-    /// Returns the length of that way, in mm.
+    /// Returns the length of the move that begins at `from_mm`, in mm.
     pub fn length_mm(&self, from_mm: [f64; 3]) -> f64 {
         let along = |k: usize| self.at_mm[k] - from_mm[k];
         match &self.arc {
@@ -124,7 +126,8 @@ impl Waypoint {
         }
     }
 
-    /// Returns the ends of straight moves whose distance from the way is at most `within_mm`.
+    /// Returns the end points of straight moves that replace this move. Their distance from the move is at most
+    /// `within_mm`.
     pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
         let count = self.arc.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
         let inner = (1..count).map(|k| self.position_at(from_mm, k as f64 / count as f64));
@@ -166,7 +169,8 @@ impl Program {
         why.map_or(Ok(self), Err)
     }
 
-    /// Returns the position of the wheel's centre at a share of the way from a stop to the next.
+    /// Returns the position of the wheel's centre on the move from `from` to `to`, after the fraction `share` of the
+    /// move, from 0 to 1.
     pub fn centre_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> [f64; 3] {
         match &self.head {
             Some(head) => head.centre_on_move_mm(from, to, share),
@@ -174,7 +178,8 @@ impl Program {
         }
     }
 
-    /// Returns the length of that way, in mm; if a head turns, the distance of its ends.
+    /// Returns the length of the path of the wheel's centre on a move, in mm. If a head turns, returns the distance
+    /// between its end points.
     pub fn length_mm(&self, from: &Waypoint, to: &Waypoint) -> f64 {
         match self.axis {
             Some(_) => {
@@ -230,14 +235,16 @@ struct Reader {
     feed: Option<f64>,
     by_time: bool,
     keeps_centre: bool,
-    /// For Sinumerik: whether the work offset is set, and whether axes turn in proportion between points.
+    /// For Sinumerik: `no_offset` is true if the work offset is not set; `in_proportion` is true if axes turn in
+    /// proportion between points.
     no_offset: bool,
     in_proportion: bool,
     metric: bool,
     absolute: bool,
     by_minute: bool,
     exact: bool,
-    /// Line count of Klartext, name of the program, and whether cycle 32 waits for its tolerance.
+    /// For Klartext: number of lines, name of the program, and whether the block of cycle 32 still requires its
+    /// tolerance.
     lines: u64,
     name: Option<String>,
     cycle: bool,
@@ -297,7 +304,7 @@ impl Reader {
             return Err("something comes after the end".into());
         }
         if self.control == Control::Fanuc && self.percents != 1 {
-            return Err("it stands outside of the percent signs".into());
+            return Err("it is outside of the percent signs".into());
         }
         let mut to: BTreeMap<char, f64> = BTreeMap::new();
         let (mut smooth, mut level, mut length, kept) = (None, None, false, self.keeps_centre);
@@ -332,18 +339,18 @@ impl Reader {
                         smooth = Some(told);
                     }
                 }
-                _ => return Err(format!("{whole} is no word of this control")),
+                _ => return Err(format!("{whole} is not a word of this control")),
             }
         }
         let begins = self.keeps_centre && !kept;
         if self.control == Control::Fanuc && begins != length {
-            return Err("tool centre point control and the length of the tool go together".into());
+            return Err("tool centre point control and the length of the tool must be in one block".into());
         }
         self.exactness(smooth, level)?;
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
 
-    /// Handles a G word, in tenths; returns it if it sets the path mode.
+    /// Handles a G word, given in tenths. Returns the word if it sets the path mode, otherwise `None`.
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
             (_, 0 | 10 | 20 | 30) => self.motion = Some((tenths / 10) as u8),
@@ -367,7 +374,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// Handles a word of the path mode by itself: nothing is kept by a mode that rounds corners without a limit.
+    /// Handles the word of a path mode. A mode that rounds corners without a limit does not count as exact.
     fn exactness(&mut self, smooth: Option<i64>, level: Option<f64>) -> Result<(), String> {
         let tolerance = self.program.tolerance_mm.is_some_and(|mm| mm > 0.0);
         self.exact = match (self.control, smooth) {
@@ -382,19 +389,19 @@ impl Reader {
 
     fn go(&mut self, to: &BTreeMap<char, f64>) -> Result<(), String> {
         let told = [
-            (self.metric, "it does not say that it is in mm"),
-            (self.absolute, "it does not say that its places are absolute"),
-            (self.by_minute || self.by_time, "it does not say that its feeds are in mm/min"),
-            (!self.no_offset, "its work offset was taken back"),
-            (self.exact, "it moves before it says how exactly, or in a mode that rounds corners off as it likes"),
+            (self.metric, "it moves before it selects the unit mm"),
+            (self.absolute, "it moves before it selects absolute positions"),
+            (self.by_minute || self.by_time, "it moves before it selects feeds in mm/min"),
+            (!self.no_offset, "its work offset is cancelled and not set again"),
+            (self.exact, "it moves before it sets the path mode, or in a mode that rounds corners without a limit"),
         ];
         if let Some((_, why)) = told.iter().find(|(is_so, _)| !is_so) {
             return Err((*why).to_owned());
         }
         let feed = match self.motion {
             Some(0) => None,
-            Some(_) => Some(self.feed.ok_or("it moves at a feed that nobody told")?),
-            None => return Err("it moves nobody knows how".into()),
+            Some(_) => Some(self.feed.ok_or("it moves without a programmed feed")?),
+            None => return Err("it moves before it sets the motion mode".into()),
         };
         let before = self.at_mm.unwrap_or([f64::NAN; 3]);
         let mut at_mm = before;
@@ -412,11 +419,11 @@ impl Reader {
             self.feed = None;
         }
         if feed_mm_min.is_some() && at_mm.iter().any(|v| v.is_nan()) {
-            return Err("it feeds from a place that it did not tell".into());
+            return Err("it moves at a feed from a position that it has not programmed".into());
         }
         let turn = match self.motion {
             Some(motion @ (2 | 3)) => Some(self.read_arc([before, at_mm], to, motion == 2)?),
-            _ if to.keys().any(|letter| "IJK".contains(*letter)) => return Err("a centre stands with no arc".into()),
+            _ if to.keys().any(|letter| "IJK".contains(*letter)) => return Err("it has a centre without an arc".into()),
             _ => None,
         };
         self.at_mm = Some(at_mm);
@@ -434,10 +441,10 @@ impl Reader {
             self.program.keeps_centre = self.keeps_centre;
         }
         if self.program.keeps_centre != self.keeps_centre {
-            return Err("it turns with and without the wheel's centre kept".into());
+            return Err("it turns the axis both with and without tool centre point control".into());
         }
         if self.control == Control::Sinumerik && self.keeps_centre && !self.in_proportion {
-            return Err("it does not say how it turns between points".into());
+            return Err("it turns the axis before it sets the interpolation of the angle (ORIAXES)".into());
         }
         self.rotary_deg = Some(to_deg);
         Ok(())
@@ -450,15 +457,15 @@ impl Reader {
         told: &BTreeMap<char, f64>,
         clockwise: bool,
     ) -> Result<CircularArc, String> {
-        let axes = self.plane.ok_or("the plane of its arc was not told")?;
+        let axes = self.plane.ok_or("the plane of its arc is not selected")?;
         let [a, b, c] = axes;
         let letter = |of: &str, k: usize| of.chars().nth(k).unwrap_or('?');
         if ![a, b].iter().all(|k| told.contains_key(&letter("XYZ", *k))) {
-            return Err("it does not tell where in the plane its arc ends".into());
+            return Err("the end of its arc is not programmed along both axes of the plane".into());
         }
         // Maximum difference of the radii of an arc, as the maker's default.
         let (of, from_start, takes_mm) = match self.control {
-            Control::Linuxcnc => (told, self.from_start.ok_or("it does not say where centres are told from")?, 0.005),
+            Control::Linuxcnc => (told, self.from_start.ok_or("it sets no G90.1 or G91.1 before its arc")?, 0.005),
             Control::Fanuc => (told, true, 0.005),
             Control::Sinumerik => (told, true, 0.01),
             Control::Heidenhain => (&self.centre, false, 0.016),
@@ -472,7 +479,7 @@ impl Reader {
         }
         let mut centre_mm = [0.0; 2];
         for (k, axis) in [a, b].into_iter().enumerate() {
-            let told = of.get(&letter(letters, axis)).ok_or("the centre of its arc is not told")?;
+            let told = of.get(&letter(letters, axis)).ok_or("the centre of its arc is not programmed")?;
             centre_mm[k] = if from_start { ends[0][axis] + told } else { *told };
         }
         CircularArc::new(axes, ends, centre_mm, clockwise, takes_mm)
@@ -495,7 +502,7 @@ impl Reader {
         }
         if rest.starts_with("END PGM") {
             self.ended = true;
-            return if program("END PGM ") == self.name { Ok(()) } else { Err("it ends another program".into()) };
+            return if program("END PGM ") == self.name { Ok(()) } else { Err("END PGM names another program".into()) };
         }
         match rest {
             _ if self.ended && !rest.is_empty() => Err("something comes after the end".into()),
@@ -523,7 +530,7 @@ impl Reader {
                 Some(("L", rest)) => self.straight(rest, Some(1)),
                 Some(("CC", rest)) => self.read_centre(rest),
                 Some(("C", rest)) => self.straight(rest, None),
-                _ => Err("it is no line of a pass".into()),
+                _ => Err("this line is not allowed in the program of a pass".into()),
             },
         }
     }
@@ -534,9 +541,9 @@ impl Reader {
         for word in rest.split_whitespace() {
             let (axis, value) = word.split_at(1);
             if !(matches!(axis, "X" | "Y" | "Z") && value.starts_with(['+', '-'])) {
-                return Err(format!("{word} is no word of a CC"));
+                return Err(format!("{word} is not allowed in a CC"));
             }
-            let value = value.parse().map_err(|_| format!("{word} is no place"))?;
+            let value = value.parse().map_err(|_| format!("{word} is not a position"))?;
             self.centre.insert(axis.chars().next().unwrap_or('X'), value);
         }
         let named: String = self.centre.keys().collect();
@@ -544,7 +551,7 @@ impl Reader {
             "XY" => [0, 1, 2],
             "XZ" => [2, 0, 1],
             "YZ" => [1, 2, 0],
-            _ => return Err("a centre is told by two axes".into()),
+            _ => return Err("a CC must have two axes".into()),
         });
         Ok(())
     }
@@ -558,15 +565,15 @@ impl Reader {
                 (_, "FMAX") if motion.is_some() => self.motion = Some(0),
                 (_, "DR-" | "DR+") if motion.is_none() => self.motion = Some(if word == "DR-" { 2 } else { 3 }),
                 (_, "R0") => {}
-                (("F", feed), _) => self.feed = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
+                (("F", feed), _) => self.feed = Some(feed.parse().map_err(|_| format!("{word} is not a feed"))?),
                 ((axis @ ("X" | "Y" | "Z" | "A" | "B"), value), _) if value.starts_with(['+', '-']) => {
-                    let value = value.parse().map_err(|_| format!("{word} is no place"))?;
+                    let value = value.parse().map_err(|_| format!("{word} is not a position"))?;
                     to.insert(axis.chars().next().unwrap_or('X'), value);
                 }
-                _ => return Err(format!("{word} is no word of an L")),
+                _ => return Err(format!("{word} is not allowed in an L")),
             }
         }
-        if to.is_empty() { Err("it goes nowhere".into()) } else { self.go(&to) }
+        if to.is_empty() { Err("the move has no target".into()) } else { self.go(&to) }
     }
 }
 

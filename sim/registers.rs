@@ -53,7 +53,7 @@ pub struct SimulatedMachine {
     status: Vec<u16>,
     torn: bool,
     frozen: bool,
-    /// True if a command came while the application was frozen.
+    /// True if a command block was written while the application was frozen.
     unseen: bool,
 }
 
@@ -350,7 +350,8 @@ impl SimulatedMachine {
         self.handshake.speed = speed.max(0.0);
     }
 
-    /// Freezes or continues the application; the wire continues to answer with the registers as they are.
+    /// Freezes the application, or continues it with `frozen` = false. While it is frozen, the wire still answers, with
+    /// registers that do not change.
     pub fn freeze(&mut self, frozen: bool) {
         self.frozen = frozen;
         self.publish();
@@ -396,13 +397,14 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Makes an idle machine move without a command until it is held; `false` returns it to its state before.
+    /// Makes an idle machine move without a command until it is held. With `strays` = false, returns the machine to the
+    /// state before that motion.
     pub fn stray(&mut self, strays: bool) {
         self.handshake.stray(strays);
         self.publish();
     }
 
-    /// Makes the next payload in force change after it has been checked, without the client.
+    /// Changes the identities in force after the next payload has come into force and a client has read the slots.
     pub fn spoil(&mut self) {
         self.handshake.spoil();
     }
@@ -413,7 +415,7 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Makes the two snapshot numbers of the next status that is read disagree.
+    /// Makes the two snapshot numbers differ at the next read of the status, as if the read were torn.
     pub fn tear_status(&mut self) {
         self.torn = true;
     }

@@ -149,7 +149,7 @@ impl BeatMonitor {
     }
 }
 
-/// Newest events; the older half is dropped when the log is full.
+/// Log of the newest events. When it is full, the older half is dropped.
 #[derive(Default)]
 pub(crate) struct EventLog {
     entries: Vec<LogEntry>,

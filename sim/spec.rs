@@ -1,4 +1,4 @@
-//! The table of a simulated world: what is wrong with everything in it, with what each number may be.
+//! Specification of a simulated world: all errors of its machines and its part, with the allowed range of each number.
 
 use std::fmt;
 
@@ -7,14 +7,15 @@ use serde::{Deserialize, Serialize};
 use crate::Vec3;
 use crate::part::{Aperture, PartSpec};
 
-/// Temperature at which lengths are those of drawings, in °C.
+/// Reference temperature, at which lengths equal those of the drawing, in °C.
 pub(crate) const REFERENCE_C: f64 = 20.0;
 
 /// Errors of the grinder.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GrinderSpec {
-    /// True radius of the wheel less the radius stated in the first pass; the true one stays.
+    /// True radius of the wheel minus the radius stated in the first pass. Later statements do not change the true
+    /// radius.
     pub wheel_radius_error_um: f64,
     /// Offset of the wheel in x and y.
     pub setting_error_um: [f64; 2],
@@ -26,13 +27,13 @@ pub struct GrinderSpec {
     pub straightness_x_um: [f64; 2],
     /// Straightness along y: amplitudes of the same polynomials.
     pub straightness_y_um: [f64; 2],
-    /// Amplitude of the screw's error along x.
+    /// Amplitude of the periodic error of the screw along x.
     pub periodic_um: f64,
-    /// Its pitch.
+    /// Pitch of the screw.
     pub periodic_pitch_mm: f64,
     /// RMS of a fixed random waviness.
     pub waviness_um: f64,
-    /// Its correlation length.
+    /// Correlation length of the waviness.
     pub waviness_correlation_mm: f64,
     /// Lag along the path at 1000 mm/min, proportional to the feed.
     pub following_um: f64,
@@ -40,13 +41,13 @@ pub struct GrinderSpec {
     pub wear_um: f64,
     /// Fast wear of the freshly dressed wheel.
     pub break_in_um: f64,
-    /// Share of a finishing stroke after which all but 1/e of the fast wear is over.
+    /// Number of finishing strokes after which 1/e of the fast wear is still to come; 0 for no fast wear.
     pub break_in_share: f64,
     /// The wheel is dressed before every pass; otherwise its fast wear is over after the first.
     pub dressed_each_pass: bool,
-    /// Growth of the spindle when it is warm through.
+    /// Growth of the spindle at its steady temperature.
     pub thermal_um: f64,
-    /// Its time constant.
+    /// Time constant of the growth of the spindle.
     pub thermal_tau_s: f64,
     /// Share of the excess height that remains after a pass, mu.
     pub error_copying: f64,
@@ -55,7 +56,7 @@ pub struct GrinderSpec {
     pub scallops: bool,
     /// RMS of the random part drawn for every pass.
     pub repeatability_um: f64,
-    /// Its correlation length.
+    /// Correlation length of the random part.
     pub repeatability_correlation_mm: f64,
     /// Travel of the wheel from the middle of the machine in x and y.
     pub travel_mm: [f64; 2],
@@ -140,7 +141,7 @@ pub struct CmmSpec {
     pub outlier_um: f64,
     /// Share of the touches that are missed.
     pub not_found_share: f64,
-    /// True radius of the ball less the one that the plan states.
+    /// True radius of the ball minus the radius that the plan states.
     pub probe_radius_error_um: f64,
     /// Temperature of the part while it is measured.
     pub part_temperature_c: f64,
@@ -148,13 +149,13 @@ pub struct CmmSpec {
     pub cte_per_k: f64,
     /// Radius of the reference sphere on the table.
     pub sphere_radius_mm: f64,
-    /// Its centre in the machine's frame.
+    /// Centre of the reference sphere in the machine's frame.
     pub sphere_centre_mm: Vec3,
     /// Minimum coordinates of the ball's centre.
     pub travel_least_mm: Vec3,
     /// Maximum coordinates of the ball's centre.
     pub travel_most_mm: Vec3,
-    /// Time for a point.
+    /// Time for the touch of one point.
     pub seconds_per_point: f64,
     /// Speed of the travel from one point to the next.
     pub travel_mm_s: f64,
@@ -204,7 +205,7 @@ impl CmmSpec {
     }
 }
 
-/// Complete truth of the simulation in one table.
+/// Complete specification of a simulated world.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldSpec {
@@ -235,7 +236,7 @@ impl Default for WorldSpec {
     }
 }
 
-/// Reflection or rotation of a map by the grinder.
+/// Reflection or rotation that the grinder applies to a map by mistake.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mirrored {
@@ -259,17 +260,17 @@ pub enum Misreported {
     /// Nothing.
     #[default]
     Nothing,
-    /// The number of the previous job.
+    /// The record has the number of the previous job.
     Job,
-    /// Failure, although the status says that the pass is complete.
+    /// The record states a failure, although the status says that the pass is complete.
     Result,
-    /// Three millimetres as the largest depth.
+    /// The record states 3 mm as the largest depth.
     Depth,
-    /// A path of -1 mm.
+    /// The record states a path of -1 mm.
     Path,
-    /// A wheel that is smaller by an eighth.
+    /// The record states a wheel radius that is smaller by an eighth.
     Wheel,
-    /// No time at all.
+    /// The duration is 0.
     Duration,
 }
 
@@ -281,7 +282,7 @@ pub struct WorldFaults {
     pub map_sign_flipped: bool,
     /// The grinder reflects or rotates the map.
     pub map_mirrored: Mirrored,
-    /// The grinder displaces by the map twice over.
+    /// The grinder displaces by twice the map.
     pub map_doubled: bool,
     /// The grinder grinds as if the map were zero.
     pub map_ignored: bool,
@@ -293,7 +294,7 @@ pub struct WorldFaults {
     pub contact_points_declared: bool,
     /// The CMM reports inches, and the header says millimetres.
     pub inches: bool,
-    /// An axis of the CMM counts the other way: what it reports is mirrored in y.
+    /// An axis of the CMM has the wrong sign: the reported points are mirrored in y.
     pub cmm_mirrored: bool,
     /// The part lies on the CMM turned by half a turn about z.
     pub part_turned_180: bool,
@@ -307,7 +308,7 @@ pub struct WorldFaults {
     pub missing_records: u32,
 }
 
-/// Error of a table of a simulated world.
+/// Value in a specification that is outside its range.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SpecError {
     /// Key, as a path in the table.
@@ -335,7 +336,7 @@ impl WorldSpec {
     /// Checks every number.
     ///
     /// # Errors
-    /// The first one that is outside what the simulation holds for.
+    /// Returns the first number that is outside the range for which the simulation is valid.
     pub fn check(&self) -> Result<(), SpecError> {
         check_all("speed", &[self.speed], 1e-3, 1e6, "0.001 to 1e6")?;
         let [half_x, half_y] = self.part.aperture.half_mm();
@@ -404,7 +405,8 @@ impl WorldSpec {
         check_all("cmm.travel_mm_s", &[c.travel_mm_s], 0.1, 1e6, "0.1 to 1000000 mm/s")
     }
 
-    /// The surface must have a height everywhere on the part; domains of these shapes are convex, so the rim tells.
+    /// Checks that the surface has a height everywhere on the part. The domains of these shapes are convex, so it is
+    /// sufficient to check the rim.
     fn check_shape(&self) -> Result<(), SpecError> {
         let (shape, [half_x, half_y]) = (self.part.shape.build(), self.part.aperture.half_mm());
         for k in 0..360 {

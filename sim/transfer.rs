@@ -19,7 +19,7 @@ pub enum InboxState {
     InForce = 2,
     /// All pages have arrived, and do not match the header.
     CrcWrong = 3,
-    /// The machine cannot use it.
+    /// The machine cannot use the payload.
     Refused = 4,
 }
 
@@ -46,7 +46,7 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// Accepts a header; returns false if its content is not acceptable.
+    /// Accepts a header. Returns false if its kind or its length is not acceptable.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
         let (kind, announced_bytes) = (words[0], order.to_u32([words[2], words[3]]));
         if slot_of(of, kind).is_none() || announced_bytes == 0 || announced_bytes > limit_bytes {
@@ -65,7 +65,8 @@ impl Inbox {
         true
     }
 
-    /// Accepts a page; returns `None` if it is out of turn or its length is wrong, `Some(Some(_))` if it was the last.
+    /// Accepts a page. Returns `None` if the page is out of order or its length is wrong, and `Some(Some(_))` with the
+    /// payload if all bytes have arrived and their CRC is right. Otherwise returns `Some(None)`.
     pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
         if self.has_page(order, words) {
             return Some(None);
@@ -177,7 +178,8 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
-    /// Packs the present result of a running job: without a CRC, without a `done` number, and only in full pages.
+    /// Packs the present result of a running job as an outbox without a CRC and without a `done` number. The outbox
+    /// contains only full pages.
     pub(crate) fn partial(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);
@@ -186,7 +188,7 @@ impl Outbox {
         Some(outbox)
     }
 
-    /// Packs a result; `None` if one of its figures is not a number that may be sent.
+    /// Packs a result as an outbox. Returns `None` if one of its figures is not finite.
     pub(crate) fn new(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
         if !figures.iter().all(|figure| figure.is_finite()) {

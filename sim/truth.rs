@@ -38,10 +38,10 @@ pub struct GrindEntry {
 /// taken away.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ExecutedPass {
-    /// Number of strokes over the whole part: 1, plus 1 for every spark-out, if nothing was left out and nothing was
-    /// done twice.
+    /// Number of visits of the wheel to nodes, divided by the number of nodes: 1, plus 1 for every spark-out, if no
+    /// node was omitted and none was visited again.
     pub strokes: f64,
-    /// Part of `strokes` that was in the air.
+    /// Part of `strokes` in which the wheel cut air, in strokes.
     pub strokes_in_air: f64,
     /// Number of tracks.
     pub tracks: u32,
@@ -51,7 +51,7 @@ pub struct ExecutedPass {
     pub seconds: f64,
 }
 
-/// Purpose of a stream of random numbers.
+/// Source of error that has its own stream of random numbers.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Source {
     Blank = 1,
@@ -63,7 +63,7 @@ pub(crate) enum Source {
     NotFound = 7,
 }
 
-/// Returns the stream of a source for its n-th use.
+/// Returns the stream of random numbers of a source, for its use number `number`.
 pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
     let mut rng = crate::rng(seed);
     rng.set_stream((source as u64) << 32 | u64::from(number));
@@ -84,7 +84,7 @@ pub(crate) struct WorldState {
     pub part_identity: Option<[u8; 32]>,
     pub true_wheel_radius_mm: Option<f64>,
     pub passes_begun: u32,
-    /// Number of passes over the blank after which it was last damaged.
+    /// Number of passes over the blank at the time when damage was last applied.
     pub damaged_after: Option<u32>,
     /// Number of passes over the blank in the grinder.
     pub passes_of_blank: u32,
@@ -100,7 +100,7 @@ pub(crate) struct WorldState {
     pub worn_strokes: f64,
     /// Machine whose job has the part.
     pub holder: Option<Kind>,
-    /// Machine whose wheel or probe is at the part.
+    /// Machine whose wheel or probe is not clear of the part.
     pub engaged: Option<Kind>,
     pub history: Vec<GrindEntry>,
     /// Passes along executed paths, in order.
@@ -155,8 +155,8 @@ impl WorldState {
         self.job = Some(job);
     }
 
-    /// Returns the placement for a measurement: the last one if the part has not moved, otherwise that of a new
-    /// loading.
+    /// Returns the placement for a measurement. It is the last placement if the part has stayed on the CMM, otherwise a
+    /// new one with the random error of loading.
     pub fn load_on_table(&mut self) -> Placement {
         if !self.on_table {
             self.damage();
@@ -167,7 +167,7 @@ impl WorldState {
         self.placement
     }
 
-    /// Applies the damage that is due after this number of passes, once.
+    /// Applies the defects that appear after the present number of passes. Does nothing if they are applied already.
     fn damage(&mut self) {
         if self.damaged_after.replace(self.passes_of_blank) == Some(self.passes_of_blank) {
             return;
@@ -184,7 +184,7 @@ impl WorldState {
         self.holder.is_some_and(|other| other != kind)
     }
 
-    /// Gives the part to a machine, unless the other machine has it.
+    /// Gives the part to a machine. Returns false, and does nothing, if the other machine has the part.
     pub fn claim_part(&mut self, kind: Kind) -> bool {
         if self.is_held_by_other(kind) {
             return false;
@@ -214,7 +214,8 @@ impl WorldState {
     }
 }
 
-/// Returns the placement of the part on the measuring machine after the n-th loading; 0 is the placement in the table.
+/// Returns the placement of the part on the measuring machine at loading number `loading`. Loading 0 is the placement
+/// of the specification, without random error.
 fn placement(spec: &WorldSpec, loading: u32) -> Placement {
     let mut rng = stream(spec.seed, Source::Loading, loading);
     let mut about = |middle: Vec3, sigma: f64| -> Vec3 {

@@ -1,4 +1,5 @@
-//! Wheel that a controller without knowledge of part or pass moves from place to place, and the surface that it leaves.
+//! Wheel that a controller without knowledge of part or pass moves from position to position, and the surface that the
+//! wheel leaves.
 //!
 //! The wheel is a ball. With its centre at C, its height over the nominal surface is the distance of C from the surface
 //! minus its radius, at the projection of C. Between two tracks, a stiff machine would leave the heights of both
@@ -25,7 +26,8 @@ struct Track {
 }
 
 impl Track {
-    /// Returns the height at a place along the track; beyond its ends, that of the end.
+    /// Returns the height at `x`, interpolated along the track; beyond the ends of the track, the height at its end.
+    /// Returns `None` for a track without samples.
     fn height_at(&self, x: f64) -> Option<f64> {
         let near = |a: &&[f64; 2], b: &&[f64; 2]| (a[0] - x).abs().total_cmp(&(b[0] - x).abs());
         let below = self.places.iter().filter(|place| place[0] <= x).min_by(near);
@@ -53,7 +55,7 @@ impl PlainWheel {
         Self { world, radius_mm, first_track: None, previous_track: None, current_track: None }
     }
 
-    /// Clamps the part for a program; returns true if it is there.
+    /// Clamps the part for a program. Returns true if the part is in the grinder.
     pub fn claim_part(&mut self) -> bool {
         let mut state = locked(&self.world);
         (self.first_track, self.previous_track, self.current_track) = (None, None, None);
@@ -66,7 +68,7 @@ impl PlainWheel {
         locked(&self.world).release(Kind::Grinder);
     }
 
-    /// Moves the centre of the wheel to a place of the model frame.
+    /// Moves the centre of the wheel to a position in the model frame.
     pub fn move_to(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
@@ -113,7 +115,8 @@ impl PlainWheel {
     }
 }
 
-/// Grinds the material between these bounds to a height over the nominal surface.
+/// Lowers the material between the bounds `along` (x) and `across` (y) to the height that `wanted` returns for a node,
+/// over the nominal surface.
 fn grind(state: &mut WorldState, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
     let mu = state.spec.grinder.error_copying;
     let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);

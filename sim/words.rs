@@ -112,9 +112,9 @@ pub fn crc16(bytes: &[u8]) -> u16 {
     })
 }
 
-/// Converts a payload from one word order to the other, in place; bytes after the last whole record stay unchanged.
+/// Converts a payload from one word order to the other, in place. Bytes after the last complete record do not change.
 ///
-/// The kinds are those of docs/modbus.md; an unknown kind stays unchanged.
+/// `kind` and `format` are those of docs/modbus.md. A payload of an unknown kind does not change.
 pub fn turn_payload(kind: u16, format: u16, bytes: &mut [u8]) {
     let (header, record) = fields(kind, format);
     let length = header.iter().map(|field| field.unsigned_abs()).sum::<usize>().min(bytes.len());
@@ -139,7 +139,8 @@ fn turn_fields(bytes: &mut [u8], fields: &[isize]) {
     }
 }
 
-/// Returns the lengths in bytes of the values of a payload's header and of its records; a negative length is raw bytes.
+/// Returns the lengths in bytes of the values in the header and in each record of a payload. A negative length marks
+/// raw bytes, which have no word order.
 fn fields(kind: u16, format: u16) -> (&'static [isize], &'static [isize]) {
     match (kind, format) {
         (1, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, 4, -4, 8], &[4, 2, 2, 8, 8, 8, 8, 8, 8]),

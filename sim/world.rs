@@ -1,4 +1,4 @@
-//! Ground truth of a grinding cell: one table contains all errors, and one seed draws all random numbers.
+//! Ground truth of a grinding cell. One [`WorldSpec`] contains all errors, and one seed draws all random numbers.
 //!
 //! [`World`] gives out the two machines as [`Body`](crate::body::Physics). For tests only, it also returns the truth that
 //! no controller may ask for: the real placement of the part, the real deviation of its surface from the nominal, and
@@ -34,7 +34,7 @@ impl fmt::Debug for World {
 }
 
 impl World {
-    /// Creates the world of a table.
+    /// Creates the world that a specification describes.
     ///
     /// # Errors
     /// A number is outside the range for which the simulation is valid.
@@ -59,14 +59,15 @@ impl World {
         TouchProbe::new(self.state.clone())
     }
 
-    /// Returns a wheel of the grinder with this stated radius, which is moved from place to place on widely spaced
-    /// tracks; see [`crate::wheel`]. There is one grinder, so take this, [`World::wheel`] or [`World::grinder`].
+    /// Returns the wheel of the grinder, for a controller that moves it from position to position on widely spaced
+    /// tracks; see [`crate::wheel`]. `stated_mm` is the radius that the controller assumes. There is one grinder, so
+    /// take only one of this, [`World::wheel`] and [`World::grinder`].
     pub fn plain_wheel(&self, stated_mm: f64) -> PlainWheel {
         PlainWheel::new(self.state.clone(), stated_mm)
     }
 
-    /// Returns the wheel of a grinder with an external controller; it is moved along the path that the controller
-    /// executes. There is one grinder, so take either this or [`World::grinder`].
+    /// Returns the wheel of the grinder, for an external controller; it is moved along the path that the controller
+    /// executes. There is one grinder, so take only one of this, [`World::plain_wheel`] and [`World::grinder`].
     ///
     /// # Errors
     /// The radius is not possible for a wheel.
@@ -86,7 +87,7 @@ impl World {
         state.on_table = false;
     }
 
-    /// Returns the table.
+    /// Returns the specification of this world.
     pub fn spec(&self) -> WorldSpec {
         locked(&self.state).spec.clone()
     }
@@ -97,14 +98,14 @@ impl World {
         locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
-    /// Returns the true deviations at many places at one moment, in mm.
+    /// Returns the true deviations at many positions (x, y) at one moment, in mm.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
     }
 
-    /// Returns, for each place, the true height in mm of the centre of a ball above the offset of the nominal surface,
-    /// where the ball touches the real surface along the nominal normal. All values are of one moment.
+    /// Returns the true height in mm of the centre of a ball above the offset of the nominal surface, for each position
+    /// (x, y), where the ball touches the real surface along the nominal normal. All values are of one moment.
     ///
     /// In a groove, this differs from [`Self::deviation_mm`], because the ball touches beside its centre. Beyond the
     /// part the ball touches nothing.

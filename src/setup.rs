@@ -93,8 +93,8 @@ pub enum SetupError {
 const MANUAL_JOB_TIMEOUT: Duration = Duration::from_secs(7 * 86_400);
 /// Timeout for a person to hold or to stop a machine and to confirm it.
 const MANUAL_STOP_TIMEOUT: Duration = Duration::from_secs(600);
-/// Timeout of the stand-in for a machine without a wire, for example a folder on another computer. It includes the
-/// reading of a large file.
+/// Timeout of an answer of the driver of a machine without a wire, for example from a folder on another computer. It
+/// includes the time to read a large file.
 const MANUAL_ANSWER_TIMEOUT: Duration = Duration::from_secs(90);
 /// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
 const MAX_TARGET_BYTES: usize = 56;
@@ -102,11 +102,13 @@ const MAX_TARGET_BYTES: usize = 56;
 const TRANSFER_TIMEOUT_FACTOR: f64 = 3.0;
 /// Minimum time between two polls during a slow transfer.
 const MIN_MANUAL_POLL_INTERVAL: Duration = Duration::from_millis(250);
-/// Maximum share of the tolerances, of RMS and of PV, that scallops take if they determine the track distance. A larger
-/// share causes a warning. A fifth of an RMS adds 2 % in quadrature; a fifth of a PV adds a fifth.
+/// Maximum rms and height of the scallops, as a share of the RMS limit and of the PV limit, if the scallops determine
+/// the track distance. A larger share causes a warning. A fifth of an RMS adds 2 % in quadrature; a fifth of a PV adds
+/// a fifth.
 pub const MAX_SCALLOP_SHARE: f64 = 0.2;
 
-/// Builds the task, from which a run computes, and the plan, by which its cell decides.
+/// Builds the task of a run (data and options of its computations) and the plan of its cell (parameters of its
+/// decisions).
 ///
 /// # Errors
 /// Returns an error if the nominal surface or the pattern is not available, or if the recipe exceeds the limits of the
@@ -188,6 +190,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
 }
 
 /// Returns the machine parameters that are compensated, with the contact points under the nodes of a correction.
+/// Returns `None` if the recipe compensates no parameter.
 fn parameter_compensation(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -210,8 +213,9 @@ fn parameter_compensation(
     }))
 }
 
-/// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad. The rotation moves the
-/// edge of the part by the same amount. The recipe states the expanded uncertainty (k = 2).
+/// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad: the rotation displaces
+/// the edge of the part by the position uncertainty. Returns `None` if the recipe does not state the expanded
+/// uncertainty (k = 2) from which both are computed.
 fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
@@ -219,7 +223,7 @@ fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
-/// Returns the settings of a measurement with chosen touches.
+/// Returns the options of an adaptive measurement; `None` if the recipe has mode fixed.
 fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == SelectionMode::Adaptive)?;
     Some(AdaptiveOptions {
@@ -249,7 +253,8 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
     }
 }
 
-/// Returns the timeout for the transfer of `bytes` over the line of a machine, with a margin for retries.
+/// Returns the timeout for the transfer of `bytes` over the serial line of a machine, with a margin for retries.
+/// Returns zero for a machine without a serial line.
 fn transfer_timeout(link: &LinkConfig, bytes: usize) -> Duration {
     let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
@@ -281,8 +286,8 @@ fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     said
 }
 
-/// Returns the same text without the cell: the settings that runs of two cells must share so that one can start from
-/// the results of the other.
+/// Returns the text of [`learning_setting`] without the cell: the settings that runs of two cells must share so that
+/// one can start from the results of the other.
 fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
@@ -431,8 +436,8 @@ fn reference_sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Referen
     }
 }
 
-/// Checks that the probe does not search for the reference sphere inside the part. The part fills the box under its
-/// surface, in the pose of the fixture.
+/// Checks that the gap between the reference sphere and the part is large enough for the probe. The part counts as the
+/// box around its nominal points, extended downwards without limit, in the pose of the fixture.
 fn check_sphere(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -548,7 +553,8 @@ fn is_from_below(recipe: &Recipe) -> bool {
     recipe.measure.side.side() == Some(Side::Opposite)
 }
 
-/// Returns the track distance, from the recipe or from the allowed scallops, and the scallops between the tracks.
+/// Returns the track distance in mm, from the recipe or from the allowed scallops, and the scallops between the tracks.
+/// The scallops are `None` if no path over the part can be computed.
 fn track_distance(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -646,7 +652,8 @@ fn programs(
     }
 }
 
-/// Returns the same path options with the rotary axis of the cell's grinder and the tilt of the wheel from the recipe.
+/// Returns the path options `plain` with the rotary axis of the cell's grinder and the tilt of the wheel from the
+/// recipe.
 fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
     let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
     let rotary = cell.grinder.rotary.map(|head| {
@@ -773,7 +780,7 @@ pub fn create_drivers(
     Ok((cmm, grinder))
 }
 
-/// Returns the settings of a machine on Modbus; `None` for any other.
+/// Returns the settings of a machine with a Modbus wire; `None` for a machine with another wire.
 ///
 /// `simulated` states whether the cell's machines are simulated. A machine that reports the opposite is refused.
 pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
@@ -828,7 +835,8 @@ fn probe_travel_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.min_mm, travel.max_mm])
 }
 
-/// Returns the context for the driver of a machine, besides its wire, without a part.
+/// Returns the context for the driver of a machine, without its wire. The values that depend on the part or on the run
+/// are empty.
 fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
     DriverContext {
         part: "",

@@ -5,7 +5,8 @@ use crate::Vec3;
 /// Event of the machine.
 #[derive(Clone, Debug, PartialEq)]
 pub enum MachineEvent {
-    /// The machine began to move for this command. A touch continues from there along the normal, and returns.
+    /// The machine began to move for this command. For a touch, the motion continues from `to_mm` along the normal and
+    /// returns.
     MotionStarted {
         /// Name of the command.
         command: String,

@@ -35,7 +35,7 @@ pub enum Fault {
     CutInScan,
     /// A point of a scan is not sent.
     PointLost,
-    /// Each point of a scan is sent in the place of the one before it, and the last target gets none.
+    /// Each point of a scan is sent as the point of the target before it, and the last target gets none.
     PointsShifted,
 }
 

@@ -15,7 +15,7 @@ impl Tag {
     /// Tag of a message that no command requested.
     pub const UNSOLICITED: Self = Self { event: true, number: 0 };
 
-    /// Returns true if the tag is of a command that is carried out at once.
+    /// Returns true for the tag of an event command, which is carried out at once.
     pub fn is_event(self) -> bool {
         self.event
     }

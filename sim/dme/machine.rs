@@ -132,11 +132,11 @@ pub struct DmeMachine {
     reports_radius: bool,
     pub(super) contacts: u32,
     pub(super) touched_mm: Option<f64>,
-    /// Position of the probe's centre in the machine's frame, and the position to which it moves.
+    /// Position of the probe's centre in the machine's frame. `to_mm` is the position to which it moves.
     at_mm: Vec3,
     to_mm: Vec3,
     joystick: bool,
-    /// Command that is being carried out, and the events that it has caused.
+    /// Command that is being carried out. `events` are the events that it has caused.
     current_command: String,
     pub(super) events: Vec<MachineEvent>,
 }
@@ -218,17 +218,17 @@ impl DmeMachine {
         (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
     }
 
-    /// Ends the motion of the command at its target.
+    /// Ends the motion of the command at its target position.
     pub(super) fn arrive(&mut self) {
         self.stop_short(1.0);
     }
 
-    /// Moves the probe to a place while it is in contact.
+    /// Sets the position of the probe during a scan.
     pub(super) fn set_position(&mut self, at_mm: Vec3) {
         self.at_mm = at_mm;
     }
 
-    /// Ends the motion after this share of its way.
+    /// Ends the motion after the share `share` of its path, from 0 to 1.
     pub(super) fn stop_short(&mut self, share: f64) {
         self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
         self.to_mm = self.at_mm;
@@ -347,7 +347,8 @@ impl DmeMachine {
         if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
     }
 
-    /// Returns a place in the machine's frame; axes that are not named keep their value.
+    /// Returns a position in the machine's frame from the named axes; axes that are not named keep their value. Returns
+    /// `None` if an argument is not an axis with one number.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
         let mut at = self.frame().machine_to_part(self.at_mm);
         for axis in axes {
@@ -461,7 +462,7 @@ impl DmeMachine {
         told.collect::<Result<_, _>>().map(CommandResult::with_data)
     }
 
-    /// Sets parameters. A value beyond the machine's limits is limited, with a warning.
+    /// Sets parameters. A value beyond the machine's limits is replaced by the limit, with a warning.
     fn set(&mut self, properties: &[Argument], cause: &str) -> Result<CommandResult, u16> {
         let mut warnings = Vec::new();
         for property in properties {

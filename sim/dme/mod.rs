@@ -47,12 +47,12 @@ struct Running {
     began: Duration,
     ends: Duration,
     done: Result<CommandResult, DmeError>,
-    /// True if its client is gone: nobody gets its result.
+    /// True if the client has disconnected, so that the result is not sent.
     client_gone: bool,
 }
 
 impl Running {
-    /// Returns the time of its next output: a line of a scan, or its end.
+    /// Returns the time of the next output of this command: a line of a scan, or its end.
     fn next(&self, speed: f64) -> Duration {
         let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
         line.map_or(self.ends, |line| {
@@ -135,7 +135,7 @@ impl Server {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
-    /// Returns the time of the next action that needs no received line.
+    /// Returns the time of the next output that the server sends without a received line; `None` if there is none.
     pub fn due(&self) -> Option<Duration> {
         let running = self.running.as_ref().map(|running| running.next(self.speed));
         running.into_iter().chain(self.out.front().map(|out| out.at)).min()
@@ -213,7 +213,7 @@ impl Server {
         self.say(now, format!("{tag} %"));
     }
 
-    /// Aborts the running and the waiting commands; returns true if there were any.
+    /// Aborts the running and the waiting commands. Returns true if there were any.
     fn abandon(&mut self, now: Duration, error: &DmeError) -> bool {
         let running = self.running.take();
         if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {

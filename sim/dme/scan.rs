@@ -21,7 +21,7 @@ pub(super) struct Scanned {
 }
 
 impl DmeMachine {
-    /// Scans a curve as programmed; the scan ends where the probe loses the surface.
+    /// Scans a curve along its programmed points. The scan ends where the probe loses the surface.
     pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<CommandResult, u16> {
         let open = Argument::Name("Closed".into(), Some(vec![0.0]));
         let written =

@@ -67,12 +67,13 @@ impl PartProgram {
         }
     }
 
-    /// Returns the duration of a touch.
+    /// Returns the time that one touch takes.
     pub fn per_touch(&self) -> Duration {
         Duration::from_secs_f64(self.probe.seconds_per_point())
     }
 
-    /// Touches the next target; `None` if there is none left. After the last one, the probe moves clear of the part.
+    /// Touches the next target. Returns the output of this touch; `None` if no target is left. After the last target,
+    /// the probe moves clear of the part.
     pub fn touch_next(&mut self) -> Option<Outgoing> {
         let target = *self.list.as_ref()?.targets.get(self.next)?;
         self.next += 1;

@@ -26,9 +26,9 @@ use deed::{ControllerEvent, Observer};
 use faults::{Fault, LineFaults};
 use program::{LogAction, Program, Step, says};
 
-/// Duration of a set, whatever it does.
+/// Duration of every `set`.
 const SET_DURATION: Duration = Duration::from_millis(100);
-/// Maximum distance between two samples of the wheel along its way, in mm.
+/// Maximum distance between two samples of the wheel along its path, in mm.
 const STEP_MM: f64 = 0.5;
 /// Position of the wheel's centre when it is away from everything.
 const AWAY_MM: Vec3 = [0.0, 0.0, 100.0];
@@ -50,7 +50,7 @@ struct Client {
     verbose: bool,
     quiet: bool,
     lines: VecDeque<String>,
-    /// Time at which its next line is handled.
+    /// Time at which the next line of this client is handled.
     free_at: Duration,
     out: VecDeque<Outgoing>,
 }
@@ -77,9 +77,9 @@ pub struct Controller {
     interpreter: Interpreter,
     program: Option<Program>,
     steps: VecDeque<Step>,
-    /// Line that is carried out.
+    /// Number of the line that is carried out.
     line: u32,
-    /// Line at which a travel limit is reached.
+    /// Number of the line at which a travel limit is reached.
     limit_at: Option<u32>,
     at_mm: Vec3,
     errors: VecDeque<String>,
@@ -180,7 +180,8 @@ impl Controller {
         }
     }
 
-    /// Lets another client take control; it opens a program of its own if nothing runs, or aborts what runs.
+    /// Gives control to another client. That client aborts the running program if `aborts` is true. If no program then
+    /// runs, it opens `program`.
     pub fn steal(&mut self, program: Option<&str>, aborts: bool) {
         self.owner = Some(u64::MAX);
         if aborts {
@@ -218,7 +219,8 @@ impl Controller {
         self.clients.contains_key(&client)
     }
 
-    /// Returns the time of the next action for a client that needs no received line.
+    /// Returns the time of the next action for a client without a received line: a queued line to handle, or a line to
+    /// send. Returns `None` if there is none.
     pub fn due(&self, client: u64) -> Option<Duration> {
         let client = self.clients.get(&client)?;
         let next = client.lines.front().map(|_| client.free_at);
@@ -244,7 +246,7 @@ impl Controller {
         due
     }
 
-    /// Handles the lines of a client whose time has come.
+    /// Handles the queued lines of a client up to the time `now`.
     fn attend(&mut self, number: u64, now: Duration) {
         self.advance_time(now);
         loop {
@@ -295,7 +297,7 @@ impl Controller {
         }
     }
 
-    /// Carries out a line, and returns the answer; `None` if there is none.
+    /// Carries out a line and returns the answer; `None` if the line has no answer.
     fn obey(&mut self, number: u64, line: &str) -> Option<String> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default().to_ascii_lowercase();
@@ -354,7 +356,8 @@ impl Controller {
         })
     }
 
-    /// Carries out a set, and returns whether it is acknowledged; `None` if its client has no control.
+    /// Carries out a `set`. Returns true if it is acknowledged, false if it is refused, and `None` if the client has no
+    /// control.
     fn set(&mut self, number: u64, what: &str, rest: &str) -> Option<bool> {
         let client = self.clients.get_mut(&number)?;
         match (what, rest.to_ascii_lowercase().as_str()) {

@@ -17,11 +17,11 @@ const RADII_MM: f64 = 0.005;
 /// Queued step, carried out in its turn.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Step {
-    /// Straight move to a place.
+    /// Straight move to a position.
     Move { to_mm: Vec3, mm_s: f64, line: u32 },
     /// Arc that cannot be executed.
     Refused { reason: String, line: u32 },
-    /// Barrier: the lines after it are not read before the motion has come here.
+    /// Barrier: the lines after it are read only when the motion has reached it.
     Wait { line: u32 },
     /// End of the program.
     End { line: u32 },
@@ -44,9 +44,9 @@ pub(super) struct Program {
     pub(super) path: String,
     pub(super) text: String,
     lines: Vec<String>,
-    /// Line that is read next.
+    /// Index of the line that is read next.
     next: usize,
-    /// Line where a loop began, and the number of repetitions left.
+    /// Index of the line at which a loop began, and the number of repetitions left.
     repeats: Option<(usize, u32)>,
     at_mm: Vec3,
     /// Motion mode: 0 rapid, 1 at feed, 2 and 3 along an arc, clockwise and counter-clockwise.
@@ -85,7 +85,7 @@ impl Program {
         self.lines.len()
     }
 
-    /// Goes back to the beginning of the program, from a place.
+    /// Goes back to the beginning of the program. The motion starts at the position `at_mm`.
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
         (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
@@ -97,7 +97,8 @@ impl Program {
         self.waits = false;
     }
 
-    /// Reads ahead; returns the actions that are carried out at once.
+    /// Reads lines ahead of the motion and queues their steps in `steps`. Returns the actions that are carried out at
+    /// once.
     pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<LogAction> {
         let mut said = Vec::new();
         while !self.waits && steps.len() < MAX_QUEUED_STEPS && self.next < self.lines.len() {
@@ -168,7 +169,7 @@ impl Program {
         }
     }
 
-    /// Returns the way to a place: straight, or about a centre whose missing coordinates are 0.
+    /// Returns the move to a position: straight, or an arc about a centre whose missing coordinates are 0.
     fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Waypoint, String> {
         let turn = match self.motion {
             motion @ (2 | 3) => {
@@ -183,7 +184,7 @@ impl Program {
     }
 }
 
-/// Returns the action that a comment requests.
+/// Returns the action on the log file that a comment requests; `None` for any other comment.
 pub(super) fn says(text: &str) -> Option<LogAction> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));
@@ -196,7 +197,7 @@ pub(super) fn says(text: &str) -> Option<LogAction> {
     })
 }
 
-/// Returns the letters with their numbers, without comments.
+/// Returns the words of a block, each as a letter and its number, without comments.
 fn words(text: &str) -> Vec<(char, f64)> {
     let code = text.split([';', '(']).next().unwrap_or_default();
     let starts: Vec<usize> = code.char_indices().filter(|(_, c)| c.is_ascii_alphabetic()).map(|(at, _)| at).collect();

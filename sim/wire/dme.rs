@@ -23,7 +23,7 @@ pub struct SharedServer(Arc<Inner>);
 
 struct Inner {
     server: Mutex<Server>,
-    /// Signal that the server was changed from outside and can have output.
+    /// Signal that a caller has accessed the server, which can then have output.
     changed: Notify,
     began: Instant,
 }

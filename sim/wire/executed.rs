@@ -25,7 +25,8 @@ use crate::executed::Wheel;
 
 /// Duration of a servo cycle, in s.
 const CYCLE_S: f64 = 1e-3;
-/// Time within which a question is not repeated: no pass can be loaded, begun and ended within it.
+/// Time after a mark was sent within which [`ExecutedPath::caught_up`] does not send another: no pass can be loaded,
+/// begun and ended within it.
 const QUESTION_VALIDITY: Duration = Duration::from_millis(500);
 /// Time without a mark after which a program counts as gone.
 const LOST_AFTER: Duration = Duration::from_secs(30);
@@ -34,7 +35,7 @@ const LOST_AFTER: Duration = Duration::from_secs(30);
 const RESTART_DELAY: Duration = Duration::from_millis(200);
 const MAX_RESTART_DELAY: Duration = Duration::from_secs(2);
 
-/// Wheel that follows the executed path of a controller, until this is dropped.
+/// Wheel that follows the executed path of a controller. It stops following when this is dropped.
 pub struct ExecutedPath {
     shared: Arc<Shared>,
     last_question: Mutex<(u32, Option<Instant>)>,
@@ -81,8 +82,8 @@ impl ExecutedPath {
         Ok(Self { shared, last_question: Mutex::new((rand::random(), None)) })
     }
 
-    /// Waits until the wheel has been moved along everything that the controller has executed before now. If no program
-    /// reports any more, the path reported so far is complete.
+    /// Waits until the wheel has been moved along the whole path that the controller has executed before this call.
+    /// Returns at once if no helper program runs any more: then no more path is reported.
     pub async fn caught_up(&self) {
         let question = {
             let (question, when) = &mut *locked(&self.last_question);
@@ -115,7 +116,7 @@ impl Drop for ExecutedPath {
     }
 }
 
-/// Follows one program after another.
+/// Runs the helper program, and starts it again whenever it ends.
 fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel) {
     let mut next = Ok(first);
     // Number of consecutive programs that reported nothing.
@@ -157,7 +158,7 @@ fn pause_after(silent: u32) -> Duration {
     (RESTART_DELAY * 2u32.pow(silent.min(8))).min(MAX_RESTART_DELAY)
 }
 
-/// Moves the wheel line by line until the lines end. Returns true if any came.
+/// Moves the wheel line by line until the lines end. Returns true if at least one line arrived.
 fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {

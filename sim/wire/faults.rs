@@ -54,7 +54,7 @@ pub enum Fault {
     Silence,
     /// The two snapshot numbers of the next status disagree.
     TornStatus,
-    /// The wire carries the request out a second time, before the request that comes this many requests later.
+    /// The request is carried out a second time, before the request that follows this number of requests later.
     CarryOutAgain(u64),
     /// The application freezes before the request is carried out; the wire continues.
     Freeze,
@@ -163,7 +163,8 @@ impl FaultPlan {
         self.times(1, u64::MAX, when, fault)
     }
 
-    /// Adds a fault for `count` requests that the rule selects, beginning with the `first` of them, from 1.
+    /// Adds a fault for `count` of the requests that the rule selects. The first of them is number `first`, counted
+    /// from 1.
     pub fn times(mut self, first: u64, count: u64, when: When, fault: Fault) -> Self {
         self.rules.push(Rule { when, faults: vec![fault], skip: first.saturating_sub(1), left: count });
         self

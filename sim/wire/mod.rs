@@ -138,7 +138,7 @@ enum After {
     Silent,
 }
 
-/// Answer with all its faults.
+/// Answer as the wire delivers it, with its faults.
 struct Delivery {
     delay: Duration,
     bytes: Vec<u8>,
@@ -329,7 +329,8 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Serves machines over Modbus RTU on a new pseudo-terminal, whose path a client opens like that of a serial port.
+    /// Serves machines over Modbus RTU on a new pseudo-terminal. A client opens its path like the path of a serial
+    /// port.
     ///
     /// # Errors
     /// No pseudo-terminal is available.
@@ -345,7 +346,8 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Links the serial port to another path, the one in a client's configuration, for as long as it is served.
+    /// Creates a link to the serial port at the path `at`, which a client's configuration can name. The link exists
+    /// while the port is served.
     ///
     /// # Errors
     /// Something that is not a link exists there, the link cannot be made, or this is not a serial port.
@@ -424,7 +426,7 @@ impl Serving {
         &self.faults
     }
 
-    /// Waits until the wire fails, as a serial port does when it is unplugged; a TCP port does not fail.
+    /// Waits until the wire fails, for example because a serial port is unplugged. A TCP port does not fail.
     ///
     /// # Errors
     /// Returns the failure of the wire.

@@ -19,7 +19,8 @@ pub struct SharedController(Arc<Inner>);
 
 struct Inner {
     controller: Mutex<Controller>,
-    /// Count of changes from outside, after which the controller can have output; then the number of the last client.
+    /// Counter that wakes the connections after each access to the controller, which can then have output. `clients` is
+    /// the number of the last client.
     changed: watch::Sender<u64>,
     clients: Mutex<u64>,
     began: Instant,

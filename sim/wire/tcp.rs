@@ -1,4 +1,4 @@
-//! Modbus TCP: a header of seven bytes; clients share nothing but the machines.
+//! Modbus TCP: a header of seven bytes before each frame. The clients share only the machines.
 
 use std::io;
 use std::time::Duration;

@@ -13,7 +13,7 @@ pub struct Alarm {
     pub consequence: String,
     /// Steps to take, in this order.
     pub remedy: Vec<String>,
-    /// Role that may clear it.
+    /// Role that may clear the alarm.
     pub clears: Role,
 }
 
@@ -43,7 +43,8 @@ macro_rules! catalogue {
             /// All alarms, in the order of the catalogue.
             pub const ALL: &[Self] = &[$(Self::$id),+];
 
-            /// Returns the general description of the event. Every alarm of this kind begins with it.
+            /// Returns the general description of the event, without values. The text of every alarm of this kind
+            /// begins with this description.
             pub fn head(self) -> &'static str {
                 self.entry().0
             }
@@ -53,7 +54,8 @@ macro_rules! catalogue {
                 self.entry().3
             }
 
-            /// Returns the general description, the consequence, the role that clears it, and the steps to take.
+            /// Returns the entry of the catalogue: general description of the event, consequence, role that may clear
+            /// the alarm, and steps to take.
             fn entry(self) -> (&'static str, &'static str, Role, &'static [&'static str]) {
                 match self {
                     $(Self::$id => ($head, $consequence, Role::$clears, &[$($remedy),+]),)+
@@ -76,7 +78,7 @@ catalogue! {
         ["Compare the address in the cell file with the machine.", "Check that no other device has this address.",
          "Start the run again."]
     }
-    /// Sentinel registers in another word order.
+    /// Registers of the machine in another word order than in the cell file.
     WordOrder {
         "The word order of the registers differs from the cell file",
         "Every number would be wrong. Nothing was written. The run does not begin.", ProcessEngineer,
@@ -178,7 +180,7 @@ catalogue! {
         ["Check the part and the wheel: was this pass ground, with this map and this wheel?",
          "Compare the value and its limit with the machine's program and the recipe.", "Resume to measure the part as it is, or stop the run."]
     }
-    /// START of which it is unknown whether it was taken.
+    /// START command with an unknown result: the machine may have started.
     StartUnknown {
         "It is unknown whether a job was started", "The cell does not repeat START and orders no motion.", Operator,
         ["Check the machine: is it at rest and clear of the part? Was the part touched?",
@@ -232,7 +234,8 @@ catalogue! {
         ["Check how the part is loaded: turned, on swarf, or in another seat.", "Stop the run, load the part as drawn, and start a run that begins with a measurement.",
          "If it was loaded correctly, resume to measure again."]
     }
-    /// Gate: control points have moved between the touches of one measurement.
+    /// Gate: repeated touches of control points differ from the first touches: the part has moved during the
+    /// measurement.
     PartMoved {
         "The part is not where it was at the first touches of this measurement",
         "The repeated touches are not used: they belong to another place of the part.", Operator,
@@ -297,7 +300,7 @@ catalogue! {
          "If the estimate is right, resume: the next pass is ground with the corrected parameter, and the map corrects the remaining error.",
          "If it is wrong, stop the run, correct the recipe or the machine, and start a new run. Without the key in compensation.parameters, the map corrects the whole error."]
     }
-    /// Response with the wrong sign.
+    /// Response of the part with the wrong sign.
     SignFlipped {
         "The part responded to the map with the opposite sign", "Another pass would make it worse. The cell is held.", ProcessEngineer,
         ["Check the sign of the map at the grinder: positive leaves material.", "Do not resume before a test pass on a scrap part has shown the right sign.",

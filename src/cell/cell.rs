@@ -22,21 +22,22 @@ pub(super) enum SuspensionCause {
 pub(super) struct MachineStatus {
     /// Boot id of the connection. `None` before the first one and after a restart of this program.
     pub(super) boot_id: Option<u32>,
-    /// True if it was ever connected in this run, so that an abort must reach it.
+    /// True if the machine was connected at any time in this run. An abort is then also sent to this machine.
     pub(super) was_connected: bool,
-    /// True if it is connected and idle, or busy with the job of this run.
+    /// True if the machine is connected, and is idle or busy with the job of this run.
     pub(super) ready: bool,
     /// True if a fresh status has shown it clear of the part, and it has not been started since.
     pub(super) clear: bool,
     /// True if a person has confirmed it clear of the part, and it has not been started since.
     pub(super) clear_confirmed: bool,
-    /// True if it cannot report this, and a person is being asked.
+    /// True if the machine cannot report whether it is clear of the part, and a person is being asked.
     pub(super) clear_requested: bool,
     /// True if it has ended its safe sequence.
     pub(super) abort_confirmed: bool,
     /// True if it is in manual mode.
     pub(super) manual: bool,
-    /// True if it moves without an order, was ordered to hold, and has not yet confirmed that it stands still.
+    /// True if the machine moved without an order, was then ordered to hold, and has not yet confirmed that it is at
+    /// rest.
     pub(super) moves_unordered: bool,
 }
 
@@ -51,7 +52,8 @@ pub(super) struct FailureSeries {
     pub(super) reported: bool,
 }
 
-/// Cell in the middle of a run. Large parts are shared by its copies, of which [`super::transition_table()`] makes millions.
+/// Cell during a run. Copies of a cell share its large fields, because [`super::transition_table()`] creates millions
+/// of copies.
 #[derive(Clone, Debug)]
 pub struct Cell {
     pub(super) plan: Arc<CellPlan>,
@@ -61,20 +63,21 @@ pub struct Cell {
     pub(super) pass_count: u32,
     /// True if the pass record of this cycle is implausible.
     pub(super) pass_record_doubted: bool,
-    /// True for each machine that was seen at the job last requested from it. A later answer of the machine does not
-    /// reset it.
+    /// True for each machine that has reported that it executes the last job requested by the cell. A later report
+    /// without this job does not reset the flag.
     pub(super) job_observed: [bool; 2],
     pub(super) machines: [MachineStatus; 2],
     pub(super) suspension_causes: BTreeSet<SuspensionCause>,
     pub(super) active_alarms: BTreeMap<AlarmId, Arc<Alarm>>,
-    /// Figures of this cycle, and of the last one that was judged.
+    /// Figures of this cycle before its judgement (`figures`), and figures of the last judged cycle (`previous`).
     pub(super) figures: Option<Arc<Figures>>,
     pub(super) previous: Option<Arc<Figures>>,
     /// Cycle that came nearest to acceptance, and its figures.
     pub(super) best_cycle: Option<(u32, Arc<Figures>)>,
     /// Number of consecutive cycles that were worse than the one before.
     pub(super) diverging_cycles: u32,
-    /// Reason of the ending, when the state that leads to it is over; and whether the ending is `NotAccepted`.
+    /// Reason of the ending, stored until the run ends (`ending_reason`). `not_accepted` is true if the ending is
+    /// `NotAccepted`.
     pub(super) ending_reason: String,
     pub(super) not_accepted: bool,
     /// True if a person ordered the ending.
@@ -82,19 +85,20 @@ pub struct Cell {
     pub(super) abort_repeated: bool,
     /// Machine that is being stopped, while the cell is being stopped.
     pub(super) stopping_machine: Option<Device>,
-    /// True for each machine that was asked to give its result back and refused.
+    /// True for each machine that refused the request to discard its result.
     pub(super) acknowledge_refused: [bool; 2],
     /// Time of the event that is being handled, and time of the next deadline.
     pub(super) now: Duration,
     pub(super) deadline: Option<Duration>,
-    /// Time by which a machine that was ordered to hold must stand still.
+    /// Time by which a machine that was ordered to hold must be at rest.
     pub(super) hold_deadline: Option<Duration>,
-    /// Time of the last sign of progress of the running job, the longest interval between two signs, and whether a
-    /// person was notified that no sign comes.
+    /// Time of the last progress report of the running job, and longest time between two reports. `stall_notified` is
+    /// true if a person was notified that the reports have stopped.
     pub(super) last_progress: Option<Duration>,
     pub(super) max_progress_interval: Duration,
     pub(super) stall_notified: bool,
-    /// Furthest place that the cell has reached: the cycle, and the place in it.
+    /// Furthest position that the cell has reached: number of the cycle, and position in this cycle
+    /// ([`Phase::position`]).
     pub(super) furthest_position: (u32, u8),
     /// Failure series of each machine.
     pub(super) failure_series: [FailureSeries; 2],
@@ -141,8 +145,8 @@ impl Cell {
         self.state
     }
 
-    /// Returns the state in words for people. If the state implies a standstill, adds each machine that has not
-    /// confirmed it.
+    /// Returns a description of the state for people. If both machines should be at rest in this state, the description
+    /// names each machine that has not confirmed this.
     pub fn in_words(&self) -> String {
         match (self.state, &self.unconfirmed()[..]) {
             (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it is at rest", self.state),
@@ -151,7 +155,7 @@ impl Cell {
         }
     }
 
-    /// Returns the machines that have not confirmed their standstill, in a state that implies it.
+    /// Returns the machines that should be at rest in this state but have not confirmed it.
     pub fn unconfirmed(&self) -> Vec<Device> {
         match self.state {
             State::Aborted => self.unconfirmed_aborts(),
@@ -182,8 +186,9 @@ impl Cell {
         self.figures.as_deref().or(self.previous.as_deref())
     }
 
-    /// Returns true if a command that has waited must still be executed. A command that causes motion is wanted only in
-    /// the state that issued it. On the way to an end, only commands that lead there are wanted.
+    /// Returns true if a command that has waited for its record must still be executed. A command that causes motion is
+    /// executed only if the cell is still in the state that issued the command. While the run ends, only commands that
+    /// belong to the ending are executed.
     pub fn still_requires(&self, command: &Command) -> bool {
         let at = |device, step| self.state.phase() == Some(Phase::from_job(device, step));
         match (self.state, command) {

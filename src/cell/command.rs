@@ -26,11 +26,12 @@ pub enum Command {
     /// Ask a person to check that a machine is clear of the part, if the machine cannot report it. Answer:
     /// `ClearConfirmed`.
     AskWhetherClear { device: Device },
-    /// Prepare the job; first take back a preparation that is still active. Answer: `Prepared` or `Refused`.
+    /// Prepare the job. An earlier preparation that is still active is withdrawn first. Answer: `Prepared` or
+    /// `Refused`.
     Prepare { device: Device, cycle: u32 },
     /// Start the prepared job, at most once. Answer: `Started`, `StartUnknown` or, if the machine refused, `Refused`.
     StartMachine { device: Device, cycle: u32 },
-    /// Bring the machine to its safe place. Answer: `MachineHeld`, or `Ended` if the job was over before.
+    /// Bring the machine to its safe position. Answer: `MachineHeld`, or `Ended` if the job was over before.
     HoldMachine { device: Device },
     /// Resume the held machine. Answer: `MachineResumed` or `Refused`.
     ResumeMachine { device: Device },
@@ -40,7 +41,7 @@ pub enum Command {
     AbortMachine { device: Device },
     /// Bring a machine that was aborted or faulted in an earlier run back to idle. Answer: `Connected` or `Refused`.
     ClearMachine { device: Device },
-    /// Find out what became of the job. Answer: `Reconciled`.
+    /// Ask the machine for the state of the job. Answer: `Reconciled`.
     Reconcile { device: Device, cycle: u32 },
     /// Read, check and store the points of this cycle. Answer: `Collected`.
     Collect { cycle: u32 },
@@ -50,7 +51,8 @@ pub enum Command {
     Acknowledge { device: Device },
     /// Register the measurement of this cycle. Answer: `Registered` or `RegistrationFailed`.
     Register { cycle: u32 },
-    /// Compute the map of the next pass from this cycle. Answer: `Compensated` or `CompensationRefused`.
+    /// Compute the map of the next pass from the measurement of this cycle. Answer: `Compensated` or
+    /// `CompensationRefused`.
     Compensate { cycle: u32 },
     /// Announce the judgement of the cycle. No answer.
     Announce(Judgement),
@@ -90,13 +92,13 @@ pub enum Verdict {
     WrongResponse,
     /// No better than before, or no improvement expected.
     Stalled,
-    /// The uncertainty reaches across a limit, and another pass would not help.
+    /// A limit lies within the uncertainty of a figure, and another pass would not help.
     Undecided,
     /// In tolerance only without the outliers: touch those places again.
     LeftOut,
-    /// No pass is left.
+    /// The maximum number of passes is reached.
     MaxCycles,
-    /// No material is left to take off.
+    /// The removal budget is spent.
     BudgetSpent,
 }
 
@@ -120,14 +122,14 @@ pub enum Ending {
     Aborted { cycle: u32, confirmed: bool, reason: String },
 }
 
-/// Formats a label as it is recorded.
+/// Formats the label of a command for the record: its name, followed by its machine if it has one.
 pub(super) fn format_label((name, device): (&'static str, Option<Device>)) -> String {
     device.map_or(name.to_owned(), |device| format!("{name} {device}"))
 }
 
 impl Command {
-    /// Returns true if two commands decide the same. Texts for people do not count: a record of a program with other
-    /// wording replays.
+    /// Returns true if two commands are equal, texts for people excepted. So the record of a program with other texts
+    /// can be replayed.
     pub fn is_same_decision(&self, other: &Self) -> bool {
         self.without_texts() == other.without_texts()
     }

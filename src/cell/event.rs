@@ -7,7 +7,7 @@ use std::fmt;
 use super::interval::RecordedInterval;
 use super::state::Device;
 
-/// Person, and the place at which the order was given.
+/// Person, and the terminal or computer from which the order came.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Actor {
     /// Name of the person, or of the program that acts for one.
@@ -32,7 +32,7 @@ pub enum Event {
     Start { actor: Actor },
     /// The right part is loaded and clamped, and no machine touches it.
     LoadConfirmed { actor: Actor },
-    /// Come to the next safe place and wait for a person.
+    /// Move to the next safe position and wait for a person.
     Hold { actor: Actor, reason: String },
     /// Go on from where the cell was held.
     Resume { actor: Actor, reason: String },
@@ -40,10 +40,10 @@ pub enum Event {
     Stop { actor: Actor, reason: String },
     /// End at once: the safe sequence only.
     Abort { actor: Actor, reason: String },
-    /// A person has checked a machine that cannot report it: it is clear of the part.
+    /// A person has checked a machine that cannot report whether it is clear of the part: it is clear.
     ClearConfirmed { actor: Actor, device: Device },
-    /// A person has checked a machine that cannot report what became of its START: the job is over, the machine stands
-    /// still and is clear of the part. The cell never repeats the START; the part is measured as it is.
+    /// A person has checked a machine that cannot report the result of its START: the job is over, and the machine is
+    /// at rest and clear of the part. The cell never repeats the START; the part is measured instead.
     DeclaredOver { actor: Actor, device: Device, evidence: String },
     /// The program was restarted in the middle of this run; the links are new.
     Restarted { actor: Actor },
@@ -58,8 +58,8 @@ pub enum Event {
     LinkLost { device: Device, why: String },
     /// The link is open again; the signature and the synchronisation are verified.
     LinkBack { device: Device, boot_id: u32 },
-    /// The station task of the machine in this program has failed. No part of this program can talk to the machine,
-    /// whose own silence limit holds it.
+    /// The task of this program that communicates with the machine has failed. No more requests reach the machine,
+    /// which holds by its own silence limit.
     StationFailed { device: Device, why: String },
     /// A condition that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
@@ -70,8 +70,8 @@ pub enum Event {
     },
     /// The condition is back. The reporting side applies the hysteresis.
     ConditionBack { device: Device, condition: Condition },
-    /// The machine is not in automatic mode: a person may move it at its panel. Reported as a level, like a missing
-    /// condition.
+    /// The machine is not in automatic mode: a person may move it at its panel. Reported as a level: again after every
+    /// reconnection.
     NotAutomatic {
         device: Device,
         #[serde(rename = "words")]
@@ -85,23 +85,24 @@ pub enum Event {
     PlanLoaded { cycle: u32 },
     /// The machine is prepared for this cycle. Answers `Prepare`.
     Prepared { device: Device, cycle: u32 },
-    /// The machine was seen at the job of this run. Now it shows no job or another one, and reports no end.
+    /// The machine has reported the job of this run before. Now it reports no job or another job, and no end of the
+    /// job.
     JobVanished { device: Device, why: String },
-    /// The machine took START. Answers `StartMachine`.
+    /// The machine has accepted START. Answers `StartMachine`.
     Started { device: Device, cycle: u32 },
-    /// It is not known whether the machine took START. Answers `StartMachine`.
+    /// It is not known whether the machine has accepted START. Answers `StartMachine`.
     StartUnknown { device: Device, cycle: u32, why: String },
     /// The job makes progress: `done` of `total` points, or thousandths of the path. A machine that moves without a job
     /// also sends it.
     Progressed { device: Device, done: u32, total: u32 },
-    /// The machine is in its safe place and stands still. Answers `HoldMachine`, also if it was held already, or comes
-    /// without an order.
+    /// The machine is in its safe position and at rest. Answers `HoldMachine`, also if the machine was held already.
+    /// May also come without an order.
     MachineHeld { device: Device },
     /// The machine moves again. Answers `ResumeMachine`, or comes without an order.
     MachineResumed { device: Device },
     /// The job is over. For the grinder the pass record has been read. Also answers `StopMachine`, even if no job ran.
     Ended { device: Device, cycle: u32, result: JobResult },
-    /// The pass record of the grinder is implausible, or of another pass. Comes before `Ended` or `Reconciled`.
+    /// The pass record of the grinder is implausible, or belongs to another pass. Comes before `Ended` or `Reconciled`.
     RecordDoubted { cycle: u32, why: String },
     /// A fresh status shows that the machine is clear of the part. Answers `VerifyClear`.
     Cleared { device: Device },
@@ -112,7 +113,7 @@ pub enum Event {
         #[serde(rename = "words")]
         message: String,
     },
-    /// The machine stands still, but no signal shows whether it is clear of the part. Answers `VerifyClear`.
+    /// The machine is at rest, but no signal shows whether it is clear of the part. Answers `VerifyClear`.
     ClearUnknown { device: Device },
     /// The machine refused the request.
     Refused { device: Device, what: MachineRequest, why: String },
@@ -125,7 +126,7 @@ pub enum Event {
     },
     /// The machine has discarded its result and is idle. Answers `Acknowledge`.
     Acknowledged { device: Device },
-    /// The machine has finished its own safe sequence and stands still. Answers `AbortMachine`.
+    /// The machine has finished its own safe sequence and is at rest. Answers `AbortMachine`.
     AbortConfirmed { device: Device },
     /// Outcome of the job. Answers `Reconcile`.
     Reconciled { device: Device, cycle: u32, outcome: Reconciliation },
@@ -149,7 +150,7 @@ pub enum Event {
     /// There is no next map. Answers `Compensate`.
     CompensationRefused { cycle: u32, why: CompensationRefusal },
 
-    /// The result of a computation from a measurement cannot be written. The cell does not use it before it can be.
+    /// The result of a computation cannot be written to the disk. The cell does not use a result before it is written.
     /// Answers `Collect`, `Register` and `Compensate`.
     NotSaved { cycle: u32, why: RecordFailure },
 
@@ -161,7 +162,7 @@ pub enum Event {
     ControlLost { why: String },
     /// The channel for orders is back.
     ControlBack,
-    /// Time has passed; the cell does what is due.
+    /// Time has passed. If the deadline of the cell is reached, the cell reacts to it.
     Deadline,
 }
 
@@ -173,7 +174,7 @@ pub enum Occupation {
     Idle,
     /// Aborted or faulted in an earlier run; it can be cleared.
     ToClear,
-    /// Busy with a job that is not of this run, in words.
+    /// Busy, for example with the job of this run. Contains a description for people.
     Busy(String),
 }
 
@@ -191,7 +192,7 @@ pub enum ConnectionRefusal {
     Inches,
     /// Another client owns it.
     Owned(String),
-    /// It runs the job of another run. The cell does not touch this job, not even with an abort.
+    /// It runs the job of another run. The cell sends no order to it, not even an abort.
     AtAnotherJob(String),
 }
 
@@ -248,19 +249,19 @@ pub enum JobResult {
     Failed,
 }
 
-/// Outcome of a job whose machine was out of sight.
+/// Outcome of a job after a time in which the cell had no reports from the machine.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reconciliation {
-    /// The machine took the job and runs it.
+    /// The machine has started the job and runs it.
     Running,
-    /// The machine took the job and holds.
+    /// The machine has started the job and holds.
     Held,
-    /// The machine took the job, and the job is over.
+    /// The machine has started the job, and the job is over.
     Ended(JobResult),
-    /// The machine proved that it did not take the job.
+    /// The machine has proved that it did not start the job.
     NotStarted,
-    /// The machine cannot report the outcome; a person must look. The reason in words.
+    /// The machine cannot report the outcome, so a person must check the machine. Contains the reason.
     Unknown(String),
 }
 
@@ -288,11 +289,12 @@ pub enum GateFailure {
     Inches,
     /// The result is of another part, plan or cycle.
     Foreign(String),
-    /// The result is broken: its CRC, its count, or a value that is not a number.
+    /// The result is invalid: a wrong CRC, a wrong number of points, or an impossible value. Contains the reason.
     Broken(String),
     /// The temperature was outside its window.
     Temperature(String),
-    /// Touches that were repeated are not where they were: the part, its frame or its temperature has changed.
+    /// Repeated touches differ from the first touches: the part, its frame or its temperature has changed. In words,
+    /// with the value and the limit.
     Moved(String),
 }
 
@@ -308,8 +310,8 @@ pub struct Figures {
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
-    /// Figures of the part itself, which are judged: without the noise of the probe. `None` in records of earlier
-    /// versions, which judged the figures of the points.
+    /// Figures of the form of the part, without the noise of the probe. The cell judges these figures. `None` in
+    /// records of earlier versions, in which the figures of the points are judged.
     #[serde(default)]
     pub form: Option<RecordedFormFigures>,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
@@ -318,7 +320,7 @@ pub struct Figures {
     /// Expanded measuring uncertainty (k = 2) of the root mean square.
     #[serde(with = "super::number")]
     pub rms_expanded_mm: f64,
-    /// Share of the aperture that is covered, 0 to 1.
+    /// Share of the aperture that the measured points cover, 0 to 1.
     #[serde(with = "super::number")]
     pub coverage: f64,
     /// Points used.
@@ -347,11 +349,12 @@ pub struct Figures {
     /// Maximum removal at any place since the run began. `None` if it is not known.
     #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
-    /// Number of contributions to the uncertainty for which no value is stated, and the number of all. An unstated
-    /// contribution counts as 0. `None` if there is no budget.
+    /// Number of contributions to the uncertainty without a stated value, and number of all contributions. A
+    /// contribution without a stated value counts as 0. `None` if there is no uncertainty budget.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unstated: Option<[u32; 2]>,
-    /// Points to touch before any decision. `None` if enough is known, and if all targets are touched at once.
+    /// Further targets that the measurement requires before the cell decides. `None` if no further targets are
+    /// required.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub touch_on: Option<Box<FurtherTouches>>,
 }
@@ -367,7 +370,7 @@ pub struct OutlierFigures {
     pub rms_mm: f64,
     /// Outliers: which points, where they are and how large their deviations are, in words.
     pub places: String,
-    /// True if these places can be touched again alone. Otherwise the whole part is measured again.
+    /// True if only the outliers can be touched again. If false, the whole part is measured again.
     #[serde(default)]
     pub again: bool,
 }
@@ -375,7 +378,7 @@ pub struct OutlierFigures {
 /// Further points to touch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FurtherTouches {
-    /// Number of the next targets.
+    /// Number of targets to touch next.
     pub targets: u32,
     /// Reason, in words.
     pub why: String,
@@ -386,8 +389,8 @@ pub struct FurtherTouches {
 pub struct RecordedFormFigures {
     /// Peak to valley.
     pub pv: RecordedInterval,
-    /// Peak to valley of the aperture: of the touched points and the places between them, without the outermost 0.1 %
-    /// at each end.
+    /// Peak to valley over the aperture: at the touched points and between them, without the outermost 0.1 % at each
+    /// end.
     pub pv_robust: RecordedInterval,
     /// Root mean square.
     pub rms: RecordedInterval,
@@ -405,7 +408,8 @@ pub struct Forecast {
     /// Standard deviation of the expected rms.
     #[serde(with = "super::number")]
     pub sigma_mm: f64,
-    /// Lower limit that no correction can improve on, as estimated from the passes so far.
+    /// Lower bound of the rms that further corrections can reach, as estimated from the passes so far. `None` if it is
+    /// not known.
     #[serde(default, with = "super::number::optional")]
     pub floor_mm: Option<f64>,
 }
@@ -447,10 +451,11 @@ pub struct CompensationSummary {
     /// Share of the part where the wheel will not cut, as far as it can be predicted.
     #[serde(default, with = "super::number")]
     pub air_share: f64,
-    /// Gains: the share of the error that is taken back, with the wavelength in millimetres from which on each applies.
+    /// Gains, as pairs: shortest wavelength of a band in millimetres, and share of the error in this band that the
+    /// correction removes.
     #[serde(default, with = "super::number::pairs")]
     pub gains: Vec<[f64; 2]>,
-    /// Share of a correction to which the part responds.
+    /// Response of the part: change of the part as a share of the commanded correction.
     #[serde(default, with = "super::number")]
     pub response: f64,
     /// Other warnings for a person.
@@ -461,7 +466,8 @@ pub struct CompensationSummary {
     /// Root mean square of the residual error for the map, if parameters are compensated in addition.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub map_rms_mm: Option<f64>,
-    /// Parameters to which a person must agree first, in words: their corrections exceed the tolerance of the recipe.
+    /// Questions to a person before the next pass: one for each parameter whose correction exceeds the tolerance of the
+    /// recipe.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub asks: Vec<String>,
 }
@@ -505,7 +511,7 @@ impl RecordedParameter {
 pub enum CompensationRefusal {
     /// The next pass would exceed the total removal that the recipe allows. In words, with the value and the limit.
     BudgetSpent(String),
-    /// The pose is undetermined in these directions, so a map would be at the wrong place.
+    /// The pose is undetermined in these directions, so a map would be displaced on the part.
     WeakDirections(Vec<String>),
     /// Another reason, in words.
     Failed(String),
@@ -576,7 +582,7 @@ impl fmt::Display for JobResult {
 }
 
 impl Event {
-    /// Returns the cycle that the event belongs to, if there is one.
+    /// Returns the number of the cycle that the event belongs to; `None` for an event without a cycle.
     pub fn cycle(&self) -> Option<u32> {
         match self {
             Self::PassLoaded { cycle }
@@ -598,7 +604,7 @@ impl Event {
         }
     }
 
-    /// Returns the machine that the event comes from or is about.
+    /// Returns the machine that the event comes from or is about; `None` if it concerns no machine.
     pub fn device(&self) -> Option<Device> {
         match self {
             Self::DeclaredOver { device, .. }
@@ -632,12 +638,12 @@ impl Event {
         }
     }
 
-    /// Returns true if a person gave the event as an order.
+    /// Returns true if the event is an order or a confirmation of a person.
     pub fn is_order(&self) -> bool {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })
     }
 
-    /// Returns the origin of the event as it is recorded: the person, the machine or the cell itself, and the place.
+    /// Returns the origin of the event for the record: the name of the person, the machine or the cell, and the place.
     pub fn origin(&self) -> (String, String) {
         match (self.actor(), self.device()) {
             (Some(Actor { name, station }), _) => (name.clone(), station.clone()),
@@ -646,7 +652,7 @@ impl Event {
         }
     }
 
-    /// Describes the event for a person when it does not fit the state.
+    /// Describes the event for a message to a person, if the event does not fit the state of the cell.
     pub(super) fn in_words(&self) -> String {
         match self {
             Self::LoadConfirmed { .. } => "the confirmation that the part is loaded".to_owned(),
@@ -660,7 +666,7 @@ impl Event {
         }
     }
 
-    /// Returns the person who gave the order.
+    /// Returns the person who gave the order, made the confirmation or restarted the program; `None` for other events.
     pub fn actor(&self) -> Option<&Actor> {
         match self {
             Self::Start { actor }

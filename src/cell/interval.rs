@@ -23,11 +23,12 @@ pub struct RecordedInterval {
 impl RecordedInterval {
     /// Number of quantiles of a figure.
     pub const COUNT: usize = 15;
-    /// Probabilities of the quantiles: dense where limits are usual, and no further out than a thousand samples can
-    /// show.
+    /// Probabilities of the quantiles. They are dense near the usual required probabilities, and end at 0.001 and
+    /// 0.999: a thousand samples do not determine quantiles beyond these.
     pub const PROBABILITIES: [f64; Self::COUNT] =
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
-    /// Standard normal deviates of the same probabilities. Between two of them the figure is interpolated as normal.
+    /// Standard normal deviates of [`Self::PROBABILITIES`]. Between two quantiles, the figure is interpolated linearly
+    /// over the deviate.
     const DEVIATES: [f64; Self::COUNT] = [
         -3.090_232_306_167_813_5,
         -2.575_829_303_548_901,
@@ -46,18 +47,18 @@ impl RecordedInterval {
         3.090_232_306_167_813_5,
     ];
 
-    /// Returns the interval of a normal figure with the same uncertainty on both sides.
+    /// Returns the interval of a normally distributed figure from its median and its expanded uncertainty (k = 2).
     pub fn from_expanded(median_mm: f64, expanded_mm: f64) -> Self {
         Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm, quantiles_mm: None }
     }
 
-    /// Returns the expanded uncertainty: half of the width.
+    /// Returns the expanded uncertainty (k = 2): half of the width of the interval.
     pub fn expanded_mm(&self) -> f64 {
         0.5 * (self.high_mm - self.low_mm)
     }
 
-    /// Returns the probability that the figure is not above a limit. The result is clamped to 0.001 to 0.999, because
-    /// nothing is known beyond these quantiles.
+    /// Returns the probability that the figure is at most `limit_mm`. The result is clamped to 0.001 to 0.999, because
+    /// the quantiles beyond these probabilities are unknown.
     pub fn probability_within(&self, limit_mm: f64) -> f64 {
         let quantiles = self.quantiles();
         let (Some(below), last) = (quantiles.iter().rposition(|q| *q <= limit_mm), Self::COUNT - 1) else {
@@ -73,7 +74,8 @@ impl RecordedInterval {
         normal_probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
     }
 
-    /// Returns the quantile of the figure at a probability.
+    /// Returns the quantile of the figure at a probability, clamped to the outermost recorded quantiles. Returns NaN
+    /// for a probability of NaN.
     pub fn quantile_mm(&self, probability: f64) -> f64 {
         // `p` and `1 - (1 - p)` differ in their last digits.
         const SAME: f64 = 1e-9;
@@ -90,8 +92,8 @@ impl RecordedInterval {
         quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
     }
 
-    /// Returns the recorded quantiles. If there are none, returns those of a normal figure with these ends: each half
-    /// width (k = 2) counts as 1.96 standard uncertainties.
+    /// Returns the recorded quantiles. If there are none, returns quantiles of a normal distribution on each side of
+    /// the median: the distance from the median to that end of the interval counts as 1.96 standard uncertainties.
     fn quantiles(&self) -> [f64; Self::COUNT] {
         let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
         let of_normal = |k: usize| {

@@ -15,7 +15,7 @@ pub(super) struct ReasonedVerdict {
 }
 
 impl Figures {
-    /// Returns true if all figures are finite numbers, and none that cannot be negative is negative.
+    /// Returns true if all figures are finite and not negative, and all intervals of the form are valid.
     pub(super) fn are_valid(&self) -> bool {
         let all = [
             self.pv_mm,
@@ -35,8 +35,8 @@ impl Figures {
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
-    /// Returns the intervals of the peak to valley and of the root mean square, as far as they are known. The flag is
-    /// true if the first is the PV 99.8 %; otherwise it is the PV of all points.
+    /// Returns the intervals of the peak to valley (PV) and of the root mean square (RMS). The flag is true if the PV
+    /// is the PV 99.8 %, and false if it is the PV of all points.
     fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
             Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
@@ -50,13 +50,13 @@ impl Figures {
     }
 }
 
-/// Position of a figure relative to its limit with its uncertainty counted (ISO 14253-1, JCGM 106): within the limit
-/// with at least the probability of the tolerance, beyond it with at least this probability, or neither.
+/// Conformity of a figure with its limit (ISO 14253-1, JCGM 106): proven within the limit, proven beyond the limit, or
+/// neither. A proof requires the probability of the tolerance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conformity {
     /// Within, for certain.
     Within,
-    /// The uncertainty reaches across the limit: nothing is proven.
+    /// The limit lies within the uncertainty of the figure: nothing is proven.
     Undecided,
     /// Beyond, for certain.
     Beyond,
@@ -81,20 +81,20 @@ pub struct ComparedFigure {
     pub name: &'static str,
     /// Median of the figure.
     pub median_mm: f64,
-    /// Expanded measuring uncertainty (k = 2), whether the tolerance counts it or not: half of the width of
-    /// `between_mm`.
+    /// Expanded measuring uncertainty (k = 2): half of the width of `interval_mm`. Given even if the tolerance ignores
+    /// the uncertainty.
     pub expanded_mm: f64,
-    /// Lower and upper end of the 95 % interval, whether the tolerance counts them or not.
+    /// Lower and upper end of the 95 % credible interval. Given even if the tolerance ignores the uncertainty.
     pub interval_mm: [f64; 2],
     /// Largest accepted value; infinite if the figure is not limited.
     pub limit_mm: f64,
-    /// Probability that the figure is within its limit, 0.001 to 0.999, whether the tolerance counts it or not. `None`
-    /// if the figure is not limited.
+    /// Probability that the figure is within its limit, 0.001 to 0.999. Given even if the tolerance ignores the
+    /// uncertainty. `None` if the figure is not limited.
     pub probability_within: Option<f64>,
-    /// Values that are compared with the limit: the lower and upper quantile for the probability of the tolerance, or
-    /// twice the median.
+    /// Lower and upper value that are compared with the limit: the quantiles at 1 - p and p, where p is the probability
+    /// of the tolerance. If the tolerance ignores the uncertainty, both values are the median.
     pub compared_mm: [f64; 2],
-    /// Conformity, with the uncertainty if the tolerance counts it.
+    /// Conformity of the figure. The uncertainty counts unless the tolerance ignores it.
     pub conformity: Conformity,
 }
 
@@ -111,7 +111,7 @@ impl ComparedFigure {
     }
 }
 
-/// Formats a probability for people. Rounds down, so that it is never overstated.
+/// Formats a probability for people, in percent. Rounds down, so that the probability is never overstated.
 fn format_percent(probability: f64) -> String {
     format!("{:.1} %", 0.1 * (1e3 * probability + 1e-6).floor())
 }
@@ -143,16 +143,16 @@ impl Tolerance {
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
 
-    /// Returns true if the part is within its limits without the outliers, and beyond one with them.
+    /// Returns true if the part is within its limits without the outliers and exceeds a limit with the outliers.
     pub fn outliers_decide(&self, figures: &Figures) -> bool {
         let [pv, rms] = self.compare(figures).map(|compared| compared.conformity);
         pv.max(rms) == Conformity::Within && self.exceeded_with_outliers(figures).is_some()
     }
 
-    /// Describes the outliers if the part would exceed a limit with them. Returns `None` otherwise. A touched point
-    /// counts until it is touched again.
+    /// Describes the outliers if the part exceeds a limit when they are included. Returns `None` otherwise.
     ///
-    /// The outliers increase the figures of the part by as much as they increase the figures of the points.
+    /// The outliers are assumed to increase the figures of the part by as much as the figures of the points: the PV by
+    /// the same difference, the RMS by the same difference of the squares.
     fn exceeded_with_outliers(&self, now: &Figures) -> Option<String> {
         let left_out = now.left_out.as_ref()?;
         let [pv, rms] = self.compare(now);
@@ -169,7 +169,9 @@ impl Tolerance {
     }
 }
 
-/// Judges the figures of a cycle after `passes` passes. The rules come in the order of what cannot be undone.
+/// Judges the figures `now` of a cycle after `passes` passes; `before` are those of the last judged cycle. The first
+/// rule that applies gives the verdict: acceptance, removal budget, number of passes, wrong response, divergence,
+/// stall, expected improvement by another pass.
 pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> ReasonedVerdict {
     let tell = |verdict, reason| ReasonedVerdict { verdict, reason };
     let figures = figures_in_words(plan, now);
@@ -217,7 +219,8 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     judge_next_pass(plan, before, now, conformity)
 }
 
-/// Returns the verdict on another pass: continue if the expected gain is worth its material.
+/// Returns the verdict on another pass: continue if its expected improvement exceeds the stall limits of the plan, or
+/// if it cannot be predicted.
 fn judge_next_pass(
     plan: &CellPlan,
     before: Option<&Figures>,

@@ -1,5 +1,5 @@
-//! Serialization of a number that can be missing or not finite. JSON has no NaN and no infinity, but a run is replayed
-//! from its record.
+//! Serialization of a number that can be missing or not finite. JSON has no NaN and no infinity, so these values are
+//! recorded as text. A replay then reads the recorded value.
 
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -22,7 +22,7 @@ impl RecordedNumber {
     fn into_value<E: Error>(self) -> Result<f64, E> {
         match self {
             Self::Number(value) => Ok(value),
-            Self::Word(word) => word.parse().map_err(|_| E::custom(format!("{word:?} is no number"))),
+            Self::Word(word) => word.parse().map_err(|_| E::custom(format!("{word:?} is not a number"))),
             Self::Nothing(()) => Ok(f64::NAN),
         }
     }
@@ -49,7 +49,7 @@ pub(super) mod optional {
     }
 }
 
-/// Reads a limit. A missing one is infinite, because JSON has no infinity.
+/// Reads a limit. `null` means an infinite limit, because JSON has no infinity.
 pub(super) fn limit<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Option::<RecordedNumber>::deserialize(from)?.map_or(Ok(f64::INFINITY), RecordedNumber::into_value)
 }

@@ -4,25 +4,28 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-/// Parameters by which the cell decides. The builder checks them; a NaN makes the cell accept nothing.
+/// Parameters by which the cell decides. The code that builds a plan checks its values. With a NaN as a limit, the cell
+/// accepts no part.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CellPlan {
-    /// Start of the first cycle.
+    /// First step of the first cycle.
     pub begin_with: FirstStep,
     /// Maximum number of passes of the grinder.
     pub max_cycles: u32,
     /// Accepted tolerance.
     pub tolerance: Tolerance,
-    /// Minimum improvement, as a share of the cycle before. Below it the run counts as stalled.
+    /// Minimum improvement of a figure by a cycle, as a share of the figure of the previous cycle. With less
+    /// improvement the run counts as stalled.
     pub stall_share: f64,
-    /// Minimum improvement of the rms in absolute terms. Below it the run counts as stalled, whatever the share is.
+    /// Minimum improvement of the rms by a cycle. With less improvement the rms counts as stalled, even if the
+    /// improvement exceeds `stall_share`.
     #[serde(default)]
     pub stall_mm: f64,
     /// Action when the run stalls.
     pub on_stall: HoldOrStop,
     /// Action after two cycles in a row that are worse than the one before.
     pub on_divergence: HoldOrStop,
-    /// Action when there is no next map for another reason than the budget.
+    /// Action when no next map can be computed, for a reason other than the removal budget.
     pub on_refusal: HoldOrStop,
     /// Limits that a measurement must satisfy.
     pub gates: GateLimits,
@@ -30,7 +33,7 @@ pub struct CellPlan {
     pub removal_budget_mm: f64,
     /// Minimum removal of a pass at any place.
     pub least_depth_mm: f64,
-    /// True if a machine found aborted or faulted at the start is cleared without a question.
+    /// True if a machine that is aborted or faulted at the start is cleared without asking a person.
     pub clear_at_start: bool,
     /// Time limits.
     pub deadlines: Deadlines,
@@ -56,7 +59,7 @@ pub struct Tolerance {
     /// Limit of the root mean square; infinite if it is not limited.
     #[serde(deserialize_with = "super::number::limit")]
     pub rms_mm: f64,
-    /// True if the uncertainty of the figures counts. Otherwise the median is compared with the limit.
+    /// True if a figure must be within its limit with `probability`. If false, the median is compared with the limit.
     pub with_uncertainty: bool,
     /// Probability with which a figure must be within its limit to be accepted, and beyond it to be rejected: 0.5 to
     /// below 1. Recorded only if it is not the default one.
@@ -131,24 +134,26 @@ pub struct Deadlines {
     pub transfer: Duration,
     /// Time for any other answer of a machine: prepare, start, clear, acknowledge, resume, reconcile.
     pub answer: Duration,
-    /// Maximum time between two signs of progress of a running job of each machine: CMM, grinder. A manual job gives no
-    /// sign before its end.
+    /// Maximum time between two progress reports of a running job, for each machine: CMM, grinder. A manual job gives
+    /// no report before its end.
     pub progress: [Duration; 2],
-    /// Time without a sign of progress after which a person is notified; at least three times the longest interval of
-    /// this job. `None` if a job gives no such signs.
+    /// Time without a progress report after which a person is notified. The cell extends it to three times the longest
+    /// interval between reports of the running job. `None` if a machine gives no such reports.
     #[serde(default)]
     pub progress_notice: [Option<Duration>; 2],
-    /// Time since the first of several failures at the same place, without progress, after which the cell is held.
+    /// Maximum duration of a series of failures without progress, from its first failure. After this time the cell is
+    /// held.
     #[serde(default = "Deadlines::vain")]
     pub vain: Duration,
     /// Number of failures in a row, without progress, after which the cell is held.
     #[serde(default = "Deadlines::vain_failures")]
     pub vain_failures: u32,
-    /// Time from HOLD to the safe place of each machine: CMM, grinder.
+    /// Time from HOLD to the safe position of each machine: CMM, grinder.
     pub hold: [Duration; 2],
     /// Time from STOP to the end of the job of each machine: CMM, grinder.
     pub stop: [Duration; 2],
-    /// Time from ABORT to its confirmation. Then follow the alarm, one repetition, and the same time again.
+    /// Time from ABORT to its confirmation. After this time the cell raises an alarm, repeats ABORT once and waits for
+    /// the same time again.
     pub abort: Duration,
     /// Time for a registration or a compensation.
     pub compute: Duration,

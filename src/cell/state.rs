@@ -45,7 +45,7 @@ impl fmt::Display for Device {
     }
 }
 
-/// Step of one job of one machine, named for the event that it waits for.
+/// Step of a job of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobStep {
@@ -59,15 +59,15 @@ pub enum JobStep {
     Start,
     /// The machine moves.
     Run,
-    /// It is unknown whether the machine took START; the cell asks it.
+    /// The state of the job is unknown; the cell asks the machine for it.
     Reconcile,
     /// The result is being read and gated (CMM only).
     Collect,
     /// The radius of the probe is being compared with the reference sphere (CMM only).
     Qualify,
-    /// The machine gets the order to discard its result, which is used.
+    /// The machine gets the order to discard its result. The cell uses the result.
     Acknowledge,
-    /// The machine gets the order to discard its result, which is not used.
+    /// The machine gets the order to discard its result. The cell does not use the result.
     Discard,
 }
 
@@ -85,14 +85,14 @@ pub enum Phase {
     Measure(JobStep),
     /// The measurement is registered to the nominal surface.
     Register,
-    /// The figures are judged. This takes no time, unless the cell is held before it.
+    /// The figures are judged. The cell leaves this phase at once, unless it is held before the judgement.
     Judge,
     /// The next map is computed.
     Compensate,
 }
 
 impl Phase {
-    /// Returns the job of a machine at a step.
+    /// Returns the phase of a step in the job of a machine.
     pub(super) fn from_job(device: Device, step: JobStep) -> Self {
         match device {
             Device::Cmm => Self::Measure(step),
@@ -100,7 +100,7 @@ impl Phase {
         }
     }
 
-    /// Returns the machine whose job this phase is, and its step.
+    /// Returns the machine and the step of its job; `None` if this phase is not the job of a machine.
     pub fn job(self) -> Option<(Device, JobStep)> {
         match self {
             Self::Grind(step) => Some((Device::Grinder, step)),
@@ -116,8 +116,8 @@ impl Phase {
             .map(|(device, _)| device)
     }
 
-    /// Returns the position in a cycle: a later phase has a higher number. A job that is being reconciled counts as
-    /// less far than one that is seen running.
+    /// Returns the position of the phase in the sequence of a cycle: a later phase has a higher number. The step
+    /// Reconcile comes before Run, because the state of its job is unknown.
     pub(super) fn position(self) -> u8 {
         let step = |step: JobStep| match step {
             JobStep::Send => 0,
@@ -175,13 +175,14 @@ pub enum State {
     Starting,
     /// A cycle runs.
     Execute(Phase),
-    /// Held from inside or by a person: a moving machine comes to its safe place first.
+    /// Being held, by a person or by a cause inside the cell: a moving machine first moves to its safe position.
     Holding(Phase),
     /// Held. A person must resume.
     Held(Phase),
     /// The held machine is being resumed.
     Unholding(Phase),
-    /// Suspended from outside (a link, supplies, temperature): a moving machine comes to its safe place first.
+    /// Being suspended by a cause outside the cell (a link, supplies, a signal): a moving machine first moves to its
+    /// safe position.
     Suspending(Phase),
     /// Suspended; resumes by itself when the cause is gone.
     Suspended(Phase),
@@ -221,8 +222,8 @@ impl State {
         }
     }
 
-    /// Returns the machine that has not confirmed its standstill, while the cell is held or suspended. It was last seen
-    /// at a job, or may have been started, and its end is not known.
+    /// Returns the machine that has not confirmed that it is at rest, while the cell is held or suspended: the state of
+    /// its job is unknown. Returns `None` in all other cases.
     pub fn unconfirmed(self) -> Option<Device> {
         match self {
             Self::Held(phase) | Self::Suspended(phase) => {

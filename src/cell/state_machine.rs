@@ -19,7 +19,8 @@ use State::{
 };
 
 impl Cell {
-    /// Handles an event and returns the commands to execute, in this order. After an end state there are none.
+    /// Handles an event at the time `now` since the run began. Returns the commands to execute, in this order. In an
+    /// end state there are none.
     ///
     /// If the event does not fit, the answer is [`Command::Refuse`], and the state does not change.
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
@@ -34,8 +35,8 @@ impl Cell {
     /// Handles an event and leaves the commands in `commands`.
     ///
     /// # Errors
-    /// The reason of a refusal, or `None` if the event does not fit the state at all. In the second case nothing has
-    /// changed; only the display to a person needs words.
+    /// Returns the reason of a refusal, or `None` if the state has no reaction to the event. In the second case the
+    /// state of the cell is unchanged, and the caller writes the text for people.
     pub(super) fn apply_event(&mut self, now: Duration, event: &Event) -> Result<(), Option<String>> {
         if self.state.is_end() {
             return Ok(());
@@ -53,7 +54,8 @@ impl Cell {
         answered
     }
 
-    /// Returns why an event cannot belong to the present work of the cell, in any state.
+    /// Returns the reason why an event is foreign: it belongs to another cycle than the current one. Returns `None`
+    /// otherwise, and for the end of a job that answers a STOP.
     fn foreign_reason(&self, event: &Event) -> Option<String> {
         // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
         // machine then still has the job of the cycle before.
@@ -337,7 +339,7 @@ impl Cell {
     }
 }
 
-/// Returns true if an event shows a machine at the requested job, or at its end.
+/// Returns true if an event shows that a machine executes the requested job or has ended it.
 fn shows_job(event: &Event, of: Device) -> bool {
     match event {
         Event::Started { device, .. }

@@ -1,5 +1,5 @@
-//! Transition table, found by trial: every event in every reachable state. So it shows the actual behaviour, and not a
-//! list written by hand.
+//! Transition table, computed by the state machine itself: every sample event is handled in every reachable state. So
+//! the table shows the actual behaviour of the program.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
@@ -15,8 +15,8 @@ use super::event::{
 use super::plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 use super::state::{Device, JobStep, Phase, State};
 
-/// Version of the table. Only a program of the version that began a run can continue it. Any change of a reaction is a
-/// new version.
+/// Version of the transition table. A run can be continued only by a program with the version that began the run. Every
+/// change of a reaction requires a new version.
 pub const TABLE_VERSION: u32 = 12;
 
 /// Reaction to an event in a state.
@@ -56,7 +56,7 @@ impl Reaction {
     }
 }
 
-/// Returns the table, sorted by state and event.
+/// Returns the transition table of the cell: one row for each pair of state and event, sorted by both.
 pub fn transition_table() -> Vec<TransitionRow> {
     let mut answers: HashMap<State, Vec<Vec<LabelledAnswer>>> = HashMap::new();
     let mut open: VecDeque<Cell> =
@@ -98,7 +98,8 @@ pub fn transition_table() -> Vec<TransitionRow> {
         .collect()
 }
 
-/// Returns everything that decides the answer of a cell, without times and counts, and only as fine as the table needs.
+/// Returns a key of the state of a cell, without times and counts. Cells with equal keys react in the same way to the
+/// sample events, so [`transition_table`] continues from only one of them.
 fn behaviour_key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.machines.map(|known| (known.ready, known.was_connected && known.abort_confirmed));
     let clear = cell.machines.map(|known| (known.clear, known.clear_confirmed, known.clear_requested));

@@ -20,7 +20,7 @@ use State::{
     Suspending, Unholding, Unsuspending,
 };
 
-/// Minimum number of failures before the time limit `vain` counts them as failing again and again.
+/// Minimum number of failures in a series before the time limit `vain` of [`Deadlines`] can end the retries.
 const MIN_RECURRING_FAILURES: u32 = 3;
 
 // Basic operations, which the other blocks build on.
@@ -49,7 +49,8 @@ impl Cell {
         }
     }
 
-    /// Records the furthest place that the cell has reached. Resets the failures of a machine that got further.
+    /// Updates the furthest position that the cell has reached. If the position advances in the job of a machine,
+    /// resets the failure series of this machine.
     pub(super) fn update_furthest_position(&mut self) {
         let Some(phase) = self.state.phase() else { return };
         let place = (self.cycle, phase.position());
@@ -61,7 +62,8 @@ impl Cell {
         }
     }
 
-    /// Resets the failures of a machine that got further. Withdraws the alarm if no machine has a reported series left.
+    /// Resets the failure series of a machine that has made progress. Withdraws the alarm [`AlarmId::FailsAgain`] if no
+    /// reported series is left.
     fn reset_failures(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.failure_series[device as usize]).reported;
         if was_told && !self.failure_series.iter().any(|vain| vain.reported) {
@@ -115,7 +117,7 @@ impl Cell {
         }
     }
 
-    /// Returns the present state with another phase in it. A state that is neither holding nor suspending becomes
+    /// Returns the present state with `phase` as its phase. A state that is neither holding nor suspending becomes
     /// `Execute`.
     pub(super) fn state_with_phase(&self, phase: Phase) -> State {
         match self.state {
@@ -129,7 +131,7 @@ impl Cell {
         }
     }
 
-    /// Returns how long the present state may last without a sign of life. `None` means without a limit.
+    /// Returns the time limit of the present state; a progress report restarts it. `None` means no limit.
     fn state_time_limit(&self) -> Option<Duration> {
         let limits = &self.plan.deadlines;
         let job = self.state.phase().and_then(Phase::job).map(|(_, step)| step);
@@ -248,7 +250,8 @@ impl Cell {
         });
     }
 
-    /// Continues with the next phase. Stops before it if the cell is being held or suspended.
+    /// Continues with the next phase. If the cell is being held or suspended, it becomes held or suspended before this
+    /// phase.
     pub(super) fn advance(&mut self, next: Phase) {
         match self.state {
             Holding(_) | Held(_) => self.enter_state(Held(restart_phase(next))),
@@ -257,7 +260,8 @@ impl Cell {
         }
     }
 
-    /// Enters a phase. Checks at every entry, and not only on a change, that the surroundings allow it.
+    /// Enters a phase and issues its command. Checks first, at every entry: in manual mode no machine is prepared or
+    /// started, and while a cause of a suspension is active, only phases that need no machine are entered.
     fn enter_phase(&mut self, phase: Phase) {
         if matches!(phase.job(), Some((_, JobStep::Prepare | JobStep::Start))) && self.has_manual_machine() {
             self.raise_manual_mode();
@@ -311,8 +315,8 @@ impl Cell {
         self.advance(phase.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::from_job(job, JobStep::Prepare)));
     }
 
-    /// Handles a machine that cannot report whether it is clear of the part. A person's confirmation counts if the
-    /// machine was not started since. If there is none, the cell asks a person.
+    /// Handles a machine that cannot report whether it is clear of the part. An earlier confirmation of a person counts
+    /// if the machine was not started since then. Without such a confirmation, the cell asks a person.
     pub(super) fn on_clear_unknown(&mut self, phase: Phase, device: Device) {
         if self.machine(device).clear_confirmed {
             return self.on_cleared(phase, device);
@@ -342,8 +346,8 @@ impl Cell {
         device_awaited_clear(phase).is_some_and(|device| self.machine(device).clear_requested)
     }
 
-    /// Starts a machine if the interlock allows it: the other machine was seen clear since this job began, and no later
-    /// event contradicts that.
+    /// Starts a machine if the interlock allows it: since this job began, the other machine has been reported clear,
+    /// and no later event contradicts this.
     fn start_machine(&mut self, device: Device) {
         let other = device.other();
         if !self.machine(other).clear {
@@ -359,7 +363,7 @@ impl Cell {
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
 
-    /// Takes back the count of a pass after proof from the machine that it did not start.
+    /// Decrements the number of passes, after the grinder has proved that it did not start the pass.
     fn uncount_pass(&mut self, device: Device) {
         self.pass_count = self.pass_count.saturating_sub(u32::from(device == Device::Grinder));
     }
@@ -397,9 +401,9 @@ impl Cell {
         }
     }
 
-    /// Handles the declaration of a person that a job is over when the machine gives no information about it. The
-    /// machine may still have the job with its result, and would then refuse the next job. So the cell asks it to
-    /// discard the result: now if the machine is connected, otherwise later.
+    /// Handles the declaration of a person that a job is over, if the machine cannot report this. The machine may still
+    /// have the job with its result, and would then refuse the next job. So the cell asks the machine to discard the
+    /// result: at once if the machine is connected, otherwise later.
     pub(super) fn on_declared_over(&mut self, device: Device) {
         let discard = Phase::from_job(device, JobStep::Discard);
         self.acknowledge_refused[device as usize] = false;
@@ -411,7 +415,7 @@ impl Cell {
         }
     }
 
-    /// Handles the declaration of a person that a machine need not be asked again to discard its result.
+    /// Handles the declaration of a person that the cell need not ask a machine again to discard its result.
     pub(super) fn on_result_given_up(&mut self, phase: Phase) {
         self.withdraw(AlarmId::MachineRefused);
         self.acknowledge_refused = [false; 2];
@@ -612,8 +616,8 @@ impl Cell {
         }
     }
 
-    /// Holds while the cell is suspended. A machine that is out of sight may still be moving, so the state is not
-    /// `Held` yet.
+    /// Holds a suspended cell. If the state of a job is unknown, its machine may still be moving. The cell is then
+    /// holding, and not held yet.
     pub(super) fn hold_suspended(&mut self, phase: Phase) {
         let unseen = matches!(phase.job(), Some((_, JobStep::Reconcile)));
         self.enter_state(if unseen { Holding(phase) } else { Held(phase) });
@@ -663,7 +667,8 @@ impl Cell {
         self.raise(AlarmId::NotAutomatic, &format!("{} in manual mode", names.join(" and ")));
     }
 
-    /// Handles a machine that left automatic mode: no machine moves meanwhile, and no waiting job continues by itself.
+    /// Handles a machine that left automatic mode. If a machine runs a job, this job is held; a suspended job waits for
+    /// a person instead of resuming by itself.
     pub(super) fn on_manual_mode(&mut self, device: Device, message: &str) {
         self.machine_mut(device).manual = true;
         let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving_device()?))) else {
@@ -716,8 +721,8 @@ impl Cell {
         }
     }
 
-    /// Handles a machine that no longer shows the job at which it was seen. Asks the machine what became of the job,
-    /// and concludes nothing before the answer.
+    /// Handles a machine that no longer reports the job that it had reported before. The cell asks the machine for the
+    /// state of the job, and concludes nothing before the answer.
     pub(super) fn on_job_vanished(&mut self, device: Device, why: &str) {
         self.raise(AlarmId::JobVanished, &format!("{device}, {why}"));
         let asked = Phase::from_job(device, JobStep::Reconcile);
@@ -749,7 +754,7 @@ impl Cell {
                     Some(_) => "is not idle: end or clear its job at its panel",
                     None => "is not connected",
                 };
-                return Err(format!("the {device} {what}; the cell connects it again, then resume"));
+                return Err(format!("the {device} {what}; the cell connects it again; after that, resume once more"));
             }
         }
         Ok(())
@@ -827,8 +832,9 @@ impl Cell {
         }
     }
 
-    /// Handles a lost link. A phase that needs the link waits at a place from which it can restart. A job of the other
-    /// machine continues. A machine that was ordered to hold counts as held only after it confirms that it stands.
+    /// Handles a lost link. A phase that needs the link waits, in the state that `wait` returns, at a step from which
+    /// it can restart. A job of the other machine continues. A machine that was ordered to hold counts as held only
+    /// after it confirms that it is at rest.
     pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.set_link_lost(device, true);
         let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
@@ -860,8 +866,8 @@ impl Cell {
         }
     }
 
-    /// Handles a station of this program that has failed and can no longer talk to its machine. It does not recover by
-    /// itself, so a phase that needs it is held for a person.
+    /// Handles the failure of a station, the task of this program that communicates with a machine. The station does
+    /// not recover by itself, so a phase that needs it is held for a person.
     pub(super) fn on_station_failed(&mut self, device: Device, why: &str) {
         self.set_link_lost(device, true);
         let case = format!("{device}, {why}");
@@ -984,8 +990,8 @@ impl Cell {
         Ok(())
     }
 
-    /// Enters the running state. Holds or suspends the machine again if one is in manual mode or a condition is
-    /// missing.
+    /// Enters `Execute` with the running job `run`. Holds the job again if a machine is in manual mode, and suspends it
+    /// if a condition is missing.
     pub(super) fn enter_running(&mut self, run: Phase) {
         self.enter_state(Execute(run));
         // The time during which the machine was held is no measure of its pace.
@@ -1075,7 +1081,8 @@ impl Cell {
 
 // The ends, and time.
 impl Cell {
-    /// Ends in order: stops a machine that is at a job, or acknowledges its result. After that the run is over.
+    /// Ends the run in order: stops a machine that has a job, or acknowledges its result. `judged_out` is true if the
+    /// run ends because the part is not accepted.
     pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
         reason.clone_into(&mut self.ending_reason);
         self.not_accepted = judged_out;
@@ -1140,7 +1147,8 @@ impl Cell {
         self.verify_clear(device);
     }
 
-    /// Handles the last look at a machine at the end of a run. Raises an alarm if it is not clear of the part.
+    /// Handles the last clearance check of a machine at the end of a run. Raises an alarm if the machine is not clear
+    /// of the part.
     pub(super) fn on_final_clearance(&mut self, device: Device, clear: bool, message: &str) {
         if !clear {
             self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
@@ -1167,15 +1175,15 @@ impl Cell {
         self.push(Command::Finish(Ending::Accepted { cycle, reason }));
     }
 
-    /// Handles a deadline. An event that comes before the deadline is allowed and does nothing.
+    /// Handles a deadline. Does nothing if the deadline is not reached yet.
     pub(super) fn on_deadline(&mut self) {
         if !self.is_deadline_reached() {
             return;
         }
         match self.state {
             Starting => {
-                self.raise(AlarmId::Unreachable, "not both machines connected in time");
-                self.stop("not both machines connected in time", false);
+                self.raise(AlarmId::Unreachable, "at least one machine did not connect in time");
+                self.stop("at least one machine did not connect in time", false);
             }
             Held(_) | Execute(Load) => {
                 self.raise(AlarmId::WaitedTooLong, "");
@@ -1195,7 +1203,7 @@ impl Cell {
             }
             Aborting => self.on_abort_deadline(),
             Completing => {
-                self.raise(AlarmId::NotClear, "not both machines were confirmed clear in time");
+                self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear in time");
                 self.finish_complete();
             }
             Idle | Stopped | Aborted | Complete => {}
@@ -1247,7 +1255,7 @@ impl Cell {
     fn on_abort_deadline(&mut self) {
         let unconfirmed = self.unconfirmed_aborts();
         if unconfirmed.is_empty() {
-            self.raise(AlarmId::NotClear, "not both machines were confirmed clear in time");
+            self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear in time");
             return self.finish_aborted(true);
         }
         if self.abort_repeated {
@@ -1261,7 +1269,7 @@ impl Cell {
     }
 }
 
-/// Returns the phase from which to restart if the machine has not been started.
+/// Returns the phase from which to restart an interrupted phase. A job that does not run yet restarts at the step Send.
 pub(super) fn restart_phase(phase: Phase) -> Phase {
     match phase.job() {
         Some((device, JobStep::Clear | JobStep::Prepare | JobStep::Start)) => Phase::from_job(device, JobStep::Send),
@@ -1269,7 +1277,8 @@ pub(super) fn restart_phase(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the phase from which to restart after the machine was out of sight.
+/// Returns the phase from which to restart after a lost link or a restart of the program: the step Reconcile if a
+/// machine may be moving, otherwise that of [`restart_phase`].
 fn phase_after_link_loss(phase: Phase) -> Phase {
     match phase.moving_device() {
         Some(device) => Phase::from_job(device, JobStep::Reconcile),
@@ -1277,7 +1286,8 @@ fn phase_after_link_loss(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the machine that this phase waits to see clear of the part.
+/// Returns the machine that must be clear of the part before this phase can end; `None` if the phase waits for no
+/// machine.
 pub(super) fn device_awaited_clear(phase: Phase) -> Option<Device> {
     match phase.job() {
         Some((device, JobStep::Clear)) => Some(device.other()),
@@ -1286,12 +1296,12 @@ pub(super) fn device_awaited_clear(phase: Phase) -> Option<Device> {
     }
 }
 
-/// Returns the machine whose result this phase acknowledges or discards.
+/// Returns the machine whose result this phase acknowledges or discards; `None` for any other phase.
 pub(super) fn device_awaiting_acknowledge(phase: Phase) -> Option<Device> {
     phase.job().filter(|(_, step)| matches!(step, JobStep::Acknowledge | JobStep::Discard)).map(|(device, _)| device)
 }
 
-/// Returns true if a phase waits for the machine's answer to this request.
+/// Returns true if `phase` waits for the answer of a machine to the request `what`.
 pub(super) fn awaits_answer(phase: Phase, device: Device, what: MachineRequest) -> bool {
     let steps: &[JobStep] = match what {
         MachineRequest::Load => &[JobStep::Send],
@@ -1308,12 +1318,12 @@ pub(super) fn awaits_answer(phase: Phase, device: Device, what: MachineRequest) 
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
 }
 
-/// Returns the machine that is at a job, if there is one.
+/// Returns the machine that may be moving in the phase of a state; `None` if there is none.
 pub(super) fn running_device(state: State) -> Option<Device> {
     state.phase().and_then(Phase::moving_device)
 }
 
-/// Returns the machine whose job is being reconciled.
+/// Returns the machine whose job is being reconciled in a state; `None` if there is none.
 pub(super) fn reconciling_device(state: State) -> Option<Device> {
     match state {
         Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {

@@ -33,9 +33,9 @@ pub struct CellConfig {
     pub name: String,
     /// True if the machines are simulated. Every record is then marked SIMULATION.
     pub simulated: bool,
-    /// True in a rehearsal: people play the machines and no part exists. Records are then marked like those of
-    /// simulated machines, and the plan itself is accepted as a measurement. No key of the cell file sets this; the
-    /// caller that begins the run sets it.
+    /// True in a rehearsal: people act as the machines, and no part exists. Records are then marked like those of
+    /// simulated machines, and the plan itself is accepted as a measurement. The caller that begins the run sets this;
+    /// the cell file has no key for it.
     pub rehearsal: bool,
     /// True if a run needs a key that signs its record.
     pub require_signature: bool,
@@ -134,7 +134,7 @@ pub struct ReferenceSphere {
     pub centre: Point,
     /// Radius.
     pub radius_mm: f64,
-    /// Number of points that are taken on it.
+    /// Number of points that the probe touches on the sphere.
     pub points: u16,
 }
 
@@ -233,13 +233,13 @@ impl CellConfig {
         })
     }
 
-    /// Returns a problem with a key of this file that another module found, at the key's place in the text.
+    /// Returns a problem that another module found with the value of a key, with the position of the key in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
 
-    /// Returns notes on keys that have a new name, and about the wires on this computer: serial ports that do not exist
-    /// here. A note is not an error, because the file can be checked on a computer other than the cell's.
+    /// Returns notes for people: on keys that have a new name, and on wires, such as a serial port that does not exist
+    /// on this computer. A note is not an error, because the file can be checked on a computer other than the cell's.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = [self.renamed.clone(), self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
         notes.dedup();

@@ -118,7 +118,7 @@ impl PlantConfig {
         })
     }
 
-    /// Returns a problem with a key of this file that another module found, at the key's place in the text.
+    /// Returns a problem that another module found with the value of a key, with the position of the key in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, &[], key, [found, allowed, remedy])
     }

@@ -157,9 +157,9 @@ pub(super) struct RotaryTable {
     /// Maximum rate, in °/min.
     #[schemars(range(min = 0.01, max = 10000000.0), extend("x-required" = true), example = 3600.0)]
     pub max_rate_deg_min: Option<f64>,
-    /// Vector from the wheel's centre to the pivot with the head upright, in the model frame: programs then have the
-    /// positions of the slides. Default: the control keeps the wheel's centre by itself, and programs have its
-    /// positions.
+    /// Vector from the wheel's centre to the pivot with the head upright, in the model frame. With this key, programs
+    /// contain the positions of the slides. Default: the control keeps the wheel's centre in place, and programs
+    /// contain the positions of the wheel's centre.
     #[schemars(inner(range(min = -10000.0, max = 10000.0)), example = [0.0, 0.0, 180.0])]
     pub pivot_mm: Option<[f64; 3]>,
 }

@@ -13,7 +13,7 @@ use super::snapshot::Snapshot;
 #[expect(missing_docs, reason = "the fields are told above them")]
 #[serde(tag = "order", rename_all = "snake_case")]
 pub enum Request {
-    /// Order to move to the next safe place and wait.
+    /// Order to move to the next safe position and wait.
     Hold {
         #[serde(default)]
         reason: String,
@@ -50,7 +50,8 @@ pub enum Request {
         #[serde(default)]
         map: Option<String>,
     },
-    /// Confirmation that this machine has ended its job and is clear of the part. A measurement is given as a file.
+    /// Confirmation that the machine that a person operates has ended its job and is clear of the part. The result of a
+    /// measurement is given as a file.
     Done {
         /// Identity of the map that the machine used: its first 8 hexadecimal digits, or more.
         #[serde(default)]
@@ -58,13 +59,14 @@ pub enum Request {
         #[serde(default)]
         file: Option<PathBuf>,
     },
-    /// Confirmation of a person who checked a machine that was to hold or to stop: the machine is at rest. Without a
-    /// device, it is the machine of the current job.
+    /// Confirmation of a person who checked a machine that was ordered to hold or to stop: the machine is at rest. If
+    /// `device` is `None`, the machine is that of the current job.
     Still {
         #[serde(default)]
         device: Option<Device>,
     },
-    /// Remark for the record, from a program that acts for people: who took control, or what was refused.
+    /// Remark for the record from a program that gives orders for people, such as the server of the web page: who took
+    /// control, or what was refused.
     Remark { what: String },
     /// Request for the state of the cell once.
     Status,
@@ -78,7 +80,7 @@ pub struct Reply {
     /// True if the order was accepted. It is not a verdict on the part.
     #[serde(alias = "accepted")]
     pub taken: bool,
-    /// Reason of a refusal, or what follows, for the person who asked.
+    /// Reason of a refusal, or state of the cell after the order, for the person who gave the order.
     #[serde(rename = "words")]
     pub message: String,
     /// State of the cell after the request.
@@ -95,7 +97,7 @@ pub struct OnBehalf {
     pub station: String,
 }
 
-/// Line of text as it is sent over the socket.
+/// Request in the form of one JSON line on the socket, with the person for whom a program gives it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct RequestLine {
     #[serde(flatten)]
@@ -105,8 +107,8 @@ pub(super) struct RequestLine {
 }
 
 impl RequestLine {
-    /// Returns true if a text in the request displays differently from its characters. It would be on record in that
-    /// form for years.
+    /// Returns true if a text in the request contains characters that are invisible or change the reading direction.
+    /// Such a text would be misleading in the record.
     pub(super) fn has_misleading_text(&self) -> bool {
         let text = match &self.request {
             Request::Hold { reason }

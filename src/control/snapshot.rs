@@ -111,7 +111,7 @@ pub enum NextStep {
     ClearAlarm,
     /// Resume or stop.
     ResumeOrStop,
-    /// Check that a machine is at rest that has not confirmed it.
+    /// Check whether a machine is at rest, because it has not confirmed this.
     #[expect(missing_docs, reason = "named for what it is")]
     SeeWhetherItStands { device: Device },
     /// Keep away from both machines: they run their safe sequence.

@@ -20,10 +20,11 @@ use super::snapshot::Snapshot;
 
 /// Maximum length of a line from a client, in bytes.
 const MAX_LINE_BYTES: u64 = 4096;
-/// Timeout of a read or write. A client that sends nothing for this time is considered gone.
+/// Timeout of a read or write. A client that sends nothing for this time is considered disconnected.
 const IO_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Timeout of an order in the cell. The client then gets a reply that says so, while it still listens.
+/// Timeout of the cell's answer to an order. After this time the client gets a reply that there was no answer. It is
+/// shorter than [`IO_TIMEOUT`], so that the client still waits.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(8);
 /// Maximum number of clients that watch at the same time. Each keeps a file descriptor, and orders also need
 /// descriptors.
@@ -37,7 +38,7 @@ const MAX_LINE_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum silence after which a client that watches considers the cell gone.
 const SILENCE_TIMEOUT: Duration = Duration::from_millis(2500);
 
-/// Order on its way to the loop of the cell.
+/// Order that the loop of the cell receives.
 pub struct ReceivedOrder {
     /// The request.
     pub request: Request,
@@ -47,16 +48,16 @@ pub struct ReceivedOrder {
     pub answer: Option<oneshot::Sender<Reply>>,
 }
 
-/// Time between two checks that the door in the run folder still exists.
+/// Time between two checks that the endpoint in the run folder still exists.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Change of the door in the run folder.
+/// Change of the endpoint in the run folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum EndpointChange {
-    /// The door is missing or was replaced, so clients may not find the cell. Contains the reason if it could not be
-    /// made again; otherwise empty.
+    /// The endpoint is missing or was replaced, so clients may not find the cell. Contains the reason if it could not
+    /// be created again; otherwise empty.
     Lost(String),
-    /// The door was made again, or is back in its place.
+    /// The endpoint was created again, or is back at its path.
     Restored,
 }
 
@@ -68,7 +69,7 @@ struct ControlService {
     watcher_permits: Arc<Semaphore>,
 }
 
-/// Doors of a cell. Dropping this closes and removes them.
+/// Endpoints of a cell. They are closed and removed when this is dropped.
 pub struct Control {
     folder: PathBuf,
     second_place: Option<PathBuf>,
@@ -78,7 +79,7 @@ pub struct Control {
 }
 
 impl Control {
-    /// Listens in a run folder. If `watched`, reports a door that was removed or replaced, and makes it again.
+    /// Listens in a run folder. If `watched`, an endpoint that was removed or replaced is reported and created again.
     ///
     /// # Errors
     /// The folder cannot hold a socket, for example because its path is too long for the operating system; or another
@@ -102,10 +103,10 @@ impl Control {
         Ok(Self { folder: folder.to_owned(), second_place: None, service: desk, changes, tasks })
     }
 
-    /// Listens also at a second place, for the user of this program and root only.
+    /// Listens also at a second path, for the user of this program and root only. Does nothing on Windows.
     ///
     /// # Errors
-    /// No socket can be made at that place.
+    /// No socket can be created at that path.
     pub fn listen_also_at(&mut self, place: &Path) -> io::Result<()> {
         let Some(door) = Endpoint::open_for_user(place)? else { return Ok(()) };
         self.second_place = Some(place.to_owned());
@@ -114,7 +115,7 @@ impl Control {
         Ok(())
     }
 
-    /// Waits until the door in the run folder is lost or made again, and returns the change.
+    /// Waits until the endpoint in the run folder is lost or created again, and returns the change.
     pub async fn changed(&mut self) -> EndpointChange {
         match self.changes.recv().await {
             Some(change) => change,
@@ -134,7 +135,7 @@ impl Drop for Control {
     }
 }
 
-/// Accepts the clients of a door, and of the door that replaces it.
+/// Accepts the clients of an endpoint, and of each endpoint that replaces it (received from `made_again`).
 async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpoint>, desk: ControlService) {
     loop {
         let caller = tokio::select! {
@@ -156,8 +157,8 @@ async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpo
     }
 }
 
-/// Checks periodically that a door still exists, and makes it again if not. Disk access runs on a thread of its own: a
-/// disk that does not answer blocks no order.
+/// Checks periodically that an endpoint still exists, and creates it again if not. Disk access runs on a thread of its
+/// own, so a disk that does not answer blocks no order.
 async fn restore_if_removed(
     mut mark: endpoint::EndpointIdentity,
     tell: mpsc::UnboundedSender<EndpointChange>,
@@ -285,7 +286,7 @@ pub fn is_live(folder: &Path) -> bool {
     endpoint::is_listening(folder)
 }
 
-/// Returns true if a cell listens on a door outside a run folder.
+/// Returns true if a cell listens on an endpoint outside a run folder.
 pub fn is_live_at(place: &Path) -> bool {
     endpoint::is_listening_at(place)
 }
@@ -307,10 +308,10 @@ pub fn send_request_on_behalf(folder: &Path, request: &Request, by: Option<OnBeh
     Ok(serde_json::from_str(&text)?)
 }
 
-/// Sends a request to the cell of a door outside a run folder, and blocks until its reply.
+/// Sends a request to the cell of an endpoint outside a run folder, and blocks until its reply.
 ///
 /// # Errors
-/// No cell listens there, the door belongs to another user, or the cell does not answer.
+/// No cell listens at that path, the endpoint belongs to another user, or the cell does not answer.
 pub fn send_request_at(place: &Path, request: &Request) -> io::Result<Reply> {
     let text = endpoint::exchange_line_at(place, &encode_line(request, None)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)

@@ -35,7 +35,7 @@ pub(crate) struct CholeskyFactor<'a> {
 /// Entries of the inverse within the pattern of the factor.
 pub(crate) struct SelectedInverse<'a> {
     pattern: &'a SparsityPattern,
-    /// For each supernode, the square block and the block below it, stacked.
+    /// For each supernode, the square block on the diagonal and the block below it, stacked.
     blocks: Vec<Mat<f64>>,
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{Answer, Fault, Job, MachineCommand, MachineKind, MachineState};
 
-/// Answer of a machine, or the reason why there is no answer.
+/// Result of a request to a machine.
 pub(super) type DeviceResult<T> = Result<T, DeviceError>;
 
 /// Error of the communication with a machine, or refusal by the machine.
@@ -40,8 +40,8 @@ pub enum DeviceError {
     Disconnected { machine: Arc<str>, operation: &'static str },
     /// The received data are inconsistent: wrong length, echo, checksum or page.
     #[error(
-        "{machine} sent an inconsistent {data}: expected {expected:#x}, found {found:#x}; it was not used. If this \
-         repeats, check cable, shielding and terminating resistors, and that no second client is on the line"
+        "{machine} sent an inconsistent {data}: expected {expected:#x}, found {found:#x}; the data were not used. If \
+         this repeats, check cable, shielding and terminating resistors, and that no second client is on the line"
     )]
     Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
@@ -62,13 +62,13 @@ pub enum DeviceError {
     /// [`Machine::reconcile`](super::Machine::reconcile).
     #[error(
         "{machine}: it is unknown whether START number {sequence} began {job} ({cause}). START is not sent again; \
-         ask the machine, or check it"
+         check at the machine whether the job runs"
     )]
     StartUnknown { machine: Arc<str>, job: Job, sequence: u32, cause: Box<DeviceError> },
     /// The transfer was interrupted by its [`Interrupt`](super::Interrupt).
     #[error(
-        "{machine}: the transfer of the {payload} was interrupted on request after {done} of {total} pages; nothing \
-         of it is in force"
+        "{machine}: the transfer of the {payload} was interrupted on request after {done} of {total} pages; the \
+         machine uses none of it"
     )]
     Interrupted { machine: Arc<str>, payload: &'static str, done: u32, total: u32 },
     /// The driver was used before [`Machine::connect`](super::Machine::connect).
@@ -102,7 +102,7 @@ pub enum DeviceError {
 
     /// The machine sent a line that has no meaning, or that belongs to no request.
     #[error(
-        "{machine} sent a line that cannot be used ({reason}): {line:?}; it was not used, and the connection was \
+        "{machine} sent a line that cannot be used ({reason}): {line:?}; the line was not used, and the connection was \
          closed. If this repeats, compare the server's version of I++ DME with docs/ippdme.md"
     )]
     Unreadable { machine: Arc<str>, line: String, reason: &'static str },

@@ -29,8 +29,8 @@ pub trait Machine: Send {
     /// it twice a second or more.
     fn status(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Restores a start that an interrupted run had prepared and may have given. For machines that have no memory of
-    /// their own: until a person confirms the outcome, such a machine counts as one that may move.
+    /// Restores a start that an interrupted run had prepared and possibly sent. Implemented for machines without a
+    /// memory of jobs: such a machine counts as possibly moving until a person confirms the outcome.
     fn restore(&mut self, _intended: &Armed) {}
 
     /// Makes this client the owner of the machine.
@@ -50,7 +50,7 @@ pub trait Machine: Send {
     /// * Any other error occurs before the START is sent: if the `Armed` is used for the first time, nothing was begun.
     fn start(&mut self, armed: Armed) -> impl Future<Output = Result<Started, DeviceError>> + Send;
 
-    /// Stops at the next safe place, with the wheel or probe clear of the part.
+    /// Holds the job at the next safe position, with the wheel or probe clear of the part.
     fn hold(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
     /// Continues after a hold.

@@ -32,14 +32,15 @@ pub struct PlanTarget {
     pub normal: [f64; 3],
 }
 
-/// Measuring plan: the targets that a CMM probes, and the way it probes them.
+/// Measuring plan: the targets that a CMM probes, and the parameters of probing.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// Targets, in the order in which they are probed.
     pub targets: Vec<PlanTarget>,
     /// Radius of the probe for which the plan is made, in mm.
     pub probe_radius_mm: f64,
-    /// Distance from the point to the surface of the ball at which the probe turns into the normal, in mm.
+    /// Distance between the target point and the surface of the probe ball, in mm, from which the probe moves along the
+    /// normal.
     pub approach_mm: f64,
     /// Search distance beyond the point, in mm.
     pub search_mm: f64,
@@ -116,8 +117,8 @@ pub struct MeasuredPoint {
     pub status: TouchStatus,
     /// Quality from 0 (good) to 100 (bad).
     pub quality: u16,
-    /// Position in the frame of the CMM, in mm: centre of the probe or contact point, as the measurement says.
-    /// Meaningless unless touched.
+    /// Position in the frame of the CMM, in mm: centre of the probe or contact point, as [`Measurement::coordinates`]
+    /// states. Meaningless unless touched.
     pub position_mm: [f64; 3],
 }
 
@@ -170,7 +171,7 @@ pub struct PassRecord {
     pub removed_mm3: Option<f64>,
     /// Largest depth removed, in mm.
     pub max_depth_mm: Option<f64>,
-    /// Fraction of the path that cut nothing, from 0 to 1.
+    /// Fraction of the path on which the wheel removed no material, from 0 to 1.
     pub idle_share: Option<f64>,
     /// Mean spindle load; 1 is full load.
     pub spindle_load: Option<f64>,
@@ -191,7 +192,7 @@ pub struct PassRecord {
 }
 
 impl PassRecord {
-    /// Returns the record of a pass of which nobody measured anything.
+    /// Returns a pass record with only the outcome and the identities; every measured value is `None`.
     pub(super) fn unmeasured(outcome: super::Outcome, map_identity: [u8; 32], job: super::Job, done: u32) -> Self {
         Self {
             outcome,

@@ -59,9 +59,10 @@ impl ValueRange {
     }
 }
 
-/// Returns the temperature in °C and the progress `(done, total)`, each only if possible, and a signal for each
-/// impossible value. The status is reported all the same, because it also contains the state of the machine and the
-/// command that it acknowledged.
+/// Checks the temperature in °C and the progress `(done, total)` of a status against their ranges. Returns each of
+/// them, `None` if it is missing or outside its range, and a signal with value and range for each value outside its
+/// range. An impossible value does not make the whole status an error, because the status also contains the state of
+/// the machine and the command that it acknowledged.
 pub(super) fn plausible_status(
     temperature_c: Option<f64>,
     progress: (u32, u32),
@@ -79,7 +80,7 @@ pub(super) fn plausible_status(
     (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
-/// Rejects an impossible scale of counts, in mm per count.
+/// Returns an error if `scale_mm`, the length of one count in mm, is outside its range.
 pub(super) fn check_count_scale(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
     COUNT.refuse(machine, scale_mm)
 }

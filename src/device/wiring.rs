@@ -31,7 +31,7 @@ pub struct Timing {
     pub quarantine: Duration,
 }
 
-/// Data in addition to its wire from which a machine is made.
+/// Data from which a driver is created, in addition to the table `wire`.
 #[derive(Clone, Copy, Debug)]
 pub struct DriverContext<'a> {
     /// Name of the part in files and prompts.
@@ -62,7 +62,7 @@ pub struct DriverContext<'a> {
     pub expected_name: Option<&'a str>,
     /// Box that the centre of the probe must not leave: its minimum and maximum corner, in mm.
     pub volume_mm: Option<[[f64; 3]; 2]>,
-    /// Line of the other machine, which may also be the line of this one.
+    /// Line of the other machine, which this machine can share.
     pub shared_link: Option<&'a Link>,
 }
 

@@ -129,7 +129,7 @@ pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-/// Job that the machine has checked and would begin. It is the intent that is journaled before
+/// Job that the machine has checked, with the data of the START that would begin it. Write it to the journal before
 /// [`start`](super::Machine::start).
 ///
 /// After a restart it is rebuilt from the journal and passed to [`reconcile`](super::Machine::reconcile).
@@ -164,11 +164,11 @@ pub enum Reconciled {
     Running(Status),
     /// The start was accepted and the job has ended; `done` and `outcome` in the status show how.
     Finished(Status),
-    /// The start was provably not accepted: this was seen twice, a second apart. Prepare again.
+    /// The start was not accepted: two statuses, at least a second apart, show this. Prepare again.
     NotStarted(Status),
     /// The outcome cannot be determined from here. A person must look at the machine; nothing may be repeated.
     Unknown {
-        /// Contradiction, in words.
+        /// Reason why the outcome cannot be determined.
         reason: String,
     },
 }
@@ -216,9 +216,9 @@ pub enum MachineState {
     Prepared,
     /// A job runs.
     Execute,
-    /// The machine moves to a safe place.
+    /// The machine moves to a safe position.
     Holding,
-    /// The machine is at a safe place in the middle of a job.
+    /// The machine is at a safe position, and its job has not ended.
     Held,
     /// The machine ends the job in order.
     Stopping,
@@ -294,7 +294,8 @@ impl fmt::Display for Answer {
             Self::None => "no answer yet",
             Self::Accepted => "accepted",
             Self::NotOwner => {
-                "another client owns the machine, or has since this one started: end the other client, then claim again"
+                "another client owns the machine, or has owned it since this client started: end that client, then \
+                 claim again"
             }
             Self::WrongState => "the machine does not allow it in its present state",
             Self::UnknownCommand => "the machine does not know the command: compare its program with docs/modbus.md",
@@ -423,8 +424,8 @@ impl SignalValue {
     }
 }
 
-/// Status of a machine, all of one moment. `None` marks a value that the machine cannot report. No code fills it in; if
-/// the value is required, a person is asked.
+/// Status of a machine, all of one moment. `None` marks a value that the machine cannot report; no other value is put
+/// in its place. If the value is required, a person is asked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Status {
     /// State of the machine.

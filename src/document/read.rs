@@ -45,7 +45,7 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
     let read = open(path).and_then(|file| file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes));
-    read.map_err(|e| failed(format!("the file cannot be read: {e}"), "check the path and the rights"))?;
+    read.map_err(|e| failed(format!("the file cannot be read: {e}"), "check the path and the permissions"))?;
     if bytes.len() > MAX_BYTES {
         return Err(too_large(path));
     }
@@ -125,7 +125,7 @@ impl<'t> Document<'t> {
             let span = span_of_name(&self.places, &old_steps);
             if self.contains_key(new) {
                 let found = format!("is the old name of `{new}`, and the file has both");
-                self.push(span, (*old).to_owned(), found, "", "delete the old one");
+                self.push(span, (*old).to_owned(), found, "", "delete the old key");
                 take_value(&mut self.values, &names(&old_steps).collect::<Vec<_>>());
                 continue;
             }
@@ -237,7 +237,7 @@ pub fn problem_at(
     Problems { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
 }
 
-/// Returns the names of a key that has no index.
+/// Returns the names among the steps of a key, without indices.
 fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
     steps.iter().filter_map(|step| match step {
         Step::Key(name) => Some(name.as_str()),
@@ -245,7 +245,7 @@ fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
     })
 }
 
-/// Moves the place of a value, with the span of its name.
+/// Moves the position of a value in the text, and that of its name, from an old key to a new key.
 fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     let Some(taken) = take_place(root, &names(old).collect::<Vec<_>>()) else { return };
     let mut inside = root;
@@ -263,7 +263,8 @@ fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     }
 }
 
-/// Removes a value, and the tables that become empty by that. Returns the span of its name, and the value.
+/// Removes a value, and the tables that become empty by that. Returns the span of its name, and the value; `None` if
+/// the key does not exist.
 fn take_place<'t>(table: &mut DeTable<'t>, names: &[&str]) -> Option<(Range<usize>, Spanned<DeValue<'t>>)> {
     let (first, rest) = names.split_first()?;
     if rest.is_empty() {
@@ -292,7 +293,7 @@ fn take_value(table: &mut toml::Table, names: &[&str]) -> Option<toml::Value> {
     taken
 }
 
-/// Moves a value.
+/// Moves a value from an old key to a new key. Does nothing if the old key does not exist.
 fn move_value(root: &mut toml::Table, old: &[Step], new: &[Step]) {
     let Some(value) = take_value(root, &names(old).collect::<Vec<_>>()) else { return };
     let new: Vec<&str> = names(new).collect();
@@ -382,7 +383,7 @@ fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
         .map_or_else(|| span_of(root, steps), |(key, _)| key.span())
 }
 
-/// Walk through values and their schema together.
+/// Check of values against their schema. `path` leads to the value that is being checked.
 struct Shape<'d, 't> {
     document: &'d mut Document<'t>,
     root: &'d Schema,
@@ -390,7 +391,7 @@ struct Shape<'d, 't> {
 }
 
 impl Shape<'_, '_> {
-    /// Reports values that do not fit the schema. Returns true if the value itself can stay.
+    /// Reports values that do not fit the schema. Returns false if `value` itself does not fit and must be removed.
     fn fits(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
         if let Some(words) = choices(schema) {
             return self.is_one_of(&words, value);
@@ -653,7 +654,7 @@ fn limits(schema: &Schema) -> [f64; 2] {
     [limit("minimum").unwrap_or(f64::NEG_INFINITY), limit("maximum").unwrap_or(f64::INFINITY)]
 }
 
-/// Returns the word that was probably meant.
+/// Returns the word that is most similar to `found`; `None` if no word is similar enough.
 fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w str> {
     let found: String = found.chars().take(64).collect::<String>().to_lowercase().replace('-', "_");
     let likeness = |word: &str| strsim::normalized_damerau_levenshtein(&found, &word.replace('-', "_"));
@@ -664,7 +665,7 @@ fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w 
         .map(|(_, word)| word)
 }
 
-/// Returns the table in which a key is known.
+/// Returns the name of a table that has a key, for a message; `None` if no table has it.
 fn home_of(schema: &Schema, key: &str, path: &mut Vec<String>) -> Option<String> {
     let variants = schema.get("oneOf").and_then(Schema::as_array).into_iter().flatten();
     for schema in std::iter::once(schema).chain(variants) {
@@ -688,7 +689,7 @@ fn in_words(words: &[&str]) -> String {
     words.iter().map(|word| format!("\"{word}\"")).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the unit at the end of a key.
+/// Returns the unit that the end of a key states; `None` if it states no unit.
 fn unit_of(key: &str) -> Option<&'static str> {
     const UNITS: [(&str, &str); 8] = [
         ("_mm_min", "mm/min"),

@@ -5,7 +5,7 @@ use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema};
 use serde_json::Value;
 
-/// Returns the schema of a file.
+/// Returns the JSON schema of a kind of file, which is deserialized into `File`.
 ///
 /// An optional key is an `Option`. TOML has no null, so null is removed from its types. A required key is optional for
 /// the deserializer too, so that its absence is reported with the other problems: its default is NaN, which JSON cannot
@@ -73,7 +73,7 @@ fn without_null(schema: &mut Schema) {
     }
 }
 
-/// Returns the allowed words if a schema is a choice among words.
+/// Returns the allowed words if a schema is a choice among words; `None` for any other schema.
 pub fn choices(schema: &Value) -> Option<Vec<&str>> {
     if let Some(values) = schema.get("enum").and_then(Value::as_array) {
         return values.iter().map(Value::as_str).collect();

@@ -2,12 +2,13 @@
 
 use std::fmt::Write;
 
-/// Maximum number of digits before the decimal point, or of zeros after it, that a person still counts.
+/// Maximum number of digits before the decimal point (`MAX_DIGITS`), and of zeros after it (`MAX_ZEROS`), that a person
+/// can count.
 const MAX_DIGITS: usize = 15;
 const MAX_ZEROS: usize = 9;
 
 /// Returns the first character that is invisible or that changes how the rest of the text is displayed: control
-/// characters, direction marks, and characters of zero width.
+/// characters, direction marks, and characters of zero width. Returns `None` if there is no such character.
 pub fn misleading(text: &str) -> Option<char> {
     text.chars().find(|c| is_misleading(*c))
 }

@@ -22,8 +22,8 @@ pub(super) struct TouchEvaluation {
     pub(super) next: Option<(Vec<usize>, &'static str)>,
 }
 
-/// Evaluates the touches so far. After the first batch, which the gates check, asks for enough further targets that an
-/// evaluation can decide.
+/// Evaluates the touches so far. The first batch is too small for an evaluation and is only checked by the gates. After
+/// it, the next targets are those that the first evaluation requires.
 pub(super) fn evaluate_touches(
     task: &Task,
     adaptive: &AdaptiveOptions,
@@ -63,11 +63,12 @@ pub(super) fn evaluate_touches(
     }
 }
 
-/// Returns the outliers and a few targets around each, to be touched again, with control points. Returns `None` if the
-/// machine has no plan of this program, if there are no outliers, or if they are too many to be bad touches.
+/// Returns the targets for a repetition of touches: the outliers, a few targets around each, and control points.
+/// Returns `None` if the machine has no plan of this program, if there are no outliers or too many to be bad touches,
+/// or if no further batch is possible.
 ///
-/// The targets around lie on the way to the nearest other touched points: if the probe can touch two points, it can
-/// also reach the places between them. The control points are good touches as far apart as possible.
+/// The targets around an outlier lie on the lines to its nearest other touched points: if the probe can touch two
+/// points, it can also reach the places between them. The control points are good touches as far apart as possible.
 pub(super) fn plan_repeated_touches(
     task: &Task,
     found: &Registration,
@@ -81,7 +82,7 @@ pub(super) fn plan_repeated_touches(
     /// Change of a control point that is always allowed: the repeatability of a very good machine.
     const MIN_CHANGE_MM: f64 = 5e-5;
     const TARGETS_AROUND: usize = 4;
-    /// Share of the way to the neighbour.
+    /// Distance of a target from the outlier, as a share of the distance to the neighbour.
     const NEIGHBOUR_SHARE: f64 = 0.4;
     /// Cosine of the angle between two directions, above which a neighbour is in the same direction as another one.
     const SAME_DIRECTION_COSINE: f64 = 0.7;
@@ -155,7 +156,7 @@ fn reason_message(why: Reason) -> &'static str {
     }
 }
 
-/// Interpolates the form on the grid of the error map.
+/// Interpolates the form on the grid of the error map. Returns `None` if no map can be computed from it.
 pub(super) fn interpolate_form(task: &Task, form: &Form) -> Option<ErrorMap> {
     let of = |p: &model::FormPoint| {
         (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm)

@@ -14,7 +14,7 @@ use tokio::task::{AbortHandle, JoinSet};
 pub enum BlockingWork {
     /// Registration, correction, or files that are written and read.
     Computation,
-    /// Record on its way to the disk.
+    /// Write of a record to the disk.
     Record,
 }
 
@@ -24,7 +24,8 @@ pub enum BlockingExecutor {
     /// Threads of the computer.
     #[default]
     Threads,
-    /// In turn with everything else, each after the duration that this function returns for it.
+    /// Simulated time: each piece of work runs in turn with all other tasks, after the duration that this function
+    /// returns for it.
     SimulatedTime(Arc<dyn Fn(BlockingWork) -> Duration + Send + Sync>),
 }
 

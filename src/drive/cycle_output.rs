@@ -72,8 +72,9 @@ fn removed_components(task: &Task) -> RemovedParts {
     RemovedParts { motion, filter: format!("waves below {} mm ({smoothing})", task.map_options.cutoff_mm) }
 }
 
-/// Separates the part of the deviations that parameters of the machine explain: radius and setting of the wheel, tilt
-/// of the part, wear. An offered parameter is better corrected in the machine than ground with every map.
+/// Estimates the parameters of the machine that explain a part of the deviations: radius and setting of the wheel, tilt
+/// of the part, wear. Writes the estimates to a file. Returns `None` if they cannot be estimated; the file then gives
+/// the reason.
 pub(super) fn save_parameters(
     task: &Task,
     files: &mut OutputFiles,
@@ -91,7 +92,7 @@ pub(super) fn save_parameters(
     }
 }
 
-/// Returns the points used in a registration, as the separation of parameters needs them.
+/// Returns the points used in a registration, with normals and deviations, for the estimate of machine parameters.
 pub(super) fn surface_points(found: &Registration) -> Vec<SurfacePoint> {
     let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
     used_deviations(found).map(contact).collect()
@@ -113,7 +114,8 @@ fn parameter_document(task: &Task, told: &ParameterEstimation) -> Value {
     })
 }
 
-/// Returns the parameter corrections of the next pass: those of this pass plus those now compensated.
+/// Returns the parameter corrections of the next pass: those of this pass plus those now compensated. Returns `None` if
+/// the recipe compensates no parameter, or if all corrections are 0.
 pub(super) fn next_parameter_corrections(
     task: &Task,
     cycle: &CycleState,
@@ -135,8 +137,8 @@ pub(super) fn next_parameter_corrections(
     )
 }
 
-/// Returns a function that extracts, from values at the nodes of the correction, the part that parameters and slides
-/// explain. Returns `None` if no parameter is compensated.
+/// Returns a function that computes, from values at the nodes of the correction, the part that parameters of the
+/// machine explain ([`compensation::explained_by_parameters`]). Returns `None` if no parameter is compensated.
 pub(super) fn parameter_explainer<'t>(
     task: &'t Task,
     cycle: &'t CycleState,

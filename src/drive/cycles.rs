@@ -1,4 +1,4 @@
-//! Knowledge about the cycles of a run, and the inputs of each next step.
+//! State of all cycles of a run, and the inputs of each next step.
 //!
 //! The loop and the replay of a record both use it, so a run that continues has the same state as before.
 
@@ -51,7 +51,7 @@ impl Cycles {
         cycle.plan.insert(Arc::new(plan)).clone()
     }
 
-    /// Returns the batch of touches to which the plan of a cycle belongs.
+    /// Returns the number of the batch of touches to which the plan of a cycle belongs; 0 for the first batch.
     pub(super) fn batch(&self, number: u32) -> u32 {
         self.get(number).map_or(0, |cycle| cycle.batch)
     }
@@ -67,8 +67,8 @@ impl Cycles {
         [tried.sum(), measured.count() * task.targets.len()]
     }
 
-    /// Returns the last measurement of an earlier pass that was judged. A measurement that a gate refused, or that
-    /// repeats one after the same pass, does not count.
+    /// Returns the last judged measurement of an earlier pass than that of cycle `number`; `None` if there is none. A
+    /// measurement that a gate refused, or that repeats one after the same pass, does not count.
     pub(super) fn previous_judged(&self, number: u32) -> Option<&CycleState> {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&CycleState| c.is_judged() && c.learning.is_some() && c.correction.cycle < pass;
@@ -89,20 +89,21 @@ impl Cycles {
         }
     }
 
-    /// Counts a judgement of a cycle. Returns how many it has had.
+    /// Counts a judgement of a cycle. Returns the number of judgements of this cycle so far.
     pub(super) fn count_judgement(&mut self, number: u32) -> u32 {
         let Some(cycle) = self.0.get_mut(&number) else { return 1 };
         cycle.judgement_count += 1;
         cycle.judgement_count
     }
 
-    /// Returns the last cycle with information about the grinder.
+    /// Returns the last judged cycle with a state of the learning; `None` if there is none.
     pub(super) fn last_with_learning(&self) -> Option<&CycleState> {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.learning.is_some())
     }
 
-    /// Returns the priors from earlier parts for the fields of errors, updated with the last judged pass of each kind
-    /// in this run. Priors from other cells are not included: they would come back to them as those of this cell.
+    /// Returns the priors for the error fields of later parts: those from earlier parts, updated with the last judged
+    /// pass of each kind in this run. Priors from other cells are not included: otherwise these cells would get their
+    /// own results back as results of this cell.
     pub(super) fn part_priors(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();

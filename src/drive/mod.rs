@@ -81,7 +81,7 @@ pub struct RunInputs {
     pub task: Task,
     /// Journal of the run: a new one, or an open one of an interrupted run.
     pub journal: Box<dyn JournalSink>,
-    /// Number of the part's run, for the machines.
+    /// Number of the run, which the machines get with each job.
     pub job: u32,
     /// Person who began the run.
     pub actor: Actor,
@@ -98,7 +98,7 @@ pub struct RunInputs {
     pub executor: BlockingExecutor,
 }
 
-/// Channel for orders from this process itself: Ctrl-C, a prompt.
+/// Channel for orders that come from this process: by Ctrl-C or at a prompt.
 #[derive(Clone)]
 pub struct OrderSender {
     orders: mpsc::Sender<ReceivedOrder>,
@@ -124,7 +124,8 @@ impl OrderSender {
         self.status.clone()
     }
 
-    /// Returns true if the cell is in Execute: neither held nor suspended, and not on the way there or back.
+    /// Returns true if the cell is in the state Execute. It is then neither held nor suspended, and in no transition to
+    /// or from these states.
     pub fn is_executing(&self) -> bool {
         self.status.borrow().state == StateName::Execute
     }
@@ -146,7 +147,8 @@ pub struct Drive {
     elapsed_before: Duration,
     requests: [mpsc::Sender<StationRequest>; 2],
     interrupts: [Interrupt; 2],
-    /// Counters of the aborts for each station, which then gives up its present work.
+    /// Number of aborts ordered for each station. When the number increases, the station cancels the request in
+    /// progress.
     abort_counts: [watch::Sender<u64>; 2],
     watchdog: LoopWatchdog,
     reports: mpsc::Receiver<StationReport>,
@@ -174,11 +176,11 @@ pub struct Drive {
     open_commands: Vec<(u64, Command)>,
     /// Entries that wait to be recorded, in order.
     backlog: VecDeque<PendingRecord>,
-    /// Reason why nothing is recorded at present.
+    /// Reason why nothing can be recorded at present; `None` if records are written.
     record_failure_reason: Option<String>,
-    /// Judgement that the program did not write before it ended.
+    /// Judgement that the interrupted program did not write to a file, and its number within its cycle.
     unannounced_judgement: Option<(u32, Judgement)>,
-    /// Files that the program did not record before it ended.
+    /// Files that the interrupted program did not record.
     unrecorded_files: Vec<String>,
     ending: Option<Ending>,
     station_tasks: Vec<tokio::task::JoinHandle<()>>,
@@ -191,7 +193,7 @@ enum Computation {
     Gate,
     Registration,
     Compensation,
-    /// Registration on which the cell decides, if touches are chosen.
+    /// Registration after the last batch of an adaptive measurement, on which the cell decides.
     FinalRegistration,
 }
 
@@ -217,8 +219,8 @@ impl Computation {
     }
 }
 
-/// Returns the folder of a cycle, below that of the run. Recorded files are never overwritten: another attempt has a
-/// folder of its own.
+/// Returns the path of the folder of a cycle, relative to the run folder. Each further attempt has its own subfolder,
+/// so that recorded files are never overwritten.
 fn cycle_folder(cycle: u32, attempt: u32) -> String {
     match attempt {
         0 | 1 => format!("cycle-{cycle}"),
@@ -226,7 +228,7 @@ fn cycle_folder(cycle: u32, attempt: u32) -> String {
     }
 }
 
-/// Returns the folder of the results after a batch of touches, if touches are chosen.
+/// Returns the path of the folder for the results after a batch of an adaptive measurement, relative to the run folder.
 fn batch_folder(cycle: u32, batch: u32) -> String {
     format!("cycle-{cycle}/batch-{batch}")
 }
@@ -263,7 +265,7 @@ struct ComputationResult {
     /// `None` if no event follows.
     event: Option<Event>,
     product: ComputationProduct,
-    /// Files that it made, written to the disk and read back.
+    /// Files that the computation created, written to the disk and read back.
     files: Result<Vec<Artefact>, RecordFailure>,
 }
 
@@ -355,10 +357,10 @@ impl Drive {
         Ok((drive, OrderSender { orders, status: seen }))
     }
 
-    /// Listens for orders also at another place, so that the cell can be found if its run folder is gone.
+    /// Listens for orders also at a second path, so that clients can reach the cell even if its run folder is gone.
     ///
     /// # Errors
-    /// A place where no socket can be created.
+    /// Returns an error if no socket can be created at that path.
     pub fn listen_also_at(&mut self, place: &Path) -> std::io::Result<()> {
         self.control.listen_also_at(place)
     }
@@ -415,7 +417,8 @@ impl Drive {
         self.end_run().await
     }
 
-    /// Reports a computation that panicked for what it is: a fault of this program, and no fact about the part.
+    /// Reports a computation that panicked to the cell as a failed computation. The reason names a fault of this
+    /// program, so nothing is concluded about the part.
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
         let why = format!("the computation failed by a fault of the program; report it: {}", panic_message(error));
@@ -466,7 +469,7 @@ impl Drive {
     /// Reports that a START was not sent: the state of the cell changed while the START waited to be recorded.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "not sent: it was not recorded, or the cell was held first".to_owned();
+            let why = "it was not sent: it could not be recorded, or the cell was held first".to_owned();
             self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
         }
     }
@@ -516,8 +519,8 @@ impl Drive {
         }
     }
 
-    /// Answers waiting orders while nothing can be recorded, so that no one is kept waiting. The answer says what was
-    /// done and what was not.
+    /// Answers waiting orders while nothing can be recorded, so that no client waits for long. The answer says which
+    /// steps were carried out, and why the order is not recorded.
     fn answer_unrecorded_orders(&mut self) {
         let Some(why) = &self.record_failure_reason else { return };
         let status = self.snapshot();
@@ -534,7 +537,7 @@ impl Drive {
         }
     }
 
-    /// Writes the end of the run and gives the machines back.
+    /// Writes the end of the run and releases the machines.
     async fn end_run(mut self) -> Ending {
         let ending = self.ending.take().expect("the loop ended with one");
         self.orders.close();
@@ -605,7 +608,7 @@ impl Drive {
         }
     }
 
-    /// Records a remark of a program that acts for people.
+    /// Records the text of a [`Request::Remark`], and answers the program that sent it.
     fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let origin = (actor.name.clone(), actor.station.clone());
         let payload = json!({ "remark": what });
@@ -617,7 +620,7 @@ impl Drive {
         }
     }
 
-    /// Handles a person's confirmation about a machine that cannot report it itself.
+    /// Handles the confirmation of a person about a machine that cannot report its own state.
     fn handle_confirmation(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let asked = self.operator_confirmation(request).map(|(device, confirmed, word)| {
             let mut payload = serde_json::to_value(request).unwrap_or_default();
@@ -670,7 +673,8 @@ impl Drive {
         })
     }
 
-    /// Returns the full identity of the map of this cycle, if the digits are its beginning.
+    /// Returns the full identity of the map of this cycle. Returns an error if `digits`, at least 8 hexadecimal ones,
+    /// are not its beginning, or if no pass is in progress.
     fn map_identity(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
@@ -679,7 +683,7 @@ impl Drive {
         let identity = self.task.payloads(&cycle.correction).0.identity();
         let whole = hex(&identity);
         if digits.len() < 8 {
-            return Err("give at least the first 8 digits of the map; they are in correction.json".into());
+            return Err("give at least the first 8 digits of the identity of the map in correction.json".into());
         }
         if !whole.starts_with(&digits) {
             let (given, handed) = (digits.get(..8).unwrap_or(&digits), &whole[..8]);
@@ -782,7 +786,7 @@ impl Drive {
         }
     }
 
-    /// Records files.
+    /// Records files of a cycle, or reports why they could not be written.
     async fn record_files(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
         match files {
             Ok(files) if files.is_empty() => {}
@@ -970,7 +974,8 @@ impl Drive {
         self.write_document(format!("{}/result.json", cycle_folder(number, which)), number, &result).await;
     }
 
-    /// Stores the initial state for the next part of this kind, if the run reached its end.
+    /// Writes what this run has learned, as the initial state for the next part of this kind. Does nothing if the run
+    /// was stopped or aborted.
     async fn save_learned(&mut self, ending: &Ending) {
         if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
             return;
@@ -1004,8 +1009,8 @@ impl Drive {
         }
     }
 
-    /// Checks that the disk has room for the files of this cycle. If it has not, the cell is held before anything
-    /// moves; the machine may get its payload meanwhile.
+    /// Checks that the disk has space for the files of this cycle. If not, the cell is held before a machine moves; the
+    /// payload may be sent to the machine meanwhile.
     fn check_disk_space(&mut self, cycle: u32) {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
         self.executor.spawn_computation(&mut self.computations, move || {
@@ -1092,7 +1097,7 @@ impl Drive {
         self.running_computations.insert(computing.id(), (cycle, kind));
     }
 
-    /// Sends an event to the cell through the queue of computations, like every other event.
+    /// Sends an event to the cell through the queue of the computations, as if it were the result of a computation.
     fn queue_event(&mut self, cycle: u32, event: Event) {
         let computed = ComputationResult {
             cycle,

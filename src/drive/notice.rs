@@ -1,4 +1,4 @@
-//! Display of a run while it runs.
+//! Notices that a run sends for display while it is in progress.
 
 use regrind_control::CycleRow;
 use serde::Serialize;
@@ -39,7 +39,7 @@ pub enum Notice {
         #[serde(skip_serializing_if = "Option::is_none")]
         left_s: Option<[f64; 2]>,
     },
-    /// The points of a measurement were transferred, in this time.
+    /// The points of a measurement were transferred in `seconds`.
     Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
     /// A measurement is registered.
     Figures { cycle: u32, figures: Figures },
@@ -62,8 +62,8 @@ pub enum Notice {
     Finished {
         ending: Ending,
         cycles: Vec<CycleRow>,
-        /// Touches of the part, and the number that the whole pattern would have needed. `None` if the touches were not
-        /// chosen.
+        /// Number of touches of the part, and number of touches of the whole pattern in all measurements. `None` if the
+        /// measurement is not adaptive.
         touches: Option<[usize; 2]>,
     },
 }

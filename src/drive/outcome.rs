@@ -58,7 +58,8 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
     }
 }
 
-/// Returns the request and the machine of a command, as a refusal names them.
+/// Returns the machine and the request of a command, as a refusal names them; `None` for a command that a machine
+/// cannot refuse.
 fn machine_request(command: &Command) -> Option<(Device, MachineRequest)> {
     Some(match command {
         Command::LoadPass { .. } => (Device::Grinder, MachineRequest::Load),

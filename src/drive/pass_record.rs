@@ -9,14 +9,14 @@ use crate::geometry::Aperture;
 /// Maximum relative difference of the wheel radius from the recipe. A larger one means another wheel; wear and dressing
 /// stay below it.
 const MAX_WHEEL_RADIUS_DIFFERENCE: f64 = 0.01;
-/// Minimum share of the tracks over the part that a pass travels. If the part has no outline, the tracks over its
-/// rectangle count, of which corners and holes may be left out.
+/// Minimum path of a pass, as a share of the length of the tracks over the part. If the part has no outline, the tracks
+/// over its bounding rectangle count, and the share is smaller because the part may have no corners and may have holes.
 const MIN_PATH_SHARE: f64 = 0.5;
 const MIN_RECTANGLE_PATH_SHARE: f64 = 0.25;
-/// Maximum path as a multiple of the tracks, for each time that the pass goes over the part: includes moves in the air
-/// and over the edges.
+/// Maximum path of a pass, as a multiple of the length of its tracks, for each time that the wheel goes over the part.
+/// It includes moves in the air and beyond the edges.
 const MAX_PATH_FACTOR: f64 = 20.0;
-/// Maximum ratio of a surface that the wheel can follow to its rectangle.
+/// Maximum ratio of the area of a surface that the wheel can follow to the area of its bounding rectangle.
 const MAX_SURFACE_FACTOR: f64 = 2.0;
 /// Maximum removal beyond the planned one: allows for noise and for rounding of the measurement.
 const MAX_DEPTH_FACTOR: f64 = 1.05;
@@ -33,7 +33,8 @@ pub(super) struct CommandedPass<'t> {
     pub(super) outline: Option<&'t Aperture>,
 }
 
-/// Returns the first implausible figure of a record, with its limit. A figure that was not reported is not checked.
+/// Returns the first implausible figure of a record, with its limit; `None` if there is none. `told` is the commanded
+/// pass. A figure that was not reported is not checked.
 pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> Option<String> {
     let CommandedPass { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {

@@ -37,7 +37,8 @@ use super::task::{
     deviation_samples, used_deviations,
 };
 
-/// Checks if the measurement of a cycle can be used, and writes its points.
+/// Checks if the measurement of a cycle can be used, and writes its points. `earlier` is the last measurement before
+/// it, with the number of its cycle.
 pub(super) fn gate_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -95,11 +96,11 @@ pub(super) fn gate_cycle(
 /// Replaces the touches that were repeated and adds those around them. Returns the points and the number of touches
 /// found.
 ///
-/// A miss leaves the old touch in place: only a touch replaces a touch. The control points keep their first touches.
+/// If a repeated touch misses the part, the first touch stays. The control points keep their first touches.
 ///
 /// # Errors
-/// Other coordinates than those of the first touches, or control points that have moved: the two sets of touches are
-/// not of one measurement.
+/// Returns a failure if the kind of coordinates differs from that of the first touches, if points are missing, or if
+/// control points have moved. The two sets of touches are then not of one measurement.
 fn merge_repeated_touches(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -135,7 +136,8 @@ fn merge_repeated_touches(
 /// One control point may be a wrong touch, so the second largest change decides.
 ///
 /// # Errors
-/// A change that the noise of the probe does not explain, or fewer than two control points that were touched.
+/// Returns a failure if the change exceeds what the noise of the probe explains, or if fewer than two control points
+/// were touched.
 fn check_control_points(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -164,8 +166,8 @@ fn check_control_points(
     }
 }
 
-/// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
-/// the points that the operator took.
+/// Returns the touched points of the part and of the reference sphere. If the machine has no plan of this program, all
+/// touched points are of the part.
 fn touched_points(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
     let taken = measurement.points.iter().filter(|p| p.status == TouchStatus::Touched).map(|p| p.position_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
@@ -215,15 +217,15 @@ fn gate_points(
     })
 }
 
-/// Returns the standard deviation of the probe's noise from the residuals on a sphere, and its relative uncertainty.
-/// The fit uses four degrees of freedom.
+/// Returns the standard deviation of the probe's noise in mm, from the residuals on a sphere, and the relative
+/// uncertainty of this deviation. The fit uses four degrees of freedom.
 fn probe_noise(rms_mm: f64, points: usize) -> [f64; 2] {
     const FITTED: f64 = 4.0;
     let free = (points as f64 - FITTED).max(1.0);
     [rms_mm * (points as f64 / free).sqrt(), 1.0 / (2.0 * free).sqrt()]
 }
 
-/// Targets that were tried and targets that were found, if they are chosen batch by batch.
+/// Targets of an adaptive measurement that were tried, and those that were found.
 #[derive(Default, Serialize, Deserialize)]
 pub(super) struct TouchRecord {
     simulation: bool,
@@ -263,7 +265,7 @@ pub(super) fn gate_recorded_points(
 /// Maximum relative difference of a qualified probe's radius from the stated one. A larger one means another stylus.
 const MAX_PROBE_RADIUS_DIFFERENCE: f64 = 0.01;
 
-/// Returns why a result is foreign or broken: another plan, or values that are impossible.
+/// Returns why a result belongs to another plan or has impossible values; `None` if neither is the case.
 fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
         return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
@@ -302,10 +304,12 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
     }
 }
 
-/// Minimum number of touches for the comparison: fewer may be equal by chance, if a machine reports coarse steps.
+/// Minimum number of touches for a comparison of two results. Fewer touches can be equal by chance, if a machine
+/// reports coarse steps.
 const MIN_COMPARED_TOUCHES: usize = 8;
 
-/// Returns a failure if a machine has given its earlier result again. No probe repeats every place to the last bit.
+/// Returns a failure if a machine has returned its earlier result again. Two real measurements never agree in every
+/// bit.
 fn repeated_result_failure(
     task: &Task,
     earlier: Option<&(u32, Arc<UsablePoints>)>,
@@ -340,7 +344,8 @@ fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFai
 }
 
 /// Fits the probe radius on the reference sphere. Returns the radius, its standard uncertainty and the rms residual of
-/// the points. Detects contact points and inches in place of centres in millimetres.
+/// the points; `None` if the sphere is not measured. Detects contact points and inches in place of centres in
+/// millimetres.
 fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.reference_sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
@@ -467,7 +472,7 @@ fn register_and_evaluate(
         figures.warnings.push(message.to_owned());
     }
     let untold =
-        |error: &String| format!("form and noise of the probe could not be separated, so U is too small: {error}");
+        |error: &String| format!("form and noise cannot be separated, so the stated uncertainty is too small: {error}");
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }
@@ -517,8 +522,8 @@ fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<I
     told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
 }
 
-/// Returns the prior for the error field of a cycle: from earlier parts for passes of its kind, or else from the
-/// previous pass of this run if it is of the same kind.
+/// Returns the prior for the error field of a cycle: from passes of the same kind on earlier parts, otherwise from the
+/// previous pass of this run if it is of the same kind. Returns `None` if there is neither.
 fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> Option<Prior> {
     let is_corrected = !cycle.correction.is_zero();
     let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
@@ -657,8 +662,9 @@ fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFi
     RecordedFormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
 }
 
-/// Returns the root mean square without the noise s of n points, of which the registration used p degrees of freedom:
-/// F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
+/// Returns the interval of F, the root mean square of the form without noise. With the standard deviation s of the
+/// noise of n points, and p degrees of freedom used by the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty
+/// is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
 fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> RecordedInterval {
     const MOTIONS: f64 = 6.0;
     let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
@@ -773,8 +779,8 @@ fn compute_correction(
     Ok((summary, step.correction))
 }
 
-/// Returns the estimates of the parameters that the recipe compensates. Empty after the first pass, when they no longer
-/// change.
+/// Returns the estimates of the parameters that the recipe compensates. Empty for later passes of a run, because only
+/// the first pass is used for the estimate.
 pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<RecordedParameter> {
     let Some(taken) = &task.parameter_compensation else { return Vec::new() };
     let told = cycle.parameters.iter().flat_map(|told| told.estimates.iter().enumerate());
@@ -815,8 +821,8 @@ fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     beyond.map(question).collect()
 }
 
-/// Returns the initial state for the next part of this kind. Returns `None` if this run did not get that far, or the
-/// part responded wrongly.
+/// Returns the initial state for the next part of this kind. Returns `None` if the cycle has no state of the learning,
+/// or if the part responded wrongly.
 pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleState, PartPriors)) -> Option<Learned> {
     let known = cycle.learning.as_deref()?;
     let wrong = [PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled];

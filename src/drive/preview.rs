@@ -49,7 +49,7 @@ impl PreviewAccumulator {
         *self = Self::default();
     }
 
-    /// Returns the figures for display. Returns `None` before the part was touched.
+    /// Returns the statistics for display; `None` if the part has not been touched yet.
     pub(super) fn statistics(&self) -> Option<PreviewStatistics> {
         let [least, most] = self.range_mm?;
         let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touch_count)).sqrt();
@@ -57,8 +57,8 @@ impl PreviewAccumulator {
     }
 }
 
-/// Returns the signed distance of a touch from its target along the normal: the error of the part and of its place
-/// together.
+/// Returns the signed distance of a touch from its target along the normal, in mm. It includes the error of the part
+/// and the displacement of the part.
 fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
     (0..3).map(|k| (point.position_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
 }

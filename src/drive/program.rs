@@ -20,8 +20,8 @@ use crate::surface::Nominal;
 
 use super::recorder::OutputFiles;
 
-/// Name of the program file without its extension, which the dialect gives. A table file for controllers that
-/// compensate by a table is written too.
+/// Name of the program file, without the extension, which the dialect defines. `TABLE_FILE` is the file for controllers
+/// that compensate by a table.
 pub(super) const PROGRAM_FILE: &str = "toolpath";
 const TABLE_FILE: &str = "toolpath_z.csv";
 /// Maximum number of points of a program that a run writes with each correction.
@@ -137,19 +137,19 @@ impl Programs {
         Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
-    /// Returns the wheel with the radius error that measurements have estimated.
+    /// Returns the wheel with its radius corrected by the radius error that measurements have estimated.
     fn wheel(&self, correction: &Correction) -> Wheel {
         self.options.wheel.with_larger_radius(self.wheel_radius_error_mm(correction))
     }
 
-    /// Returns the nominal surface relative to the zero of the machine. The zero was touched off with the lowest point
-    /// of the wheel, for the radius of the recipe. So the centre of a wheel that is larger by dR is already higher by
-    /// dR.
+    /// Returns the nominal surface relative to the zero of the machine. This zero was touched off with the lowest point
+    /// of the wheel, for the radius of the recipe. The centre of a wheel that is larger by dR is therefore already
+    /// higher by dR.
     fn nominal(&self, correction: &Correction) -> HeightField {
         self.surface_and_outline.0.clone().lowered(self.wheel_radius_error_mm(correction))
     }
 
-    /// Returns the difference of the wheel radius from that of the recipe.
+    /// Returns the difference of the wheel radius from that of the recipe; 0 if it is not estimated.
     fn wheel_radius_error_mm(&self, correction: &Correction) -> f64 {
         correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
@@ -169,9 +169,9 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes the program and `toolpath_z.csv` of a pass into a folder. The program is also copied into the folder
-    /// where the controller looks for programs. Returns the reason if one of the files is missing: the program is too
-    /// long to be kept, or the table reaches where the wheel cannot.
+    /// Writes the program and `toolpath_z.csv` of a pass into a folder, and copies the program into the folder where
+    /// the controller looks for programs. Returns the reason if one of the files is not written: the program is too
+    /// long, or the table cannot be computed.
     pub(super) fn save(
         &self,
         files: &mut OutputFiles,
@@ -196,7 +196,8 @@ impl Programs {
         }
     }
 
-    /// Copies a program into the folder where the controller looks for it, under its own name, and reads it back.
+    /// Copies a program into the folder where the controller looks for programs, under the name that the dialect
+    /// defines, and reads the copy back.
     fn copy_to_controller(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let bytes = read_bytes(program).map_err(GcodeError::from)?;

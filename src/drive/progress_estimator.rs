@@ -22,7 +22,7 @@ pub(super) struct ProgressEstimator {
 }
 
 impl ProgressEstimator {
-    /// Adds a sign of progress.
+    /// Adds a progress report: `done` of `total` at the time `now`. `job` is the machine and the number of the cycle.
     pub(super) fn record_progress(&mut self, now: Duration, job: (Device, u32), done: u32, total: u32) {
         if self.job.replace(job) != Some(job) || done < self.done_and_total.0 {
             self.marks.clear();

@@ -1,5 +1,6 @@
 //! Thread of the journal. The loop queues the entries in order and continues. An action that needs a record waits for
-//! its [`Ticket`]. An entry that cannot be written stays first in the queue and is retried until it can be written.
+//! its [`RecordReceipt`]. An entry that cannot be written stays first in the queue and is retried until it can be
+//! written.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +17,7 @@ use crate::cell::RecordFailure;
 use crate::formats::{FormatError, ResultFolder};
 use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, RecordKind};
 
-/// Result of a record: resolves when it is on the disk, or when it is certain that it never will be.
+/// Result of writing a record. It arrives when the record is on the disk, or when the record is given up.
 pub(super) type RecordReceipt = oneshot::Receiver<Result<(), RecordFailure>>;
 
 /// Interval between two checks of the record files while nothing is written.
@@ -74,7 +75,7 @@ impl JournalSink for Journal {
 /// Work for the journal.
 enum JournalTask {
     Append(Box<Entry>),
-    /// Intent, with the number by which [`Job::Outcome`] refers to it.
+    /// Intent, with the number by which [`JournalTask::Outcome`] refers to it.
     Intent(u64, Box<Entry>),
     /// Outcome of an intent.
     Outcome(u64, Box<Entry>),
@@ -91,7 +92,7 @@ pub(super) struct Recorder {
     tasks: Option<mpsc::UnboundedSender<QueuedTask>>,
     /// Failures to write: the first one of each series, and repeated reports while it lasts.
     failures: mpsc::UnboundedReceiver<RecordFailure>,
-    /// True if no one waits any more: an entry that cannot be written now is given up.
+    /// True if no action waits for records any more. An entry that cannot be written is then given up.
     abandoned: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
     folder: PathBuf,
@@ -99,8 +100,8 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Creates a recorder for a journal. `open` are the numbers of the recorded commands that have no outcome yet. This
-    /// recorder refers to them by 1, 2, 3 from now on.
+    /// Creates a recorder for a journal. `open` are the command numbers in the journal of the commands that have no
+    /// outcome yet. The recorder refers to these commands by the numbers 1, 2, 3, in this order.
     pub(super) fn new(journal: Box<dyn JournalSink>, open: &[u32], beside: &BlockingExecutor) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
@@ -135,7 +136,7 @@ impl Recorder {
         self.enqueue(JournalTask::Append(Box::new(entry)))
     }
 
-    /// Records a command before it is executed. Returns the number by which [`Recorder::outcome`] refers to it.
+    /// Records a command before it is executed. Returns the number by which [`Recorder::append_outcome`] refers to it.
     pub(super) fn append_intent(&mut self, entry: Entry) -> (u64, RecordReceipt) {
         self.intent_count += 1;
         (self.intent_count, self.enqueue(JournalTask::Intent(self.intent_count, Box::new(entry))))
@@ -190,7 +191,7 @@ struct JournalWriter {
     command_ids: HashMap<u64, u32>,
     failures: mpsc::UnboundedSender<RecordFailure>,
     abandoned: Arc<AtomicBool>,
-    /// True if an entry was given up. After that nothing is written.
+    /// True if an entry was given up. After that no further entry is written.
     closed: bool,
     executor: BlockingExecutor,
 }
@@ -274,19 +275,19 @@ pub(super) fn nanoseconds(now: Duration) -> u64 {
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Writes files of a run folder to the disk and reads them, for [`Recorder::adopt`]. Blocks, and takes long for large
-/// files.
+/// Writes files of a run folder to the disk and reads them back, for [`Recorder::append_artefacts`]. Blocks, and takes
+/// long for large files.
 pub(super) fn sync_and_hash(folder: &Path, names: &[String]) -> Result<Vec<Artefact>, RecordFailure> {
     names.iter().map(|name| Artefact::from_file(folder, name).map_err(record_failure)).collect()
 }
 
-/// Files that a computation makes in one folder below that of the run. Those that exist when the computation ends are
+/// Files that a computation creates in one subfolder of the run folder. Those that exist when the computation ends are
 /// recorded, whatever its result is.
 pub(super) struct OutputFiles {
     run_folder: PathBuf,
     subfolder: String,
-    /// Folder that replaces `below` when the result is settled. Before that, `below` is the folder of a batch of
-    /// touches.
+    /// Folder that replaces `subfolder` when the result of an adaptive measurement is final. Until then, `subfolder` is
+    /// the folder of a batch of touches.
     final_subfolder: Option<String>,
     file_names: Vec<String>,
 }
@@ -296,12 +297,13 @@ impl OutputFiles {
         Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new() }
     }
 
-    /// Sets the folder that [`Files::settle`] switches to.
+    /// Sets the folder that [`OutputFiles::switch_to_final_subfolder`] switches to.
     pub(super) fn with_final_subfolder(self, settled: String) -> Self {
         Self { final_subfolder: Some(settled), ..self }
     }
 
-    /// Switches to the folder of the result on which the cell decides, and creates it if it is another one.
+    /// Switches to the folder of the final result, on which the cell decides, and creates it. Does nothing if there is
+    /// no such folder.
     pub(super) fn switch_to_final_subfolder(&mut self) -> Result<(), FormatError> {
         let Some(settled) = self.final_subfolder.take() else { return Ok(()) };
         self.subfolder = settled;
@@ -333,13 +335,13 @@ impl OutputFiles {
     }
 }
 
-/// Failure of a computation: its files cannot be written, or another reason.
+/// Failure of a computation: its files cannot be written (`NotSaved`), or another reason (`Failed`).
 pub(super) enum ComputationError<T> {
     NotSaved(RecordFailure),
     Failed(T),
 }
 
-/// Distinguishes a write error from other errors, by the error of the operating system.
+/// Classifies an error: it is a write error if its cause is an error of the operating system.
 pub(super) fn classify_error<E: std::error::Error + 'static>(error: E) -> ComputationError<String> {
     let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(&error);
     while let Some(next) = cause {

@@ -23,7 +23,7 @@ const CLAIM_RETRY_INTERVAL: Duration = Duration::from_millis(500);
 /// Step that brings a machine nearer to idle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RecoveryStep {
-    /// End its job in order, or take its preparation back.
+    /// End its job in order, or withdraw its preparation.
     Stop,
     /// Discard its result.
     Acknowledge,
@@ -66,13 +66,13 @@ impl RecoveryStep {
         }
     }
 
-    /// Returns the effect of the step, and the loss that it causes.
+    /// Returns the effect of the step on a machine, including what is lost by it, for people.
     pub fn consequence(self, device: Device) -> &'static str {
         match (self, device) {
             (Self::Stop, _) => "ends its job in order, clear of the part, or withdraws its preparation",
             (Self::Acknowledge, Device::Cmm) => "discards its result: a measurement that no run has collected is lost",
             (Self::Acknowledge, Device::Grinder) => {
-                "discards its result: the part has had this pass, but no run will know it"
+                "discards its result: the part has had this pass, but no record will contain it"
             }
             (Self::Clear, _) => {
                 "returns it to idle: first check that it is at rest, clear of the part, and why it was stopped"
@@ -131,8 +131,8 @@ pub async fn execute_step<M: Machine>(
     ended
 }
 
-/// Claims the machine for this program. A previous client may have died a moment ago; the machine then waits for it for
-/// a while.
+/// Claims the machine for this program. If a previous client ended a moment ago, the machine still belongs to it, so
+/// the claim is retried for [`OWNER_RELEASE_TIME`].
 async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     let by = Instant::now() + OWNER_RELEASE_TIME;
     loop {
@@ -154,7 +154,7 @@ pub fn describe_status(status: &Status) -> String {
     format!("{}{job}{fault}{result}", status.state)
 }
 
-/// Waits until a machine stands still.
+/// Waits until a machine is at rest, and returns its status.
 async fn wait_until_at_rest<M: Machine>(
     machine: &mut M,
     device: Device,

@@ -54,7 +54,7 @@ pub struct InterruptedRun {
     pub(super) ending: Option<Ending>,
     /// Judgement whose file is not recorded, and its number within its cycle.
     pub(super) unannounced_judgement: Option<(u32, Judgement)>,
-    /// Files of a computation that ended before it recorded them.
+    /// Files of computations that the interrupted program did not record.
     pub(super) unrecorded_files: Vec<String>,
 }
 
@@ -71,11 +71,11 @@ pub enum ReplayError {
     Scratch { path: PathBuf, source: io::Error },
     #[error("{}: the repeated computation cannot be written ({what}); no command was sent; check the disk and retry", .run.display())]
     NotSaved { run: PathBuf, what: String },
-    #[error("{}: record {seq} cannot be read ({what}); this run cannot continue; bring its machines home with `regrind recover`", .run.display())]
+    #[error("{}: record {seq} cannot be read ({what}); this run cannot continue; return its machines to idle with `regrind recover`", .run.display())]
     Unreadable { run: PathBuf, seq: u64, what: String },
     #[error(
         "{}: at record {seq} the result of this program differs from the record: {what}; no command was sent. Continue with \
-         the program that began the run, or bring its machines home with `regrind recover` and start a new run",
+         the program that began the run, or return its machines to idle with `regrind recover` and start a new run",
         .run.display()
     )]
     Differs { run: PathBuf, seq: u64, what: String },
@@ -133,7 +133,7 @@ struct Replay<'t> {
     run_folder: &'t Path,
     task: &'t Task,
     replayed: InterruptedRun,
-    /// Commands that followed from the last event and are not yet seen in the record.
+    /// Commands that followed from the last event and for which no record has been read yet.
     due_commands: VecDeque<Command>,
     /// Newest file of each name in the folder of a cycle.
     files: BTreeMap<(u32, String), Artefact>,
@@ -209,7 +209,7 @@ impl<'t> Replay<'t> {
 
     fn apply_event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
         if let Some(missing) = self.due_commands.front() {
-            return Err(self.differs(format!("it commands {}, but the record has another event", missing.name())));
+            return Err(self.differs(format!("the program sends {}, but the record has another event", missing.name())));
         }
         let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
         if let Event::Prepared { device, .. } = &event {
@@ -224,7 +224,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Applies the effect of a command within this program.
+    /// Applies the effect of a command on the state of this program. Sends nothing to a machine.
     fn apply_command(&mut self, command: &Command) {
         let (cycles, task) = (&mut self.replayed.cycles, self.task);
         match command {
@@ -243,7 +243,7 @@ impl<'t> Replay<'t> {
     fn compare_command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
         let Some(command) = self.due_commands.pop_front() else {
-            return Err(self.differs(format!("no command is due, but the record has {name}")));
+            return Err(self.differs(format!("the program sends no command, but the record has {name}")));
         };
         if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
             recorded.remove("intent");
@@ -251,7 +251,7 @@ impl<'t> Replay<'t> {
         let is_same = Command::deserialize(&recorded).is_ok_and(|recorded| command.is_same_decision(&recorded));
         if !is_same {
             let due = serde_json::to_value(&command).unwrap_or_default();
-            return Err(self.differs(format!("it commands {due}, but the record has {recorded}")));
+            return Err(self.differs(format!("the program sends {due}, but the record has {recorded}")));
         }
         if let Some(id) = id.filter(|_| outcome::expects_answer(&command)) {
             self.replayed.open_commands.insert(id, command);
@@ -301,7 +301,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Returns the points of a measurement as they were written.
+    /// Returns the points of a measurement from its recorded files.
     fn read_points(&self, number: u32) -> Result<super::task::UsablePoints, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
             Some(file) => {
@@ -387,8 +387,8 @@ impl<'t> Replay<'t> {
         Ok(self.replayed)
     }
 
-    /// Registers a file that exists in the folder of an attempt: it is not overwritten, and is recorded if it is not on
-    /// record.
+    /// Counts the attempt to which an existing file belongs, so that the next attempt does not overwrite the file. Adds
+    /// the file to the unrecorded files if it is not on record.
     fn add_existing_file(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
         if name == "result.json" || name.starts_with('.') {
             return;
@@ -436,7 +436,7 @@ impl<'t> Replay<'t> {
         }
         let told = intent.digest;
         Err(self.differs(format!(
-            "the {device} was prepared in cycle {number} for {told:08x}, but the data of this cycle give {due:08x}"
+            "the {device} was prepared in cycle {number} for data {told:08x}, but this cycle has data {due:08x}"
         )))
     }
 
@@ -459,8 +459,8 @@ fn without_version(text: &str) -> String {
     })
 }
 
-/// Returns true if two JSON values are equal, texts for people excepted: a program with other wording repeats a
-/// computation all the same. A text is a string with a space; names, codes and digests have none.
+/// Returns true if two JSON values are equal, texts for people excepted. So a computation can be repeated by a program
+/// with other texts. A string with a space counts as a text; names, codes and digests have no spaces.
 fn are_equal_but_for_texts(one: &Value, other: &Value) -> bool {
     let is_text = |text: &str| text.contains(' ');
     match (one, other) {

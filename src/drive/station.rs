@@ -43,21 +43,21 @@ pub(super) enum StationRequest {
     Confirm { confirmation: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
-/// Payload for one machine or the other.
+/// Payload of a machine: a plan for the CMM, or a map and a pass for the grinder.
 #[derive(Clone)]
 pub(super) enum MachinePayload {
     Plan(Arc<Plan>),
     Pass(Arc<CorrectionMap>, Box<Pass>),
 }
 
-/// Result of a job.
+/// Result of a job, as read from the machine.
 pub(super) enum FetchedResult {
     /// Points, with the duration of their transfer.
     Points(Box<Measurement>, Duration),
     Record(Box<PassRecord>),
 }
 
-/// Present information about a machine for a person.
+/// Notes of a machine for a person, for example why it waits.
 pub(super) struct MachineNotes {
     pub(super) device: Device,
     pub(super) all: Vec<String>,
@@ -65,7 +65,7 @@ pub(super) struct MachineNotes {
     pub(super) new: Vec<String>,
 }
 
-/// Fact, with the details that the journal stores.
+/// Report of a station to the drive: an event or data of a machine, with the details that the journal stores.
 #[derive(Default)]
 pub(super) struct StationReport {
     /// `None` if the drive itself creates the event from the fetched result.
@@ -153,8 +153,8 @@ impl<G: Grinder + 'static> StationDriver for GrinderDriver<G> {
     }
 }
 
-/// Aborts on their way to a station. The drive counts each one before it sends the request; the station counts each one
-/// that it takes.
+/// Number of aborts that were ordered and handled. The drive counts an abort before it sends the request; the station
+/// counts an abort when it receives the request.
 pub(super) struct AbortCounter {
     ordered_count: watch::Receiver<u64>,
     handled_count: u64,
@@ -165,7 +165,7 @@ impl AbortCounter {
         Self { ordered_count: ordered, handled_count: 0 }
     }
 
-    /// Waits until an abort is on its way that this station has not taken.
+    /// Waits until an abort was ordered that this station has not handled yet.
     async fn wait_for_abort(&mut self) {
         let taken = self.handled_count;
         if self.ordered_count.wait_for(|ordered| *ordered > taken).await.is_err() {
@@ -175,8 +175,8 @@ impl AbortCounter {
     }
 }
 
-/// Heartbeat of the loop that decides. If it stops, no machine is polled, so none gets the sign of life of its client:
-/// the machine holds by itself.
+/// Watchdog of the loop of the drive. If the loop hangs, the stations stop polling, so the machines get no heartbeat of
+/// their client. They then hold by themselves.
 #[derive(Clone)]
 pub(super) struct LoopWatchdog {
     started_at: Instant,
@@ -228,10 +228,10 @@ struct ObservedState {
     progress_reported_at: Option<Instant>,
     supplies_missing: bool,
     manual: bool,
-    /// True if it was clear of the part; `None` if it does not report this.
+    /// True if the machine reported that it was clear of the part; `None` if it does not report this.
     clear: Option<bool>,
-    /// True if a signal of the cell file is outside its range; and since when all have been within it, until that is
-    /// accepted.
+    /// True if a signal of the cell file is outside its range (`signal_out_of_range`). While this is true,
+    /// `signals_good_since` is the time since which all signals have been within their ranges again.
     signal_out_of_range: bool,
     signals_good_since: Option<Instant>,
     aborting: bool,
@@ -239,39 +239,39 @@ struct ObservedState {
     clearing: bool,
     /// True if the end of the running job was reported.
     end_reported: bool,
-    /// True if a START was taken and its end has not been reported.
+    /// True if a START was sent and the end of its job has not been reported.
     running: bool,
     next_attempt: Option<Instant>,
     attempts: u32,
     /// Time at which the link last came back.
     reconnected_at: Option<Instant>,
-    /// True if the machine was seen at the job since START was sent or the job was reconciled.
+    /// True if the machine has reported the job since START was sent or since the job was reconciled.
     at_job: bool,
     /// Number of status reads in a row without the job.
     reads_without_job: u32,
-    /// Number of status reads with progress that rose since the one before, although the machine reports HELD.
+    /// Number of status reads in which the progress had increased although the machine reports HELD.
     progress_rises_at_held: u32,
-    /// Time at which STOP was taken.
+    /// Time at which the machine accepted STOP.
     stop_accepted_at: Option<Instant>,
 }
 
-/// Interval between two beats of the loop that decides.
+/// Interval between two beats of the loop of the drive.
 pub(super) const WATCHDOG_INTERVAL: Duration = Duration::from_millis(250);
-/// Time without a beat after which the loop counts as hung.
+/// Time without a beat after which the loop of the drive counts as hung.
 const WATCHDOG_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time between two attempts to reach a lost machine.
 const MAX_RETRY_INTERVAL: Duration = Duration::from_secs(5);
 /// Time for which signals must be within their ranges before they count as good. Prevents flapping of a signal at its
 /// limit.
 const SIGNAL_SETTLING_TIME: Duration = Duration::from_secs(1);
-/// Duration of a link after which a new loss does not belong to the same series of losses.
+/// Minimum duration of a link after which a new loss starts a new series of losses.
 const STABLE_LINK_TIME: Duration = Duration::from_secs(10);
 /// Number of status reads without the job before the job counts as vanished.
 const VANISHED_AFTER_READS: u32 = 2;
-/// Number of rises of the progress at HELD before the machine counts as moving. It may still count what it has just
-/// ended.
+/// Number of increases of the progress at HELD before the machine counts as moving. A machine may count a few completed
+/// items late.
 const MOVING_AFTER_RISES: u32 = 3;
-/// Time after which a machine that took a STOP must have left EXECUTE.
+/// Time after which a machine that accepted a STOP must have left EXECUTE.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 /// Minimum share of the path that a machine must have travelled when it reports its job complete.
 const MIN_COMPLETE_SHARE: f64 = 0.95;
@@ -302,7 +302,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Restores the last preparation into the driver. The machine may still run it since before this program began.
+    /// Restores the last preparation into the driver. The machine may still run this job, which was started before this
+    /// program was restarted.
     pub(super) fn restore_preparation(mut self) -> Self {
         if let Some(armed) = &self.armed {
             self.driver.machine().restore(armed);
@@ -310,8 +311,8 @@ impl<B: StationDriver> MachineTask<B> {
         self
     }
 
-    /// Serves requests until no sender is left. If the task panics, which is a fault of this program, reports that as
-    /// an event. The run then continues without the machine, to which nothing talks any more.
+    /// Serves requests until no sender is left. If the task panics, which is a fault of this program, reports this as
+    /// an event. The run then continues without communication with this machine.
     pub(super) async fn serve(
         self,
         asks: mpsc::Receiver<StationRequest>,
@@ -446,7 +447,7 @@ impl<B: StationDriver> MachineTask<B> {
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
-    /// Returns the occupation of a machine at the connection. A preparation of a client that is gone is taken back.
+    /// Returns the occupation of a machine at the connection. Withdraws a preparation of a client that is gone.
     async fn occupation(&mut self, status: &Status) -> Occupation {
         match status.state {
             MachineState::Idle => Occupation::Idle,
@@ -559,8 +560,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Refuses a command if the link was lost after the cell had requested it: nothing moves by this order until the
-    /// machine is connected again.
+    /// Refuses a command that was not sent, because the link was lost after the cell had issued it. So the command
+    /// cannot move the machine later.
     async fn refuse_unsent(&mut self, what: MachineRequest) {
         let why = "the link is lost, and the command was not sent".to_owned();
         self.report(Event::Refused { device: B::DEVICE, what, why }).await;
@@ -626,8 +627,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Connects a machine that a restarted program has not seen yet before an abort. Refuses another device, and a
-    /// machine that runs the job of another run. A machine that cannot be reached now is left to the abort itself.
+    /// Connects a machine before an abort, if this program has not connected it since its restart.
     async fn connect_for_abort(&mut self) -> Result<(), String> {
         let met = async {
             self.driver.machine().connect().await?;
@@ -657,7 +657,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle) else {
             // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
-            let why = "this program has no preparation of this cycle".to_owned();
+            let why = "this program has not prepared the machine in this cycle".to_owned();
             let outcome = Reconciliation::Unknown(why);
             return self.report(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
@@ -692,7 +692,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn collect(&mut self, cycle: u32) {
         let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
-            let why = "this program has no job of this cycle for it".to_owned();
+            let why = "this program has not prepared it for a job of this cycle".to_owned();
             return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Collect, why }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
@@ -737,7 +737,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports that the machine refused, or that it cannot be reached.
+    /// Reports an error of a request as an event: a lost link, a fault of the machine, or a refusal.
     async fn report_failure(&mut self, what: MachineRequest, error: DeviceError) {
         if error.is_link() {
             self.report_link_lost(&error).await;
@@ -782,7 +782,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reads points of a running job while no other request waits: an order raises the interrupt and comes first.
+    /// Reads preliminary points of a running job. The interrupt ends the transfer as soon as an order arrives.
     async fn read_ahead(&mut self) {
         let Some(armed) = self.armed.as_ref().filter(|_| self.observed.running && !self.observed.end_reported) else {
             return;
@@ -874,7 +874,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports when a machine that was seen at the job of this run shows no job or another one, and no end.
+    /// Reports when a machine that had the job of this run reports no job or another job, and no end.
     async fn report_absence(&mut self, status: &Status) {
         let ObservedState { running, end_reported: ended, stopping, clearing, aborting, .. } = self.observed;
         if !running || ended || stopping || clearing || aborting {
@@ -896,8 +896,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports a contradiction in the status of a machine: it reports HELD but makes progress, or took a STOP and
-    /// continues.
+    /// Reports a contradiction in the status of a machine: it reports HELD but makes progress, or it accepted a STOP
+    /// and continues.
     async fn report_contradiction(&mut self, before: Option<MachineState>, status: &Status) {
         let device = B::DEVICE;
         let is_held = status.state == MachineState::Held && before == Some(MachineState::Held);
@@ -923,7 +923,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports a pass that the grinder calls complete before the path is travelled.
+    /// Raises a doubt about a pass that the grinder reports as complete before [`MIN_COMPLETE_SHARE`] of the path is
+    /// travelled.
     async fn check_early_end(&mut self, status: &Status) {
         let (Device::Grinder, Outcome::Complete, Some((done, total))) = (B::DEVICE, status.outcome, status.progress)
         else {
@@ -1024,11 +1025,11 @@ impl<B: StationDriver> MachineTask<B> {
         self.report_end(job_result(status.outcome)).await;
     }
 
-    /// Reads the record of a finished pass and hands it over. A record that does not belong to this job is reported as
-    /// doubtful.
+    /// Reads the record of a finished pass and sends it to the drive. Does nothing for a CMM. A record that does not
+    /// belong to this job is reported as doubtful.
     ///
     /// # Errors
-    /// A lost link, which has been reported.
+    /// Returns an error if the link is lost. The loss has then been reported.
     async fn fetch_pass_record(&mut self) -> Result<(), ()> {
         let (Device::Grinder, Some(armed)) = (B::DEVICE, &self.armed) else { return Ok(()) };
         // Short: one or two pages. No interrupt is needed; an abort gives the request up.
@@ -1079,7 +1080,7 @@ fn job_result(outcome: Outcome) -> JobResult {
     }
 }
 
-/// Describes a fault for this machine.
+/// Describes a fault of a machine for people.
 fn fault_message(device: Device, fault: Fault) -> String {
     match (device, fault) {
         // A probe that meets material where only air should be is not at fault: the part is in another place.

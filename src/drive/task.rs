@@ -60,20 +60,21 @@ pub struct Task {
     pub gain_rule: GainRule,
     /// Error (rms) that a pass adds by itself, if the recipe states it.
     pub repeatability_mm: Option<f64>,
-    /// Systematic error that an earlier run of this part found in every pass.
+    /// State that was learned in earlier runs: correction of the first pass, state of the learning, and priors of the
+    /// error field.
     pub learned: Option<Learned>,
-    /// Setting that a run must share with another to learn from it.
+    /// Text of the settings that two runs must share so that one can learn from the other.
     pub setting: String,
-    /// Setting without the cell: shared with a run of another cell to learn from it.
+    /// Text of the settings without the cell, which runs of two cells must share so that one can learn from the other.
     pub kind: String,
     /// Limits of a correction.
     pub correction_limits: CorrectionLimits,
-    /// Parameters of the machine that are compensated; `None` if everything is left to the map.
+    /// Parameters of the machine that are compensated; `None` if the map corrects the whole error.
     pub parameter_compensation: Option<ParameterCompensation>,
-    /// Standard uncertainty of the datum: of the position in mm and of the orientation in rad. `None` if the recipe
-    /// does not state it.
+    /// Standard uncertainty of the fixture along the locked directions: of the position in mm and of the orientation in
+    /// rad. `None` if the recipe does not state it.
     pub locked_sigmas: Option<[f64; 2]>,
-    /// Tolerated uncertainty of the place of a correction on the part.
+    /// Maximum uncertainty of the position of a correction on the part.
     pub map_limits: MapLimits,
     /// Parameters of a pass. Level and identity are set for each cycle.
     pub pass: Pass,
@@ -89,7 +90,7 @@ pub struct Task {
     pub temperature_range_c: Option<[f64; 2]>,
     /// Thermal expansion of part and scales, if the recipe states it for the part.
     pub expansion: Option<ThermalExpansion>,
-    /// Common error of the measuring machine for all points, as its cell file states it.
+    /// Standard uncertainties of the errors of the measuring machine that all points share, from the cell file.
     pub machine_uncertainty: MachineUncertainty,
     /// Accepted tolerance, as in the plan of the cell.
     pub tolerance: Tolerance,
@@ -106,7 +107,7 @@ pub struct Task {
 pub struct ParameterCompensation {
     /// Tolerance of each compensated parameter, in its unit, in the order of [`ParameterKind::ALL`].
     pub tolerances: [Option<f64>; ParameterKind::COUNT],
-    /// Effect of another wheel radius on this grinder.
+    /// Effect of an error of the wheel radius on a surface of this grinder: along the normal, or in height.
     pub wheel_term: WheelTerm,
     /// Surface under the nodes of a correction.
     pub node_points: Vec<SurfacePoint>,
@@ -124,14 +125,14 @@ pub struct AdaptiveOptions {
 }
 
 impl AdaptiveOptions {
-    /// Share of the first touches that remains if one of them finds nothing.
+    /// Share of the first touches that are found if one of them misses the part.
     pub const FIRST_BATCH_MIN_SHARE: f64 = 1.0 - 1.0 / FIRST_BATCH as f64;
     /// Maximum number of evaluations of a measurement. Each may err with its share of the accepted risk.
     const MAX_DECISIONS: f64 = 5.0;
     /// Maximum uncertainty of the form, as a share of the rms tolerance, for a correction. It is negligible compared
     /// with what a pass adds.
     const MAX_FORM_UNCERTAINTY_SHARE: f64 = 0.17;
-    /// Value of the rms that is as hard to achieve as a peak to valley of 1.
+    /// Ratio of an rms limit to a PV limit that is equally hard to meet.
     const RMS_TO_PV_RATIO: f64 = 0.2;
 
     /// Returns the probability with which one evaluation may err: a share of the accepted risk. It is at most that of
@@ -140,7 +141,7 @@ impl AdaptiveOptions {
         (self.accepted_risk / Self::MAX_DECISIONS).min(1.0 - self.tolerance.probability)
     }
 
-    /// Returns the criteria for a measurement after a pass.
+    /// Returns the criteria by which an adaptive measurement stops. `may_grind` is true if a further pass is allowed.
     pub fn stopping_criteria(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
@@ -178,17 +179,19 @@ pub struct ReferenceSphere {
 pub(super) struct CycleState {
     pub(super) correction: Arc<Correction>,
     pub(super) plan: Option<Arc<Plan>>,
-    /// Batch of touches of the plan, and its targets, if touches are chosen.
+    /// Number of the batch of touches that the plan belongs to, and indices of its targets (`batch_targets`), in an
+    /// adaptive measurement.
     pub(super) batch: u32,
     pub(super) batch_targets: Arc<Vec<usize>>,
     /// Targets of the next batch.
     pub(super) next_targets: Option<Arc<Vec<usize>>>,
-    /// Touches to repeat, if all targets are touched at once.
+    /// Touches to repeat, in a measurement that is not adaptive.
     pub(super) repeated_touches: Option<Arc<RepeatedTouches>>,
     pub(super) points: Option<Arc<UsablePoints>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
-    /// Hyperparameters of the field of its error from its points alone. `None` if they show no field.
+    /// Hyperparameters of the error field, estimated from the points of this cycle without a prior. `None` if the
+    /// points show no field.
     pub(super) field_hyperparameters: Option<Hyperparameters>,
     pub(super) error_map: Option<Arc<ErrorMap>>,
     /// State of the learning with this cycle included.
@@ -203,7 +206,7 @@ pub(super) struct CycleState {
 }
 
 impl CycleState {
-    /// Returns a cycle in which only the correction of its pass is known.
+    /// Returns the state of a cycle at its start: only the correction of its pass is known.
     pub(super) fn new(correction: Correction) -> Self {
         Self {
             correction: Arc::new(correction),
@@ -262,7 +265,7 @@ impl CycleState {
     }
 }
 
-/// Result of a computation for the following ones, in addition to its event and its files.
+/// Result of a computation that later computations use, in addition to its event and its files.
 pub(super) enum ComputationProduct {
     Nothing,
     Points(UsablePoints),
@@ -276,7 +279,7 @@ pub(super) struct RegistrationProduct {
     pub(super) registration: Registration,
     /// Form from the model of the error; `None` if the model fails.
     pub(super) form: Option<Form>,
-    /// Hyperparameters of the error field from the points alone.
+    /// Hyperparameters of the error field, estimated from the points without a prior.
     pub(super) field_hyperparameters: Option<Hyperparameters>,
     pub(super) error_map: Option<ErrorMap>,
     pub(super) learning: Option<LearningState>,
@@ -292,7 +295,7 @@ pub(super) struct RegistrationProduct {
 /// Outliers to be touched again, with a few targets around each and control points elsewhere.
 #[derive(Clone, Debug)]
 pub(super) struct RepeatedTouches {
-    /// Numbers of the points to touch again.
+    /// Indices of the points to touch again.
     pub(super) outlier_points: Vec<usize>,
     /// Control points, which show whether part, frame and temperature are those of the first touches.
     pub(super) control_points: Vec<ControlPoint>,
@@ -305,7 +308,7 @@ pub(super) struct RepeatedTouches {
 /// Good touch that is repeated as a control.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ControlPoint {
-    /// Number of the point.
+    /// Index of the point among the points of the part.
     pub(super) point_index: usize,
     /// Normal of the nominal surface at the point, in the CMM frame.
     pub(super) normal: Vector,
@@ -316,18 +319,19 @@ pub(super) struct ControlPoint {
 pub(super) struct UsablePoints {
     pub(super) part: Vec<Point>,
     pub(super) sphere: Vec<Point>,
-    /// True radius of the probe, if a sphere was touched.
+    /// Radius of the probe, measured on the reference sphere; `None` if no sphere was touched.
     pub(super) probe_radius_mm: Option<f64>,
     /// Kind of coordinates: centres of the probe, or contact points.
     pub(super) coordinates: Coordinates,
     /// Standard uncertainty of the radius; 0 if it is the radius of the recipe, which states none.
     pub(super) probe_radius_sigma_mm: f64,
-    /// Standard deviation of the probe's noise from the sphere, and the relative uncertainty of that. 0 if no sphere
-    /// was touched.
+    /// Standard deviation of the probe's noise on the reference sphere, and the relative uncertainty of this deviation.
+    /// Both are 0 if no sphere was touched.
     pub(super) probe_noise_mm: [f64; 2],
     /// Temperature of the part in °C, if the machine reported it.
     pub(super) temperature_c: Option<f64>,
-    /// Targets tried, batch by batch, and the target of each point of the part. Empty if all are touched at once.
+    /// Indices of the targets of each batch (`tried_targets`), and index of the target of each point in `part`
+    /// (`point_targets`). Empty if the measurement is not adaptive.
     pub(super) tried_targets: Vec<Vec<usize>>,
     pub(super) point_targets: Vec<usize>,
     /// Number of rounds in which outliers were touched again.
@@ -335,10 +339,11 @@ pub(super) struct UsablePoints {
 }
 
 impl Task {
-    /// Starts from what an earlier part learned about the grinder: the first pass is ground with its correction.
+    /// Sets the state that was learned from an earlier part as the initial state of this run. The first pass is ground
+    /// with its correction.
     ///
     /// # Errors
-    /// A first correction beyond the limits of this run; the task is unchanged.
+    /// Returns an error if the first correction exceeds the limits of this run. The task is then unchanged.
     pub fn start_from_learned(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
         let within = self.first_correction().removed_mm(&self.correction_limits).map_err(|error| match error {
@@ -393,8 +398,8 @@ impl Task {
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
-    /// Computes the path of the first pass. Returns `None` if only the controller of the grinder can; `programs` gives
-    /// the reason.
+    /// Computes the path of the first pass. Returns `None` if this program cannot plan a path for the part, but the
+    /// controller of the grinder may be able to; `programs` then contains the reason.
     ///
     /// # Errors
     /// A surface that the wheel cannot grind, and limits of the grinder that the path exceeds.
@@ -422,10 +427,12 @@ impl Task {
         LearningState::new(self.gain_rule, &self.map_options, size_mm, self.repeatability_mm)
     }
 
-    /// Registers points to the surface offset by a radius. Returns the registration and the options used.
+    /// Registers points to the nominal surface, offset by `probe_radius_mm`. Returns the registration and the options
+    /// used.
     ///
-    /// A search may leave the part anywhere along a direction that the surface does not determine, and a correction
-    /// would be ground at that place. If there is such a direction, starts again from the fixture pose.
+    /// If the surface does not determine a direction of the pose, the position that a search finds in this direction is
+    /// arbitrary, and a correction would be ground at that position. In this case the registration is repeated from the
+    /// fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -437,7 +444,7 @@ impl Task {
         self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
-    /// Registers in the same way, and starts from the fixture pose if `start_at_fixture` is true.
+    /// Registers points as [`Self::register`] does. If `start_at_fixture` is true, starts from the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -469,7 +476,7 @@ impl Task {
         locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
     }
 
-    /// Returns the options for the separation of parameters, for a pass with these parameter corrections.
+    /// Returns the options for the estimate of machine parameters. `told` are the parameter corrections of the pass.
     pub fn parameter_options(&self, told: Option<&ParameterCorrections>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration_options.locked.map(|locked| !locked),
@@ -483,7 +490,8 @@ impl Task {
         }
     }
 
-    /// Returns the radius of the wheel for a pass: that of the recipe, or corrected by measurements.
+    /// Returns the radius of the wheel for a pass: that of the recipe plus the correction in `told`, the parameter
+    /// corrections of the pass.
     pub fn wheel_radius_mm(&self, told: Option<&ParameterCorrections>) -> f64 {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
@@ -493,7 +501,7 @@ impl Task {
         self.payloads(correction).0.identity()
     }
 
-    /// Returns the payloads of a pass.
+    /// Returns the payloads of a pass: the map and the parameters of the pass.
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
         let map = CorrectionMap {
             grid: correction.grid,
@@ -508,8 +516,8 @@ impl Task {
     /// Creates the plan: the reference sphere first, then the part at the last measured pose and at the level to which
     /// it was ground.
     ///
-    /// If the part may have been clamped again, a few targets that are as far apart as possible come first, at low
-    /// speed. They reveal a part in another place than expected.
+    /// If `seated_anew`, the part may have been clamped again. A few targets that are as far apart as possible then
+    /// come first, at low speed, to detect a displaced part.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let first = if seated_anew { farthest_points(&self.target_places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
@@ -521,8 +529,8 @@ impl Task {
         self.targets.iter().map(|target| (target.point, target.normal)).collect()
     }
 
-    /// Creates a plan of some targets, the first group at low speed. The reference sphere, if wanted, comes between the
-    /// groups.
+    /// Creates a plan of some targets, given by their indices. The targets in `first` are touched at low speed. The
+    /// reference sphere, if `with_sphere`, comes between `first` and `rest`.
     pub(super) fn plan_by_index(
         &self,
         level_mm: f64,
@@ -534,7 +542,7 @@ impl Task {
         self.plan_targets(level_mm, cmm_from_model, (first, rest), with_sphere)
     }
 
-    /// Creates a plan in the same way for targets at any place.
+    /// Creates a plan as [`Self::plan_by_index`] does, for targets that need not belong to the pattern.
     pub(super) fn plan_targets(
         &self,
         level_mm: f64,
@@ -564,7 +572,7 @@ impl Task {
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
 
-    /// Writes the correction of a pass, with the identity of the one that it replaces.
+    /// Writes the correction of a pass, with the identity of the map of `base`, the correction that it replaces.
     pub(super) fn save_correction(
         &self,
         files: &mut OutputFiles,
@@ -596,7 +604,7 @@ impl Task {
     }
 }
 
-/// Returns the grid of the corrections of a part with these minimum and maximum x and y.
+/// Returns the grid of the corrections of a part, from its minimum and maximum x and y.
 pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
     let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
     Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {
@@ -609,7 +617,7 @@ pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> G
 
 /// Number of targets with which a plan begins if the part may have been clamped again.
 const CAREFUL_TARGETS: usize = 9;
-/// Share of the recipe's speed for these targets.
+/// Speed for [`CAREFUL_TARGETS`], as a share of the recipe's speed.
 const CAREFUL_SPEED_SHARE: f64 = 0.2;
 
 /// Returns the points used in a registration.
@@ -617,7 +625,7 @@ pub(super) fn used_deviations(found: &Registration) -> impl Iterator<Item = &Dev
     found.deviations.iter().filter(|d| d.status == PointStatus::Inlier)
 }
 
-/// Returns their deviations at x and y of the model frame.
+/// Returns the deviations of the points used in a registration, with their x and y in the model frame.
 pub(super) fn deviation_samples(found: &Registration) -> Vec<DeviationSample> {
     used_deviations(found)
         .map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm })

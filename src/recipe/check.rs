@@ -175,10 +175,10 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             format!(
-                "is {risk}, less than {:.3}, the risk that `acceptance.probability`, {probability}, leaves",
+                "is {risk}, and `acceptance.probability`, {probability}, leaves a risk of {:.3}",
                 1.0 - probability
             ),
-            "the risk of the verdict must not exceed the risk of the whole measurement",
+            "the accepted risk must be at least the risk that the required probability leaves",
             &format!("raise it to {:.3}, or the probability to {:.3}", 1.0 - probability, 1.0 - risk),
         );
     }
@@ -195,7 +195,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "acceptance.expanded_uncertainty",
             "is false",
-            "figures of some of the targets require their uncertainty",
+            "mode adaptive touches only some targets, so the uncertainty of the figures must count",
             "write `expanded_uncertainty = true`, or `mode = \"fixed\"`",
         );
     }
@@ -203,8 +203,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.qualify",
             "is false",
-            "mode adaptive measures the noise of the probe on the reference sphere, to separate it from form between \
-             the touches",
+            "mode adaptive requires the noise of the probe, which is measured on the reference sphere",
             "write `qualify = true`, or `mode = \"fixed\"`",
         );
     }
@@ -297,7 +296,7 @@ fn registration(written: &RegistrationSettings, document: &mut Document) {
         document.report(
             "registration.lock",
             "locks directions while `start` is \"search\"",
-            "a locked direction keeps the value of the fixture",
+            "a locked direction keeps its value of the fixture pose, and a search does not start from this pose",
             "write `start = \"fixture\"`, or lock no direction",
         );
     }
@@ -356,7 +355,7 @@ fn compensation(written: &Compensation, document: &mut Document) {
         document.report(
             "compensation.gain",
             format!("is {gain}, and `gain_by` is {by:?}"),
-            "the gain is either fixed or chosen",
+            "`gain` fixes the share of the error that a correction removes, and `gain_by` is a rule that chooses it",
             "remove one of the two",
         );
     }
@@ -375,7 +374,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         document.report(
             KEY,
             "is set in a recipe that begins with a measurement",
-            "parameters are estimated from the error after the first pass, and this part has had no pass of this run",
+            "parameters are estimated from the error after the first pass, and this run measures before its first pass",
             "write `begin_with = \"grind\"`, or remove the table",
         );
     }
@@ -399,7 +398,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         document.report(
             "compensation.parameters.wheel_radius_um",
             "requires a spherical wheel",
-            "the error that another radius leaves is known only for a sphere",
+            "the effect of a radius error is known only for a sphere",
             "remove it: the map then corrects this error",
         );
     }
@@ -417,22 +416,22 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
             document.report(
                 &format!("{KEY}.{key}"),
                 format!("is set while `registration.lock` does not lock {coordinate}"),
-                "in a free direction this error looks the same as another position of the part",
+                "in a free direction this error cannot be separated from a displacement of the part",
                 &format!("remove it, or lock \"{coordinate}\" if the fixture holds it"),
             );
         } else if registration.lock_uncertainty_um.is_none() {
             document.report(
                 &format!("{KEY}.{key}"),
                 "requires `registration.lock_uncertainty_um`",
-                "the estimate is no better than the fixture holds the part",
+                "the uncertainty of the fixture limits the uncertainty of the estimate",
                 "add `lock_uncertainty_um = 0.5` to [registration]",
             );
         }
     }
 }
 
-/// Minimum angle between the normal and the axis of a ball that follows the surface: within 2 degrees of the pole the
-/// ball hardly moves.
+/// Minimum angle between the surface normal and the axis of a spherical wheel that follows the surface. Nearer to its
+/// pole, the wheel has almost no cutting speed.
 const MIN_LEAD_DEG: f64 = 2.01;
 
 fn grinding(written: &Grinding, document: &mut Document) {
@@ -478,7 +477,7 @@ fn grinding(written: &Grinding, document: &mut Document) {
     }
 }
 
-/// Checks the tables against each other.
+/// Checks that the values in different tables of the recipe agree.
 fn check_tables(written: &RecipeFile, document: &mut Document) {
     if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
         && most < rms
@@ -494,7 +493,7 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
         document.report(
             "compensation.learn",
             "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
-            "learning acts in the first pass, and a part that is measured first has already had that pass",
+            "`learn` acts on a pass before the first measurement, and this recipe has no such pass",
             "remove one of the two",
         );
     }

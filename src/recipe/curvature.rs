@@ -33,7 +33,7 @@ pub(super) fn min_concave_radii_mm(surface: &DefinedSurface) -> [(f64, [f64; 2])
     sharpest
 }
 
-/// Returns the minimum and the maximum principal curvature, in 1/mm.
+/// Returns the minimum and the maximum principal curvature, in 1/mm. Returns `None` where the formula has no value.
 fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64) -> Option<[f64; 2]> {
     let gradient = |x: f64, y: f64| surface.formula().sag_and_gradient(x, y).map(|(_, gradient)| gradient);
     let [p, q] = gradient(x, y)?;

@@ -51,7 +51,7 @@ pub struct Recipe {
     pub grinding: Grinding,
     /// Maximum number of cycles, and the action if the part does not improve.
     pub cycle: CycleSettings,
-    /// Truth of a simulated cell, as written. Only the simulator reads it.
+    /// True properties of a simulated cell, as written in the recipe. Only the simulator reads this table.
     pub simulation: Option<toml::Table>,
     path: PathBuf,
     text: String,
@@ -59,14 +59,14 @@ pub struct Recipe {
     notes: Vec<String>,
 }
 
-/// Format of a table of points in the words of the recipe, for files that do not state it themselves.
+/// Format of a table of points, as text from the recipe, for files that do not state their format themselves.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TableSettings {
     /// Columns of x, y and z.
     pub columns: Option<String>,
     /// Unit. The default is mm.
     pub unit: Option<String>,
-    /// Unit of z, if it differs.
+    /// Unit of z, if it differs from that of x and y.
     pub height_unit: Option<String>,
 }
 
@@ -140,7 +140,7 @@ impl Recipe {
         Self::parse(path, &text)
     }
 
-    /// Returns the other files that the recipe names.
+    /// Returns the paths of the files that the recipe refers to: of the nominal surface and of the measuring pattern.
     pub fn files(&self) -> Vec<&Path> {
         let nominal = match &self.nominal {
             NominalSource::File { path, .. } => Some(path.as_path()),
@@ -188,7 +188,7 @@ impl Recipe {
         })
     }
 
-    /// Returns a problem with a key of this recipe that another module found, at the key's place in the text.
+    /// Returns a problem that another module found with the value of a key, with the position of the key in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
@@ -216,8 +216,8 @@ impl Recipe {
         }
     }
 
-    /// Returns the probability with which a figure must be within its limit. Unless the recipe sets it, the risk of a
-    /// wrong acceptance is at most the accepted risk of a measurement with chosen touches.
+    /// Returns the probability with which a figure must be within its limit. If the recipe does not set it, this is the
+    /// default (0.975), or 1 - `accepted_risk` in mode adaptive if that is more.
     pub fn required_probability(&self) -> f64 {
         let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == SelectionMode::Adaptive);
         let usual = risk

@@ -323,8 +323,8 @@ pub struct Compensation {
     /// the machine is grinder.limits.max_depth_mm of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
     pub depth_of_cut_um: Micrometres,
-    /// Parameters of the machine that are compensated after the first pass, each with its tolerance; the map has the
-    /// rest of the error. Default: the map has the whole error.
+    /// Parameters of the machine that are compensated after the first pass, each with its tolerance. The map then
+    /// corrects the rest of the error. Default: the map corrects the whole error.
     pub parameters: Option<ParameterTolerances>,
     /// Distance between the nodes of the map.
     #[schemars(range(min = 0.01, max = 10000.0))]
@@ -459,7 +459,8 @@ pub enum SpindleAxis {
     Y,
 }
 
-/// A wheel by its dimensions, as it is ordered and dressed; [`crate::compensation::path::Wheel`] is one that stands on a part.
+/// Dimensions of a wheel, as it is ordered and dressed. [`crate::compensation::path::Wheel`] is the same wheel in the
+/// form that paths use.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(tag = "shape", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum WheelDimensions {
@@ -582,7 +583,7 @@ impl Default for RegistrationSettings {
 }
 
 impl Compensation {
-    /// Returns the rule that selects the gain: the share of the deviation that one cycle takes back.
+    /// Returns the rule that selects the gain: the share of the deviation that one correction removes.
     pub fn gain(&self) -> GainRule {
         self.gain.map_or(self.gain_by.unwrap_or_default(), GainRule::Fixed)
     }

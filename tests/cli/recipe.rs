@@ -461,7 +461,7 @@ const BAD_RECIPES: &[BadText] = &[
         "wide_mm",
         "did you mean `width_mm`",
     ),
-    (RECIPE, "accuracy_nm = 0.5", "accuracy_nm = 0.5\nspacing_mm = 1", "nominal.sampling", "sampling]", "keep one"),
+    (RECIPE, "accuracy_nm = 0.5", "accuracy_nm = 0.5\nspacing_mm = 1", "nominal.sampling", "sampling]", "exactly one"),
     (BICONIC, "projection = \"xy\"", "sampling = { spacing_mm = 1 }", "nominal.sampling", "sampling", "one source"),
 ];
 

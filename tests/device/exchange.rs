@@ -301,7 +301,7 @@ fn result_of_other_part_or_cycle_ignored() {
     }
     fs::remove_file(shop.inbox.join("SN_7_c2.csv")).unwrap();
     shop.put("notes.txt", &three());
-    bench.refused("notes.txt does not state that it belongs here, and its name does not match SN_7_c2.*");
+    bench.refused("notes.txt does not state that it is of this job, and its name does not match SN_7_c2.*");
     // A file that identifies its part and cycle can have any name.
     shop.put("export 0815.txt", &format!("# part: SN 7\n# cycle: 2\n{}", three()));
     assert!(bench.settled().answer.is_some());

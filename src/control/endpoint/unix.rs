@@ -24,13 +24,13 @@ pub(crate) type CellWriter = OwnedWriteHalf;
 /// Listening socket that accepts clients.
 pub(crate) struct Endpoint {
     listener: UnixListener,
-    /// Identity of the socket; `None` if it is not watched.
+    /// Identity of the socket file. `None` if it could not be read; the socket is then not watched.
     mark: Option<EndpointIdentity>,
-    /// True if only the user of this program and root may connect, whatever the file modes are.
+    /// True if only the user of this program and root may connect, independent of the permissions of the file.
     is_for_user: bool,
 }
 
-/// Path and identity of the socket of a door, to detect that it was removed or replaced.
+/// Path and identity of the socket file of an endpoint, to detect that the file was removed or replaced.
 #[derive(Clone)]
 pub(crate) struct EndpointIdentity {
     path: PathBuf,
@@ -59,7 +59,7 @@ impl Endpoint {
         Self::open_at(place.to_owned()).map(|door| Some(Self { is_for_user: true, ..door }))
     }
 
-    /// Returns the identity of the socket.
+    /// Returns the identity of the socket file; `None` if it could not be read.
     pub(crate) fn mark(&self) -> Option<EndpointIdentity> {
         self.mark.clone()
     }
@@ -76,7 +76,7 @@ impl Endpoint {
 }
 
 impl EndpointIdentity {
-    /// Returns true if the socket is still at the path where it was made.
+    /// Returns true if the socket file is still at the path where it was created.
     pub(crate) fn is_in_place(&self) -> bool {
         match identity(&self.path) {
             Ok(identity) => identity == self.identity,
@@ -85,7 +85,7 @@ impl EndpointIdentity {
         }
     }
 
-    /// Creates the socket again, with its folder.
+    /// Creates the socket again, and its folder if that is missing.
     pub(crate) fn open_again(&self) -> io::Result<Endpoint> {
         if let Some(folder) = self.path.parent() {
             std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -174,8 +174,8 @@ pub(crate) fn exchange_line_at(place: &Path, line: &[u8], patience: Duration) ->
     exchange_on(connect_trusted(place)?, line, patience)
 }
 
-/// Connects to a socket outside a run folder. Others can write to that place, so only a socket of this user or of root
-/// is used.
+/// Connects to a socket outside a run folder. Other users may be able to create files at that path, so the socket must
+/// belong to this user or to root.
 fn connect_trusted(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     if !is_trusted(std::fs::symlink_metadata(place)?.uid()) {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the socket belongs to another user"));
@@ -211,7 +211,7 @@ fn exchange_on(mut stream: std::os::unix::net::UnixStream, line: &[u8], patience
     }
 }
 
-/// Opens a lasting connection to the cell of a run folder.
+/// Opens a connection to the cell of a run folder, which stays open for many lines.
 pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
     UnixStream::connect(socket_path(folder)).await.map(UnixStream::into_split)
 }

@@ -68,7 +68,7 @@ impl Endpoint {
     }
 }
 
-/// Identity of a endpoint. It has no value on Windows, where no endpoint is watched.
+/// Identity of an endpoint. The type has no values on Windows, because no endpoint is watched there.
 #[derive(Clone)]
 pub(crate) enum EndpointIdentity {}
 
@@ -95,14 +95,15 @@ pub(crate) fn exchange_line_at(_: &Path, _: &[u8], _: Duration) -> io::Result<St
     Err(io::ErrorKind::NotFound.into())
 }
 
-/// Does nothing: a pipe ends with its last instance, and is in no folder.
+/// Does nothing: a pipe is not a file in the run folder, and the system removes it with its last instance.
 pub(crate) fn remove_endpoint(_: &Path) {}
 
 /// Accepted client.
 pub(crate) struct Client(NamedPipeServer);
 
 impl Client {
-    /// Returns the person at the other end, as identified by the operating system. It lets only this user connect.
+    /// Returns the person at the other end. It is the user of this program: the operating system lets no other user
+    /// connect.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let process = regrind_windows::client_process(&self.0);
         let station = process.map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
@@ -114,7 +115,7 @@ impl Client {
     }
 }
 
-/// Returns false without a check: a process can be suspended here only by a debugger, whose user knows about it.
+/// Returns false without a check: on Windows only a debugger can suspend this process, and its user knows about it.
 pub(crate) fn is_closed(_: &ClientReader) -> bool {
     false
 }
@@ -145,7 +146,7 @@ pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> i
     })
 }
 
-/// Opens a lasting connection to the cell of a run folder.
+/// Opens a connection to the cell of a run folder, which stays open for many lines.
 pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
     connect_pipe(&pipe_name(folder)?).await.map(tokio::io::split)
 }
@@ -163,8 +164,8 @@ async fn connect_pipe(name: &str) -> io::Result<NamedPipeClient> {
     }
 }
 
-/// Runs a future to its end from synchronous code. Only asynchronous code can stop waiting before a pipe answers, and
-/// the caller can itself be part of a runtime. The future therefore gets a thread and a runtime of its own.
+/// Runs a future to its end from synchronous code, on a thread with its own runtime. A future can be given a timeout,
+/// and the caller may already be part of another runtime.
 fn block_on_thread<T: Send + 'static>(what: impl Future<Output = io::Result<T>> + Send + 'static) -> io::Result<T> {
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)

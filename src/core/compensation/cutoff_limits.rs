@@ -6,9 +6,9 @@ use rayon::prelude::*;
 use super::MapError;
 use crate::geometry::DeviationSample;
 
-/// Number of readings whose neighbours are searched for the spacing; more would not change a median.
+/// Number of readings at which the distance to the neighbours is measured; more readings would not change the median.
 const PROBED: usize = 50;
-/// Share of the spacing on a square grid of as many readings; readings nearer to each other are repeats of one place.
+/// Distance below which two readings are repeats of one place, as a share of [`square_spacing_mm`].
 const SAME_PLACE: f64 = 0.02;
 
 /// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
@@ -24,7 +24,7 @@ pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
 /// not resolved by the points or cannot be ground by the wheel.
 ///
 /// # Errors
-/// A cut-off below this limit, with its cause and the remedy.
+/// Returns an error with cause and remedy if the cut-off is below this limit.
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
     let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
     // 10 % is the uncertainty of an estimated spacing.
@@ -64,7 +64,7 @@ pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     [median([0, 1]), median([2, 3])]
 }
 
-/// Returns the spacing that the same number of readings would have on a square grid over the same box.
+/// Returns the spacing that the same number of readings would have on a square grid over their bounding box.
 fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [width, depth] = [0, 1].map(|axis| {
         let along = readings.iter().map(|r| r.place_mm[axis]);
@@ -73,7 +73,8 @@ fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
 }
 
-/// Returns the distances of the nearest other places about +x, -x, +y and -y; infinite where none exists.
+/// Returns the distance to the nearest reading at another place in each of the four sectors about +x, -x, +y and -y;
+/// infinite for a sector without such a reading. A reading nearer than `same_mm` is a repeat of the same place.
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[DeviationSample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {

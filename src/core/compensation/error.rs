@@ -6,7 +6,7 @@ use super::filter::{MAX_FILTER_NODES, MIN_READINGS};
 use super::spline::SplineError;
 use crate::geometry::GridError;
 
-/// Error that prevents a map.
+/// Reason why no map can be computed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

@@ -36,11 +36,13 @@ pub(super) const MIN_READINGS: u32 = 6;
 /// Maximum number of nodes that a filter may work on; a short cut-off on a wide grid needs more nodes than the grid
 /// has.
 pub(super) const MAX_FILTER_NODES: f64 = 2e7;
-/// Maximum variance of a value, over that of one reading; a value above it is a guess.
+/// Maximum ratio of the variance of a filtered value to the variance of one reading. A node with a larger ratio is not
+/// supported.
 const MAX_VARIANCE: f64 = 2.0;
 
-/// Maximum mean square distance of the weighted readings, in variances of the weights: it is 2 in the open, 3.6
-/// between four readings half a cut-off apart, and more in a hole.
+/// Maximum spread of the readings around a node: their weighted variance along x plus that along y, in units of the
+/// squared standard deviation of the weights. It is 2 far from edges and holes, 3.6 between four readings half a
+/// cut-off apart, and more in a hole.
 const MAX_SPREAD: f64 = 4.5;
 
 /// Order of the polynomial that the filter lets pass unchanged.
@@ -48,17 +50,19 @@ const MAX_SPREAD: f64 = 4.5;
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum FilterOrder {
-    /// Constants pass: the plain weighted mean, which is biased at edges with a slope.
+    /// Order 0: constants pass unchanged. The filter is a weighted mean, which is biased at an edge where the surface
+    /// slopes.
     Constant,
-    /// Planes pass.
+    /// Order 1: planes pass unchanged.
     #[default]
     Plane,
-    /// Quadrics pass.
+    /// Order 2: quadrics pass unchanged.
     Quadric,
 }
 
 impl FilterOrder {
-    /// Returns alpha, the width of the weights over the cut-off, with which one half passes at the cut-off.
+    /// Returns alpha, the ratio of the width of the weights to the cut-off. With this ratio half of the amplitude of a
+    /// wave at the cut-off passes.
     ///
     /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u).
     /// Each is one half at u = ln 2 and at u = 1.678347, respectively, and alpha = sqrt(u / pi).
@@ -69,7 +73,8 @@ impl FilterOrder {
         }
     }
 
-    /// Returns the share of a wave's amplitude that passes in the open, for a wavelength in cut-offs.
+    /// Returns the share, from 0 to 1, of the amplitude of a wave that passes far from edges and holes.
+    /// `wavelength_in_cutoffs` is the wavelength divided by the cut-off.
     pub fn transmission(self, wavelength_in_cutoffs: f64) -> f64 {
         let u = PI * (self.alpha() / wavelength_in_cutoffs).powi(2);
         if self == Self::Quadric { (1.0 + u) * (-u).exp() } else { (-u).exp() }
@@ -113,17 +118,17 @@ pub(super) struct FilterResult {
     pub values: Vec<f64>,
     /// Slopes of the fitted polynomial along x and y, per millimetre.
     pub slopes: Vec<[f64; 2]>,
-    /// Share that a reading of weight 1 at the node has in the value there.
+    /// Leverage: change of the filtered value at the node per unit change of a reading of weight 1 at the node.
     pub leverage: Vec<f64>,
-    /// Variance of the value over that of one reading.
+    /// Ratio of the variance of the filtered value to the variance of one reading.
     pub variance: Vec<f64>,
-    /// True for a node with enough readings around it that do not all lie to one side.
+    /// True for a node that has enough readings around it, not all of them on one side.
     pub supported: Vec<bool>,
 }
 
 impl GaussianFilter {
-    /// Returns the product of leverage and density in the open: the share of a reading in the value at its place,
-    /// times the number of readings per square millimetre.
+    /// Returns the product of leverage and density far from edges and holes: the leverage of a reading at its own
+    /// place, times the number of readings per square millimetre.
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
         if self.order == FilterOrder::Quadric { 2.0 / weight } else { 1.0 / weight }
@@ -223,7 +228,8 @@ impl GaussianFilter {
     }
 }
 
-/// Value, slopes per standard deviation, leverage and variance at a node that is supported.
+/// Value, slopes along x and y per standard deviation of the weights, leverage and relative variance of the fit at a
+/// node; `None` if the node is not supported.
 type NodeFit = Option<[f64; 5]>;
 
 fn gathered(grid: &Grid, sigma_mm: f64, nodes: impl Iterator<Item = NodeFit>) -> FilterResult {
@@ -261,7 +267,8 @@ fn fit_node(order: FilterOrder, sums: &[Vec<Vec<f64>>; 3], i: usize) -> NodeFit 
     }
 }
 
-/// Solves the normal equations of a polynomial of P terms about a node; returns `None` if the node is not supported.
+/// Solves the normal equations of a polynomial of P terms about a node. `weight`, `value` and `weight2` are the moments
+/// of the weights, of the weighted values and of the squared weights. Returns `None` if the node is not supported.
 fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> NodeFit {
     if is_one_sided(weight) {
         return None;
@@ -279,10 +286,10 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     (variance <= MAX_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
 }
 
-/// Returns true if the readings lie on a line, farther to one side than their own spread, or all far away, as around
-/// a hole.
+/// Returns true if the readings around a node lie on a line, all to one side of the node, or all far from it as around
+/// a hole. A polynomial at the node would then extrapolate, or bridge an area without any reading.
 ///
-/// There a polynomial would extrapolate, or bridge an area without any reading.
+/// `m` holds the moments of the weights.
 fn is_one_sided(m: &[f64; MOMENTS]) -> bool {
     let (mx, my) = (m[1] / m[0], m[2] / m[0]);
     let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
@@ -293,7 +300,7 @@ fn is_one_sided(m: &[f64; MOMENTS]) -> bool {
     !inside || spread > MAX_SPREAD
 }
 
-/// Sampled sums on a grid with a border that is as wide as the reach.
+/// Sums of the readings at the nodes of a grid. The grid is extended on all sides by the reach of the weights.
 struct GridSums {
     columns: usize,
     rows: usize,
@@ -402,8 +409,8 @@ fn spread_reading(
     }
 }
 
-/// Returns the sampled kernels that give the moments t^0 .. t^most of the weights exp(-(scale t)^2 / 2) after
-/// spreading.
+/// Returns one sampled kernel for each power k from 0 to `most`. After the spreading, kernel k gives the moment t^k of
+/// the weights exp(-(scale t)^2 / 2).
 ///
 /// t is the distance of a reading from the node in standard deviations, `step` the spacing of the nodes and `spread`
 /// the width of the spreading, both in the same unit. With G the required Gaussian, G = S * T for the spreading S and
@@ -431,7 +438,7 @@ fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<
         .collect()
 }
 
-/// Sums of one channel along x, for each power of x.
+/// Sums along x of one channel (weights, weighted values or squared weights), for each power of x.
 struct RowSums {
     columns: usize,
     powers: Vec<Vec<f64>>,
@@ -475,7 +482,7 @@ impl RowSums {
     }
 }
 
-/// Cumulative sums of readings to the left and below, which give the number of readings in any rectangle of nodes.
+/// Summed-area table of the readings: gives the number of readings in any rectangle of nodes.
 struct ReadingCounts {
     grid: Grid,
     sums: Vec<u32>,
@@ -502,7 +509,7 @@ impl ReadingCounts {
         Self { grid: *grid, sums }
     }
 
-    /// Returns the number of readings in the square around a node.
+    /// Returns the number of readings in the square with the half side `half_side_mm` around a node.
     fn within(&self, i: usize, j: usize, half_side_mm: f64) -> u32 {
         let range = |at: usize, k: usize, nodes: usize| {
             let reach = (half_side_mm / self.grid.spacing_mm[k]).round().min(1e9) as usize;
@@ -522,7 +529,8 @@ pub(super) struct Trend {
 }
 
 impl Trend {
-    /// Fits a polynomial of a degree up to 2, or of a lower degree if the readings do not determine this one.
+    /// Fits a polynomial of this degree, at most 2. If the readings do not determine it, fits the highest degree below
+    /// it that they determine.
     pub fn fit(places: &[[f64; 2]], values: &[f64], degree: usize) -> Self {
         let [low, high] = bounds(places.iter().copied());
         let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
@@ -586,8 +594,9 @@ impl FilterResult {
 
     /// Returns value, leverage and variance at a place of the grid; `None` if no node around it is supported.
     ///
-    /// The values plus half the slopes of the four nodes around a place, weighted as for a bilinear value, are right
-    /// up to the third derivative: the error of the one cancels the error of the other.
+    /// Interpolates bilinearly between the four nodes around the place. Each node contributes its value plus half of
+    /// the rise along its slope from the node to the place. This is exact for quadrics: the second-order error of the
+    /// values cancels that of the slopes. If a node is not supported, the others contribute with their full slopes.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
         let grid = &self.grid;
         let [(i, u), (j, v)] = grid.cell(place);

@@ -33,34 +33,35 @@ use super::map::{ErrorMap, MapOptions, filter_grid};
 use super::response::{Response, ResponseKind};
 use crate::geometry::Grid;
 
-/// Process noise: variance that one pass adds to that of the estimate of R, over the variance of N.
+/// Process noise q of one pass: increase of the variance of the estimate of R, relative to the variance of N.
 const PROCESS_NOISE: f64 = 0.02;
-/// Process noise from one part to the next: another blank, a newly dressed wheel, a machine that has cooled.
+/// Process noise between two parts, in the same ratio. It allows for another blank, a newly dressed wheel, and a
+/// machine that has cooled.
 const PROCESS_NOISE_TO_NEXT_PART: f64 = 0.3;
 /// Threshold for a change of the machine: number of standard deviations by which the mean square of the innovation
 /// exceeds its expectation. Below it the innovation counts as noise.
 const CHANGED_SIGMAS: f64 = 6.0;
-/// Number of values of the noise that make one independent value: noise is correlated over longer distances than the
-/// shortest waves.
+/// Number of correlated values of the noise that carry as much information as one independent value. The noise is
+/// correlated over longer distances than the shortest waves.
 pub(super) const VALUES_PER_INDEPENDENT_VALUE: f64 = 4.0;
-/// Standard uncertainty of s before any pass has answered.
+/// Standard uncertainty of the response s before the first measured response.
 const RESPONSE_SIGMA: f64 = 0.1;
-/// Standard uncertainty that another part adds to s.
+/// Standard uncertainty of the response s that a change to another part adds in quadrature.
 const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
-/// Limits of a credible response; one outside them has other causes than the correction and is ignored.
+/// Range of credible responses. A response outside it has other causes than the correction and is ignored.
 pub(super) const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
-/// Rule for the share of an error that a correction removes.
+/// Rule for the gain: the share of an error that the correction takes back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum GainRule {
-    /// Always the same share of the newest error.
+    /// Constant gain on the newest error: the value.
     #[cfg_attr(feature = "schema", schemars(skip))]
     Fixed(f64),
-    /// One share for all wavelengths, estimated from the errors of the passes that repeat and that do not.
+    /// One gain for all wavelengths, estimated from the repeatable and the non-repeatable error of the passes.
     Adaptive,
-    /// The same estimate for each octave of wavelengths separately.
+    /// One gain for each octave of wavelengths, estimated in the same way.
     #[default]
     Wavelength,
 }
@@ -70,15 +71,15 @@ pub enum GainRule {
 pub(super) struct Band {
     /// Shortest wavelength of the band, in millimetres.
     pub(super) from_mm: f64,
-    /// Variance of the mean over that of N; `None` while nothing is known.
+    /// Ratio p of the variance of the mean to the variance of N; `None` before the first estimate.
     pub(super) belief: Option<f64>,
-    /// Sum of the estimates of the variance of N, in square millimetres, and their weighted count.
+    /// Weighted sum of the estimates of the variance of N, in square millimetres, and sum of their weights.
     pub(super) scatter: [f64; 2],
-    /// Gain of the newest pass in the mean.
+    /// Weight of the newest pass in the mean: the Kalman gain g.
     pub(super) gain: f64,
-    /// Share of the mean that remains after shrinkage.
+    /// Share of the mean that remains after shrinkage, from 0 to 1.
     pub(super) share: f64,
-    /// True if the last pass was treated as that of a machine that has changed.
+    /// True if the innovation of the last pass was treated as a change of the machine.
     pub(super) changed: bool,
     /// Share of the mean that still comes from other machines; it is no evidence of this machine.
     #[serde(default, skip_serializing_if = "is_zero")]
@@ -111,14 +112,14 @@ pub struct LearningState {
     pub(super) response: [f64; 2],
     /// Bands from the shortest waves to the longest.
     pub(super) bands: Vec<Band>,
-    /// Band of all wavelengths together: bands overlap, so that their noise variances do not add up to that of the
-    /// whole.
+    /// Estimate for all wavelengths together. It is separate because the bands overlap: the sum of their noise
+    /// variances is not the variance of the whole.
     pub(super) whole: Band,
     /// Number of passes that this state was learned from.
     passes: u32,
     /// Estimate of R, on the grid of the correction.
     pub(super) mean: Option<MeanError>,
-    /// Correction of the pass after the last one processed, in millimetres, on the grid of the correction.
+    /// Correction of the next pass, in millimetres, on the grid of the correction; `None` before a pass of this part.
     #[serde(skip)]
     pub(super) wanted_mm: Option<Vec<f64>>,
 }
@@ -193,7 +194,7 @@ impl LearningState {
 
     /// Updates the state with the error of a pass; afterwards [`Self::next_correction_mm`] returns the next correction.
     ///
-    /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
+    /// A pass that was not ground as commanded changes no estimate, and its correction is commanded again.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
         if seen
@@ -243,7 +244,7 @@ impl LearningState {
         self.wanted_mm.as_deref()
     }
 
-    /// Returns the state that the next part of the same kind begins with.
+    /// Returns the initial state for the next part of the same kind.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -255,7 +256,8 @@ impl LearningState {
         known
     }
 
-    /// Returns the expected error of the pass after this error, for scallops of the given rms between its tracks.
+    /// Returns the forecast of the error after the next pass. `error` is the error after the last pass, `scallops_mm`
+    /// the rms of the scallops between the tracks.
     ///
     /// Structure too fine for the map remains: the noise of the points, and the scallops. A probe that reaches the
     /// bottom of the grooves has already measured the scallops. So the larger of the measured residuals and the known
@@ -342,7 +344,7 @@ impl LearningState {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits values on the grid of an error into their parts in each band; the parts add up to the values.
+    /// Splits values on the grid of an error into one part for each band; the parts add up to the values.
     pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -355,7 +357,8 @@ impl LearningState {
         parts
     }
 
-    /// Returns the noise of the measured points in each band of a map, as a mean square, given that of the whole map.
+    /// Returns the mean square of the noise of the measured points in each band of a map. `whole_mm2` is the mean
+    /// square of this noise in the whole map.
     ///
     /// Equation: white noise that passes a Gaussian of width s has a power of 1 / s^2. Between two Gaussians of
     /// widths s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of
@@ -371,8 +374,8 @@ impl LearningState {
 }
 
 impl MeanError {
-    /// Returns the mean times a factor on a grid: unchanged on its own grid, interpolated on another one, 0 if there
-    /// is no mean.
+    /// Returns the mean, multiplied by `factor`, on a grid. On its own grid nothing is interpolated. If `mean` is
+    /// `None`, all values are 0.
     fn resampled(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
@@ -411,8 +414,8 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
-    /// Returns true if no pass has yet estimated the noise of this band, and only that of all bands together is
-    /// stated.
+    /// Returns true if the noise of this band comes only from a stated total or from other machines, and no own pass
+    /// has estimated it.
     fn is_guessed(&self) -> bool {
         self.scatter[1] > 0.0 && self.scatter[1] < 1.0
     }
@@ -444,8 +447,9 @@ impl Band {
         self.borrowed *= 1.0 - self.gain;
     }
 
-    /// Computes the share of the mean that remains, from its mean square; `noise_mm2` is the noise of the points
-    /// alone.
+    /// Updates the share of the mean that remains after shrinkage. `mean_mm2` is the mean square of the mean.
+    /// `noise_mm2` is the mean square of the noise of the points; it counts only while the noise N of the band is
+    /// unknown.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
@@ -462,13 +466,15 @@ impl Band {
     }
 }
 
-/// Returns the number of independent values on an area for waves longer than `from_mm`: [`VALUES_PER_INDEPENDENT_VALUE`] squares with
-/// sides of twice this wavelength make one.
+/// Returns the number of independent values on an area for waves longer than `from_mm`.
+/// [`VALUES_PER_INDEPENDENT_VALUE`] squares, each with sides of twice this wavelength, make one independent value.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
     (area_mm2 / (2.0 * from_mm).powi(2) / VALUES_PER_INDEPENDENT_VALUE).max(1.0)
 }
 
-/// Returns the response and its standard uncertainty after a new answer, as a mean weighted by inverse variance.
+/// Returns the response and its standard uncertainty, combined with a newly measured response by inverse variances.
+/// `independent` is the number of independent values of the measurement. A response outside [`RESPONSE_LIMITS`] changes
+/// nothing.
 fn combine_responses([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
     let [least, most] = RESPONSE_LIMITS;
     if !(least..=most).contains(&answer.slope) {

@@ -5,7 +5,7 @@ use crate::geometry::Grid;
 /// Values at every node of a grid, with the source node of each.
 pub(super) struct Levelled {
     pub values: Vec<f64>,
-    /// Nearest node with a value of its own; the node itself if it has one.
+    /// Index of the source node: the nearest node with a value of its own, or the node itself if it has one.
     pub sources: Vec<usize>,
 }
 

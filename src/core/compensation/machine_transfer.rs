@@ -28,9 +28,9 @@
 use super::learning::{Band, LearningState, MeanError, RESPONSE_LIMITS, ResampledError, VALUES_PER_INDEPENDENT_VALUE};
 use crate::geometry::Grid;
 
-/// Minimum variance of the mean over that of N: that after one pass.
+/// Minimum ratio of the variance of the mean to the variance of N: the ratio after one pass.
 const MIN_VARIANCE_RATIO: f64 = 1.0;
-/// Standard deviation of the response between machines, before any is known.
+/// Standard deviation of the response between machines that is assumed before any response is known.
 const RESPONSE_SIGMA_BETWEEN_MACHINES: f64 = 0.05;
 /// Number of machines that [`RESPONSE_SIGMA_BETWEEN_MACHINES`] weighs as.
 const PRIOR_MACHINES: f64 = 2.0;
@@ -40,14 +40,15 @@ const MAX_OWN_SHARE: f64 = 0.5;
 /// Maximum share of a mean that comes from other machines; above it the mean carries no information on its own
 /// machine.
 const MAX_BORROWED_SHARE: f64 = 0.5;
-/// Maximum repeatable error at any place, in millimetres.
+/// Maximum plausible repeatable error at any place, in millimetres.
 const MAX_MEAN_MM: f64 = 1.0;
-/// Maximum number of steps of a comparison.
+/// Maximum number of computation steps of a comparison: nodes times (columns plus rows) times bands.
 const MAX_STEPS: f64 = 1e9;
 /// Relative difference below which two bands begin at the same wavelength.
 const SAME: f64 = 1e-9;
 
-/// Estimate from comparisons of the share of the repeatable error that is a machine's own.
+/// Similarity of machines: the share of the repeatable error that is a machine's own, estimated from comparisons of two
+/// machines.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MachineSimilarity {
     comparisons: Vec<Comparison>,
@@ -55,10 +56,10 @@ pub struct MachineSimilarity {
 
 #[derive(Clone, Debug, PartialEq)]
 struct Comparison {
-    /// True if the machine that is to begin is one of the two.
+    /// True if one of the two machines is the machine that receives the initial state.
     is_own: bool,
     /// Shortest wavelength of each band, in millimetres, and the share of its power that is the machine's own; `None`
-    /// if it was not comparable.
+    /// if the band was not comparable.
     shares: Vec<(f64, Option<f64>)>,
     /// The same share for all bands together.
     whole: f64,
@@ -75,7 +76,7 @@ pub struct TransferredState {
     pub own_shares: Vec<[f64; 2]>,
 }
 
-/// Observation of a band by one machine.
+/// Repeatable error in one band, as the passes of one machine show it.
 struct BandEvidence {
     values_mm: Vec<f64>,
     mean_mm2: f64,
@@ -86,15 +87,15 @@ struct BandEvidence {
 }
 
 impl MachineSimilarity {
-    /// Adds a person's statement: the rms share of the repeatable error that is a machine's own, in all wavelengths.
-    /// It weighs as one comparison.
+    /// Adds a person's estimate as one comparison. `rms_share` is the rms of a machine's own repeatable error divided
+    /// by the rms of the whole repeatable error; it applies to all wavelengths.
     pub fn add_statement(&mut self, rms_share: f64) {
         let share = rms_share * rms_share;
         self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
     }
 
-    /// Compares the states of two machines for one recipe, in any order, and returns true if they are comparable;
-    /// `is_own` is true if one of them is the machine that is to begin.
+    /// Adds a comparison of the states of two machines for one recipe, in any order, and returns true if at least one
+    /// band is comparable. `is_own` is true if one of the two is the machine that receives the initial state.
     pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
         let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
         if !has_same_bands(one, other) {
@@ -120,8 +121,8 @@ impl MachineSimilarity {
         self.comparisons.len()
     }
 
-    /// Returns the share of the power of waves from a wavelength on that is a machine's own; `None` if no comparison
-    /// covers it.
+    /// Returns the machine's own share of the power in the band that starts at the wavelength `from_mm`; `None` if no
+    /// comparison covers this band.
     pub fn own_share(&self, from_mm: f64) -> Option<f64> {
         let all = self.expected_share(from_mm, |_| true)?;
         Some(self.expected_share(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
@@ -136,8 +137,8 @@ impl MachineSimilarity {
 }
 
 impl Comparison {
-    /// Returns the share in the band of this wavelength; the longest band of a smaller part contains all longer
-    /// waves.
+    /// Returns the machine's own share in the band that contains this wavelength. The longest band of a smaller part
+    /// contains all longer waves.
     fn share(&self, from_mm: f64) -> Option<f64> {
         let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
         share.map(|share| share.max(self.whole))
@@ -150,12 +151,12 @@ impl LearningState {
     /// The state can be unfit even if [`LearningState::is_valid`] returns true.
     pub fn transfer_obstacle(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
-            return Some("a mean has no uncertainty".into());
+            return Some("a learned mean error has no uncertainty".into());
         }
         let MeanError { grid, values_mm } = self.mean.as_ref()?;
         let most_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
         if most_mm > MAX_MEAN_MM {
-            return Some(format!("a mean of {most_mm:.3e} mm, limit {MAX_MEAN_MM} mm"));
+            return Some(format!("a learned mean error of {most_mm:.3e} mm, limit {MAX_MEAN_MM} mm"));
         }
         let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
         let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
@@ -163,9 +164,12 @@ impl LearningState {
         (steps > MAX_STEPS).then(why)
     }
 
-    /// Returns the initial state from the states of other machines for the same recipe, on the grid of the
-    /// correction, as far as machines are similar; `None` if no other state is usable. `self` is the state without
-    /// them.
+    /// Returns the initial state of a machine that has not ground the recipe, from the states of other machines that
+    /// have.
+    ///
+    /// `self` is the state of the machine without this transfer, `others` are the states of the other machines, and
+    /// `grid` is the grid of the correction. Only the bands in which machines are similar are taken over. Returns
+    /// `None` if no other state has a mean in the same bands.
     #[must_use]
     pub fn seeded_from(&self, others: &[&Self], alike: &MachineSimilarity, grid: Grid) -> Option<TransferredState> {
         let others: Vec<&Self> =
@@ -214,8 +218,8 @@ fn zero_error(grid: Grid) -> ResampledError {
     ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
 }
 
-/// Returns what the passes of a machine show of each band, on a grid; `None` if its variance is unknown, or if most
-/// of it comes from other machines.
+/// Returns the evidence of a machine for each band, on a grid; `None` for a band whose variance is unknown, or whose
+/// mean comes mostly from other machines.
 fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>> {
     let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
     let on_grid = zero_error(*grid);
@@ -231,7 +235,8 @@ fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>
     known.bands.iter().zip(parts).map(of_band).collect()
 }
 
-/// Returns the power in a band that is the machine's own, and all of its power; `None` if no power exceeds the noise.
+/// Returns two mean squares of the repeatable error of two machines in a band, in mm²: of the part that is a machine's
+/// own, and of the whole. Returns `None` if the whole does not exceed the noise.
 fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
     let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
     let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
@@ -257,7 +262,8 @@ fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option
     Some((values_mm, own + common / rest))
 }
 
-/// Returns the band of all wavelengths together, with the non-repeatable error of the others unless it has its own.
+/// Returns the estimate for all wavelengths together. If `own` has no estimate of the non-repeatable error, the mean of
+/// the other machines is used.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
@@ -272,8 +278,9 @@ fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     Band { belief, borrowed: 1.0, ..with }
 }
 
-/// Returns the expected response and its standard uncertainty, from the responses of the others, as far as machines
-/// differ in it, and from the earlier estimate.
+/// Returns the expected response of a machine and its standard uncertainty. It is the mean response of the other
+/// machines combined with the earlier estimate, weighted by inverse variances. The variance between machines is
+/// included.
 fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
     let n = others.len() as f64;
     let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;

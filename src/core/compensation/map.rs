@@ -128,7 +128,7 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
         let all = wide.robust(&kept);
         let far = all.find_far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
             advice.push(
-                "more than 10 % of the points stand out, so none is rejected; clean the part and the probe".to_owned(),
+                "over 10 % of the points would be outliers, so none is rejected; clean the part and probe".to_owned(),
             );
             FarReadings::default()
         });
@@ -163,9 +163,8 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
 
 /// Filters the residuals of features again and adds the result, until at least half of each feature is in the
 /// surface.
-///
-/// `features` holds indices of readings, with their heights over the surface around. A chip that covers two targets
-/// is narrower than the filter.
+/// `features` holds the index of a reading of each feature and its height above the surface around it. A chip that
+/// covers only two touches is narrower than the filter.
 fn preserve_features(
     filtered: &mut FilterResult,
     gaussian: &GaussianFilter,
@@ -198,11 +197,11 @@ fn preserve_features(
     }
 }
 
-/// Returns the map of a form that a model predicts at many places, through the filter of the map.
+/// Filters a form that a model predicts at many places, and returns its map.
 ///
-/// Each place has its standard uncertainty, in millimetres, which passes the filter as the form does. A predicted
-/// form has no noise of its own: no reading is rejected as an outlier. The noise of the points, `scatter_mm`, is that
-/// of the model.
+/// `told` holds each predicted deviation with its standard uncertainty in millimetres. The uncertainties pass the
+/// filter as the form does. A predicted form has no noise of its own, so no reading is rejected as an outlier.
+/// `scatter_mm` is the standard deviation of the noise of a point, as the model gives it.
 ///
 /// # Errors
 /// Those of [`error_map`].
@@ -222,12 +221,12 @@ pub fn map_from_model(
     Ok(ErrorMap { sigma_mm, residual_sigma_mm, point_sigma_mm: scatter_mm, ..map })
 }
 
-/// Filter of the surface that readings are compared with; its cut-off is at least four distances between them. With a
-/// shorter one a reading is compared mostly with itself.
+/// Filter for the reference surface, from which outliers and the noise of a reading are determined. Its cut-off is at
+/// least four distances between readings: with a shorter cut-off a reading would be compared mostly with itself.
 struct ReferenceFilter {
     gaussian: GaussianFilter,
     grid: Grid,
-    /// True if it is the filter of the map.
+    /// True if this filter and the filter of the map are the same.
     is_map_filter: bool,
 }
 
@@ -292,7 +291,7 @@ fn refined_grid(grid: &Grid, gaussian: &GaussianFilter) -> Result<Grid, MapError
     Ok(Grid { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: grid.first_mm, spacing_mm })
 }
 
-/// Result at the nodes of a map, before it levels off.
+/// Values at the nodes of a map, before the nodes outside the measured area are filled.
 struct UnlevelledMap {
     values: Vec<f64>,
     slopes: Vec<[f64; 2]>,
@@ -403,7 +402,7 @@ pub struct FilteredGrid {
     pub values: Vec<f64>,
     /// True for a node with enough valid values around it.
     pub valid: Vec<bool>,
-    /// Number of times that the filter was applied: 1 for the plain form.
+    /// Number of times that the filter was applied: 1 if it is not robust.
     pub rounds: usize,
 }
 

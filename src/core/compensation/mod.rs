@@ -1,10 +1,10 @@
 //! Compensation: turns deviations into a map and the map into a correction, and checks the response of the part.
 //!
 //! ```text
-//!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
-//!  (scattered)               (filtered, on a grid)           (absolute, versioned)              (answer as commanded?)
+//!  deviations --error_map--> ErrorMap --next_pass--> Correction --(ground, measured)--> Response
+//!  (scattered)               (filtered, on a grid)   (absolute, versioned)              (change as commanded?)
 //!      |
-//!      +--parameters--> Parameters --Set--> (wheel radius, setting, tilt: corrected as such, not baked into the map)
+//!      +--estimate_parameters--> ParameterEstimation --from_values--> ParameterCorrections (not part of the map)
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units:

@@ -1,4 +1,4 @@
-//! Correction of the next pass: the correction so far less the error found, within limits.
+//! Correction of the next pass: the last correction minus the error to compensate, within limits.
 
 use thiserror::Error;
 
@@ -10,13 +10,14 @@ use super::parameters::ParameterCorrections;
 /// Limits of a correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CorrectionLimits {
-    /// Depth of a pass below the one before, in millimetres; a pass is deeper where it must be to cut everywhere.
+    /// Standard depth of a pass below the previous pass, in millimetres. A pass is deeper if this is necessary to cut
+    /// everywhere.
     pub depth_of_cut_mm: f64,
     /// Minimum depth of removal at any place, in millimetres.
     pub min_depth_mm: f64,
     /// Maximum correction at any place, in millimetres.
     pub max_correction_mm: f64,
-    /// Level of the first pass, in millimetres; removal is counted from it.
+    /// Level of the first pass, in millimetres: the zero point of the total removal.
     pub allowance_mm: f64,
     /// Maximum total removal below the surface of the first pass, in millimetres.
     pub removal_budget_mm: f64,
@@ -33,11 +34,11 @@ pub struct NextPass {
     pub depth_mm: f64,
     /// Total removal below the surface of the first pass, at the place of the most removal, in millimetres.
     pub removed_mm: f64,
-    /// Predicted share of the part where the wheel does not cut.
+    /// Predicted share of the part where the wheel does not cut, from 0 to 1.
     pub air_share: f64,
 }
 
-/// Error that prevents a next pass.
+/// Reason why no next pass is possible.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

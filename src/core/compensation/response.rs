@@ -29,9 +29,9 @@ pub enum ResponseKind {
     MirroredY,
     /// As if the map had been turned by half a turn, or by a quarter.
     Turned,
-    /// As commanded, but far more: as if the map had been applied twice.
+    /// As commanded, but much larger: as if the map had been applied twice.
     Doubled,
-    /// Not at all.
+    /// No change, although one was commanded.
     NoEffect,
     /// The commanded change is too small compared with the noise for a decision.
     Unclear,
@@ -52,7 +52,8 @@ pub struct Response {
     pub sense: ResponseKind,
 }
 
-/// Share of the unexplained variance of the straight map; a mirrored or turned map must leave less than this.
+/// Maximum ratio of the unexplained variance of a mirrored or turned map to that of the straight map. With a larger
+/// ratio a mirrored or turned map is not the cause.
 const CLEARLY_BETTER: f64 = 0.5;
 /// Share of the response's variance that may stay unexplained before mirrored and turned maps are considered.
 const WELL_EXPLAINED: f64 = 0.05;
@@ -149,11 +150,11 @@ fn regress(asked: &[f64], answer: &[f64]) -> Regression {
     }
 }
 
-/// Changes by motions of the part: they span all changes that registration removes from a map.
+/// Projector that removes the changes by motions of the part. Registration removes these changes from a map.
 struct MotionProjector {
     /// Change by each of the six motions at each place, with lengths in units of the part's size.
     rows: Vec<Vector6<f64>>,
-    /// Pseudo-inverse of their sum of squares; on a flat part some motions change nothing.
+    /// Pseudo-inverse of the sum of row times row transposed over `rows`; on a flat part some motions change nothing.
     inverse: Matrix6<f64>,
 }
 
@@ -175,7 +176,7 @@ impl MotionProjector {
         Self { inverse: inverse.sum(), rows }
     }
 
-    /// Returns values at the places without the part that a motion explains.
+    /// Returns the values at the places minus the part of them that a motion explains.
     fn without(&self, mut values: Vec<f64>) -> Vec<f64> {
         let seen: Vector6<f64> = self.rows.iter().zip(&values).map(|(row, v)| row * *v).sum();
         let motion = self.inverse * seen;

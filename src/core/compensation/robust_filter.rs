@@ -20,12 +20,12 @@ use crate::geometry::{Grid, Point, PointTree};
 const ROUNDS: usize = 15;
 /// Relative change of c below which the filter has converged.
 const SETTLED: f64 = 0.01;
-/// c over the median of the absolute residuals.
+/// Ratio of the limit c to the median of the absolute residuals.
 const BIWEIGHT: f64 = 4.4;
-/// Standard deviation over the median of the absolute values, for a normal distribution.
+/// Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
 const SIGMA_OVER_MEDIAN: f64 = 1.482_602_218_505_602;
-/// Minimum freedom of a residual, its variance over that of a reading; below it the residual carries no information
-/// on its reading.
+/// Minimum freedom of a residual: the ratio of its variance to the variance of a reading. A residual with less freedom
+/// carries no information on its reading.
 const MIN_FREEDOM: f64 = 0.02;
 /// Minimum number of readings for a noise estimate to compare with.
 const MIN_READINGS: usize = 20;
@@ -35,7 +35,8 @@ const MIN_SCALE_MM: f64 = 1e-6;
 const MIN_LIMIT_SHARE: f64 = 0.5;
 /// Minimum share of the height of a reading by which a neighbour must be off to confirm it.
 const MIN_HEIGHT_SHARE: f64 = 0.25;
-/// Number of readings around one; those that are no neighbours give the plane to compare with.
+/// Number of nearest readings that are examined around a reading. The plane of comparison is fitted to those of them
+/// that are no neighbours.
 const AROUND: usize = 48;
 /// Maximum distance of a neighbour along both axes, in spacings: on a grid there are eight.
 const NEIGHBOUR: f64 = 1.5;
@@ -44,6 +45,8 @@ const NEIGHBOUR: f64 = 1.5;
 const SAME_PLACE: f64 = 0.25;
 
 /// Result of the robust filter.
+///
+/// All vectors have one entry for each reading, in the order of the readings.
 #[derive(Clone, Debug)]
 pub(super) struct RobustResult {
     pub filtered: FilterResult,
@@ -51,7 +54,7 @@ pub(super) struct RobustResult {
     pub weights: Vec<f64>,
     /// Residual of every reading; `NaN` where there is no surface.
     pub residuals: Vec<f64>,
-    /// Residual over the square root of its freedom; `NaN` if the freedom is too small.
+    /// Residual divided by the square root of its freedom; `NaN` if the freedom is below [`MIN_FREEDOM`].
     pub scaled_residuals: Vec<f64>,
     /// Standard deviation of one reading.
     pub sigma: f64,
@@ -63,7 +66,7 @@ pub(super) struct RobustResult {
 pub(super) struct Residuals {
     /// Reading minus surface; `NaN` where there is no surface.
     pub values: Vec<f64>,
-    /// Variance of a residual over that of a reading.
+    /// Freedom: ratio of the variance of a residual to the variance of a reading.
     pub freedom: Vec<f64>,
 }
 
@@ -92,8 +95,8 @@ impl Residuals {
         self.values.iter().zip(&self.freedom).map(each).collect()
     }
 
-    /// Returns the standard deviation of one reading: the square root of the residuals' sum of squares over their
-    /// freedom.
+    /// Returns the standard deviation of one reading: the square root of the sum of the squared residuals divided by
+    /// the sum of their freedoms.
     pub fn sigma(&self) -> f64 {
         let known = (0..self.values.len()).filter(|&k| self.freedom[k] > MIN_FREEDOM && self.values[k].is_finite());
         let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.values[k].powi(2), f + self.freedom[k]));
@@ -113,7 +116,8 @@ pub(super) fn filter_robust(
     iterate(gaussian.filter_scattered(places, values, None, grid), values.len(), again, compare)
 }
 
-/// Alternates filtering and weighting, starting from the result of the plain filter.
+/// Alternates filtering and weighting, starting from `first`, the result of the plain filter. `again` filters with
+/// given weights, `compare` returns the residuals from a filtered surface, and `count` is the number of readings.
 pub(super) fn iterate(
     first: FilterResult,
     count: usize,
@@ -154,10 +158,10 @@ pub(super) struct FarReadings {
 }
 
 impl RobustResult {
-    /// Returns the readings far from the surface.
+    /// Returns the readings far from the surface: with a scaled residual above `limit` standard deviations.
     ///
-    /// `apart` is the distance of neighbouring readings along x and y. Returns `None` if more than a tenth would be
-    /// outliers: then they are no exception, and no other rule defines the surface.
+    /// `apart` is the distance of neighbouring readings along x and y. Returns `None` if more than a tenth of the
+    /// readings would be outliers: so many are no exception, and the surface itself is doubtful.
     pub fn find_far(
         &self,
         (places, values): (&[[f64; 2]], &[f64]),
@@ -192,7 +196,8 @@ impl RobustResult {
         (outliers.len() * 10 <= places.len()).then_some(FarReadings { outliers, features })
     }
 
-    /// Returns true if one of the eight neighbours is off to the same side too; `off` is sorted along x.
+    /// Returns true if one of the eight neighbours of the reading `off[n]` deviates to the same side, by at least
+    /// [`MIN_HEIGHT_SHARE`] of its height. `off` holds the candidate readings, sorted along x.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
@@ -226,8 +231,9 @@ struct ReadingIndex<'r> {
 }
 
 impl ReadingIndex<'_> {
-    /// Returns true if a neighbour of a reading is above the plane through the readings around both, by at least
-    /// `least` and a quarter of the reading's height; `side` is the sign of up.
+    /// Returns true if a neighbour confirms the reading `k`. Heights are measured from the plane through the readings
+    /// around both. The neighbour must be at least as high as `least` and as a quarter of the height of the reading.
+    /// `side` is 1 for a reading above the surface, -1 below.
     fn is_confirmed(&self, k: usize, side: f64, least: f64) -> bool {
         let own = on_plane(&self.places[k]);
         let near = self.tree.nearest(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);

@@ -32,12 +32,12 @@ use crate::sparse::{SelectedInverse, SparsityPattern};
 
 /// Number of knots per cut-off: with five the splines alone pass waves at the cut-off to 0.2 %.
 const KNOTS: f64 = 5.0;
-/// Maximum number of coefficients; a factor of this size takes some 2 GB.
+/// Maximum number of coefficients; a factor of a matrix of this size takes some 2 GB.
 const MAX_COEFFICIENTS: f64 = 2e5;
 /// Step of ln mu for the derivative of the inverse.
 const STEP: f64 = 0.02;
-/// Share of the largest diagonal entry that is added to all of them: far outside the readings nothing else determines
-/// the surface.
+/// Share of the largest diagonal entry that is added to all diagonal entries. Far outside the readings nothing else
+/// determines the surface.
 const RIDGE: f64 = 1e-13;
 
 /// Choice of the smoothness of a spline.
@@ -53,7 +53,7 @@ pub enum SplineSmoothness {
     CrossValidation,
 }
 
-/// Error that prevents a smoothing surface.
+/// Reason why no smoothing surface can be fitted.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -252,7 +252,7 @@ impl<'a> NormalEquations<'a> {
         self.entries.iter().map(|e| self.normal[at(e)] + mu * self.bending[at(e)] + ridge(e)).collect()
     }
 
-    /// Returns the entries of an inverse by coefficient and later neighbour.
+    /// Returns the entries of an inverse in the layout of `normal`: [`LATER`] entries to a coefficient.
     fn spread(&self, inverse: &SelectedInverse) -> Vec<f64> {
         let nx = self.axes[0].count();
         let mut spread = vec![0.0; self.right.len() * LATER];
@@ -339,7 +339,7 @@ impl<'a> NormalEquations<'a> {
     }
 }
 
-/// Returns the columns and rows from a coefficient to its later neighbour.
+/// Returns the offset in columns and rows from a coefficient to its later neighbour with index `s`.
 fn offset(s: usize) -> [isize; 2] {
     if s < 4 { [s as isize, 0] } else { [((s - 4) % 7) as isize - 3, ((s - 4) / 7) as isize + 1] }
 }
@@ -380,7 +380,7 @@ fn bending(axes: &[SplineAxis; 2]) -> Vec<f64> {
     bending
 }
 
-/// The sixteen splines at a place.
+/// Values of the sixteen splines that are not 0 at a place.
 struct LocalSplines {
     first: usize,
     across: usize,
@@ -412,7 +412,7 @@ impl LocalSplines {
         })
     }
 
-    /// Returns b^T S b for a symmetric matrix S given by coefficient and later neighbour.
+    /// Returns b^T S b for the splines b and a symmetric matrix S with [`LATER`] entries to a coefficient.
     fn quadratic_form(&self, matrix: &[f64]) -> f64 {
         let mut sum = 0.0;
         for a in 0..16 {

@@ -13,20 +13,20 @@ pub enum FormError {
         "there are {points} points; at least {min_points} are required; measure more points or request fewer terms"
     )]
     TooFewPoints { points: usize, min_points: usize },
-    #[error("point {} has a place or a deviation that is not a finite number; remove it", index + 1)]
+    #[error("point {} has a position or a deviation that is not a finite number; remove it", index + 1)]
     NotFinite { index: usize },
-    #[error("the points lie at one place or on a line, and the figure requires an area; measure across the part")]
+    #[error("the points lie at one place or on a line; the figure requires an area; measure across the part")]
     NoArea,
     #[error(
-        "the places of the {points} points do not separate the term {term} from those before it; measure more \
+        "the positions of the {points} points do not separate the term {term} from the terms before it; measure more \
          densely or request fewer terms"
     )]
     Undetermined { term: String, points: usize },
     #[error("{terms} terms are requested, and {basis} has 1 to {max_terms}; request fewer")]
     Terms { terms: usize, basis: &'static str, max_terms: usize },
     #[error(
-        "point {} lies {distance_mm} mm from the middle of polynomials with a radius of {radius_mm} mm; the limit is \
-         1.5 times the radius; correct the aperture or remove the point", index + 1
+        "point {} lies {distance_mm} mm from the centre of the Zernike disc; the limit is 1.5 times the radius of the \
+         disc, {radius_mm} mm; correct the aperture or remove the point", index + 1
     )]
     FarOut { index: usize, distance_mm: f64, radius_mm: f64 },
     #[error("the wavelength is {wavelength_nm} nm; it must be a finite number above 0")]

@@ -58,7 +58,7 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
     let removed = taken_out.describe(&figures.removed);
     let um = |name, mm: f64, made: &str| labelled_figure(name, 1e3 * mm, "um", &removed, NO_CUT_OFF, made);
     let of_fit = format!(
-        "robust: PV of {} {} terms fitted to all points, {:.4} um, and 3 times the rms of the rest, {:.4} um",
+        "robust: PV of {} {} terms fitted to all points, {:.4} um, plus 3 times the rms of the residuals, {:.4} um",
         pvr.terms,
         pvr.basis,
         1e3 * pvr.fit_pv_mm,
@@ -66,23 +66,20 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
     );
     let cells = format!("cells of {:.3} mm within the aperture that hold a point", coverage.cell_mm);
     vec![
-        um("PV of the points", figures.pv_mm, "of all points: largest less least"),
+        um("PV of the points", figures.pv_mm, "of all points: largest minus smallest"),
         um("PVr", pvr.value_mm, &of_fit),
         um(
             "PV 99.8 % of the points",
             figures.pv_998_mm,
-            "of all points but the outermost 0.1 % at either end: largest less least",
+            "of all points but the outermost 0.1 % at either end: largest minus smallest",
         ),
         um("RMS of the points", figures.rms_mm, "of all points, about zero"),
         um("mean", figures.mean_mm, "of all points"),
         LabelledFigure {
             at_mm: Some(highest.at_mm),
-            ..um("highest (stock left)", highest.value_mm, "the one highest point")
+            ..um("highest (stock left)", highest.value_mm, "the highest point")
         },
-        LabelledFigure {
-            at_mm: Some(lowest.at_mm),
-            ..um("lowest (undercut)", lowest.value_mm, "the one lowest point")
-        },
+        LabelledFigure { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the lowest point") },
         labelled_figure("coverage", 100.0 * coverage.share, "%", "nothing", NO_CUT_OFF, &cells),
     ]
 }

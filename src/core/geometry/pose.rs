@@ -45,8 +45,9 @@ pub enum PoseError {
     /// The upper left block is not a rotation: the largest entry of R R^T - 1 is too large, or the determinant is
     /// negative (-1 for a mirror image).
     #[error(
-        "the upper left 3 x 3 block is not a rotation: it is off by {off:.3e} (limit {ROTATION_TOLERANCE:.0e}) and its \
-         determinant is {determinant:.6}; scale, shear and mirror images are not rigid"
+        "the upper left 3 x 3 block R of the pose is not a rotation: the largest entry of R R^T - 1 is {off:.3e} \
+         (limit {ROTATION_TOLERANCE:.0e}), and the determinant is {determinant:.6}; scale, shear and mirror images are \
+         not rigid"
     )]
     NotARotation { off: f64, determinant: f64 },
 }

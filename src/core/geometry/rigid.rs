@@ -44,7 +44,7 @@ impl RigidFit {
 #[non_exhaustive]
 pub enum RigidError {
     /// The sets have different lengths.
-    #[error("{from} points cannot be fitted to {to}; give every point its partner")]
+    #[error("{from} points cannot be fitted to {to} points; give two lists of the same length, pair by pair")]
     Counts { from: usize, to: usize },
     /// Too few points to fix a pose.
     #[error("{points} pairs of points do not determine a pose; at least 3 are required; measure more reference points")]
@@ -55,7 +55,7 @@ pub enum RigidError {
     /// All points lie on a line.
     #[error(
         "the points lie on one line: their width is {share:.1e} of their length; at least {MIN_WIDTH_SHARE:.0e} is \
-         required to determine the rotation about it; add a reference point off the line"
+         required to determine the rotation about this line; add a reference point off the line"
     )]
     Collinear { share: f64 },
     /// One set is a mirror image of the other.

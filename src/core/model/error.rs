@@ -7,7 +7,10 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ModelError {
-    #[error("{points} places, {deviations} deviations and {rows} rows of effects do not match")]
+    #[error(
+        "{points} places, {deviations} deviations and {rows} rows of effects do not match; give one deviation and one \
+         row of effects for each place"
+    )]
     Shape { points: usize, deviations: usize, rows: usize },
     #[error("the model requires at least {min_points} points; {points} are given")]
     TooFewPoints { points: usize, min_points: usize },
@@ -30,20 +33,23 @@ pub enum ModelError {
          above 0, the factor finite and above 1"
     )]
     Prior { what: &'static str, median: f64, factor: f64 },
-    #[error("the drift is {value}; it must be at least 0 and below 1")]
+    #[error("the noise autocorrelation is {value}; it must be at least 0 and below 1")]
     NoiseAutocorrelation { value: f64 },
     #[error(
         "the covariance of the points is not positive definite: their noise is too small compared with the field, or \
          places coincide"
     )]
     NotDefinite,
-    #[error("these points do not separate the effects; remove the effects that the surface does not show")]
+    #[error(
+        "these points do not separate the effects: at these points, one effect is nearly a combination of the others; \
+         remove this effect, or measure points at which it differs"
+    )]
     CollinearEffects,
     #[error(
-        "the points are of {sessions} session; at least {min_sessions} are required for the variance between sessions: \
-         measure once more, or from another station"
+        "the points belong to {sessions} session; at least {min_sessions} are required for the variance between \
+         sessions; measure once more, or from another station"
     )]
     TooFewSessions { sessions: usize, min_sessions: usize },
-    #[error("{points} points and {sessions} numbers of their sessions do not match")]
+    #[error("{points} points and {sessions} session numbers do not match; give one session number for each point")]
     Sessions { points: usize, sessions: usize },
 }

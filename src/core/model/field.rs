@@ -114,7 +114,7 @@ impl Field {
     /// # Errors
     /// Returns [`ModelError::Hyperparameter`] or [`ModelError::Anisotropy`] with the wrong value.
     pub(super) fn check(&self) -> Result<(), ModelError> {
-        for (what, value) in [("field", self.sigma_mm), ("range", self.range_mm)] {
+        for (what, value) in [("standard deviation of the field", self.sigma_mm), ("range", self.range_mm)] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(ModelError::Hyperparameter { what, value });
             }

@@ -193,7 +193,7 @@ impl Hyperparameters {
         let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;
         if !(scatter_mm.is_finite() && scatter_mm > 0.0) {
-            return Err(ModelError::Hyperparameter { what: "noise", value: scatter_mm });
+            return Err(ModelError::Hyperparameter { what: "standard deviation of the noise", value: scatter_mm });
         }
         if !(0.0..1.0).contains(&drift) {
             return Err(ModelError::NoiseAutocorrelation { value: drift });

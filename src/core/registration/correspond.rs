@@ -145,8 +145,8 @@ impl ProjectionPass<'_> {
         sums
     }
 
-    /// Returns the last places of four points, or places extrapolated from the eight points before them; `None` if
-    /// neither is known.
+    /// Returns the last facets of four points. If these are not known, returns the facets extrapolated from the eight
+    /// points before; `None` if there is no extrapolation.
     #[inline(always)]
     fn start(
         &self,
@@ -161,7 +161,7 @@ impl ProjectionPass<'_> {
         self.surface.extrapolate_x4(&recent[0], &recent[1])
     }
 
-    /// Processes four points together if they are on the part and near the given places. Otherwise returns false and
+    /// Projects four points together if they are on the part and near the facets `places`. Otherwise returns false and
     /// changes no correspondence and no sum.
     #[inline(always)]
     fn project_x4(
@@ -227,7 +227,7 @@ fn transform_x4(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     [row(0), row(1), row(2)]
 }
 
-/// Four measured points at the end: their projections, and the rows of A there.
+/// Four measured points under the final pose: their projections, and their rows of the matrix A.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FinalProjectionX4 {
     pub(crate) centre: Vector3x4,
@@ -235,12 +235,12 @@ pub(crate) struct FinalProjectionX4 {
     pub(crate) row: [F64x4; 6],
 }
 
-/// Conversion of four points and their projections to the reported items.
+/// Conversion of four points and their projections to the items that a registration reports.
 pub(crate) trait ProjectionReporter: Sync {
     /// Reported item of one point.
     type Item: Copy + Send;
 
-    /// Placeholder before a point is reported.
+    /// Initial value of an item.
     const BLANK: Self::Item;
 
     /// Returns the reported items of four points. Inlined, so that it is compiled with the caller's vector
@@ -280,7 +280,7 @@ pub(crate) fn report_projections<R: ProjectionReporter>(
     items
 }
 
-/// Data that all points share at the end.
+/// Data that all points share in the final projection.
 struct FinalPass<'a, R> {
     surface: &'a OffsetSurface<'a>,
     measured: &'a [Point],
@@ -309,7 +309,8 @@ impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
 }
 
 impl<R: ProjectionReporter> FinalPass<'_, R> {
-    /// Reports four points from the index `first` on. Past the end it repeats the last point.
+    /// Returns the reported items of four points from the index `first` on. Beyond the last point the last point is
+    /// repeated.
     #[inline(always)]
     fn report_group(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
@@ -331,7 +332,7 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
         )
     }
 
-    /// Returns the projections of four points, each searched on its own.
+    /// Returns the projections of four points, searched one by one.
     #[cold]
     fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> ProjectionX4 {
         let foot = |l: usize| {
@@ -346,7 +347,7 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
     }
 }
 
-/// Returns the centroid of a cloud and the rms distance of its points from it, in mm.
+/// Returns the centroid of a cloud and the rms distance of its points from the centroid, in mm.
 pub(crate) fn centroid_and_size(points: &[Point]) -> (Point, f64) {
     let n = points.len() as f64;
     // Chunks are added in order, so the bits are the same on any number of threads.

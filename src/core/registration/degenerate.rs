@@ -14,16 +14,18 @@ use super::error::RegistrationError;
 use super::options::{Coordinate, RegistrationOptions, Start};
 use crate::geometry::{Point, Pose, Vector};
 
-/// Smallest width of a cloud, in distances from point to point. A narrower cloud determines nothing across.
+/// Minimum width of a cloud, in distances from point to point. A narrower cloud does not determine the pose across the
+/// line.
 const MIN_WIDTH_SPACINGS: f64 = 2.5;
-/// Largest length of the path from point to point of a thread, in units of its extent.
+/// Maximum ratio of the length of the path from point to point to the extent of the points, for points on a thread.
 const MAX_PATH_RATIO: f64 = 2.0;
-/// Most points that are examined.
+/// Maximum number of points that are examined.
 const MAX_EXAMINED: usize = 600;
 /// Width, as a share of the length, above which a cloud is not narrow, however few points it has.
 const MIN_WIDE_RATIO: f64 = 0.2;
 
-/// Rejects a thread before any pose is tried, unless the undetermined directions are locked.
+/// Rejects points that follow each other along one line, before any pose is tried, unless the directions that they do
+/// not determine are locked.
 pub(super) fn check_scan_line(measured: &[Point], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MAX_EXAMINED)).copied().collect();
     let Some(_) = ScanLine::detect(few) else { return Ok(()) };
@@ -44,8 +46,9 @@ struct ScanLine {
 }
 
 impl ScanLine {
-    /// Returns the thread that the points form, or `None`. In the order along the longest axis, the points of a plane
-    /// go to and fro across it; the points of a line do not.
+    /// Returns the line that the points follow, or `None` if they spread over an area. The points are visited in the
+    /// order along their longest axis: points that spread over an area go to and fro across it, so that their path is
+    /// long.
     fn detect(mut points: Vec<Point>) -> Option<Self> {
         let (middle, axes) = centroid_and_axes(points.iter().copied());
         let axis: Vector = axes.column(2).into();
@@ -66,7 +69,8 @@ impl ScanLine {
     }
 }
 
-/// Rejects a strip of contacts that is too narrow for its points, unless the undetermined directions are locked.
+/// Rejects contacts that form a strip too narrow for the distance of its points, unless the directions that it does not
+/// determine are locked.
 pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let used = || deviations.iter().filter(|d| d.status == PointStatus::Inlier);
     let normal = used().map(|d| d.normal).sum::<Vector>();
@@ -103,7 +107,7 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOption
     Ok(())
 }
 
-/// Returns the shift across a line and the rotation about it, as the nearest coordinates.
+/// Returns the coordinates of the pose that are nearest to the shift across a line and to the rotation about it.
 fn undetermined_coordinates(line: Vector, normal: Vector) -> [Coordinate; 2] {
     const SHIFTS: [Coordinate; 3] = [Coordinate::X, Coordinate::Y, Coordinate::Z];
     const ROTATIONS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];

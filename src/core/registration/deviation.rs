@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Vector};
 
-/// One measured point against the nominal surface.
+/// Deviation of one measured point from the nominal surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Deviation {
     /// Contact point in the model frame: the centre moved back by the probe radius along the normal.

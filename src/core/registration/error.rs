@@ -33,7 +33,7 @@ pub enum RegistrationError {
     NotFinite { index: usize },
     #[error(
         "measured point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others, too \
-         far for a touch; remove it or correct it", index + 1, at[0], at[1], at[2]
+         far to lie on the part; remove it or correct it", index + 1, at[0], at[1], at[2]
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
     #[error(
@@ -77,7 +77,7 @@ pub enum RegistrationError {
     WrongSide { rms_mm: f64, other_rms_mm: f64 },
     #[error(
         "no free direction of the pose is observable; give the complete pose, unlock a direction, or give a surface \
-         with more shape"
+         with more curvature"
     )]
     Undetermined,
 }

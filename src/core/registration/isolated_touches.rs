@@ -13,23 +13,24 @@ use super::quality::RegistrationQuality;
 use super::refit::MIN_SIGMA_MM;
 use super::robust_loss::robust_median_and_sigma;
 
-/// Number of neighbours to compare with, and number of nearest points whose median distance is the scale.
+/// Number of neighbours to compare with, and number of nearest points whose median distance is the length scale.
 const NEIGHBOURS: usize = 8;
 const SCALE_NEIGHBOURS: u32 = 64;
-/// Largest distance of a neighbour, in distances of the third nearest. In a square pattern this includes the points
-/// along the sides and the diagonals.
+/// Maximum distance of a neighbour, in units of the distance of the third nearest neighbour. In a square pattern this
+/// includes the points along the sides and the diagonals.
 const MAX_NEIGHBOUR_DISTANCE: f64 = 1.5 + 1e-3;
-/// Share of that median distance below which two touches are repeats at one place. A repeat has the same fault, so it
-/// confirms nothing.
+/// Distance of two touches below which they are repeats at one place, as a share of the length scale. A repeat has the
+/// same fault as the first touch, so it confirms nothing.
 const SAME_PLACE: f64 = 0.05;
-/// Smallest share of the point's own height at which a neighbour confirms it, both measured from the local level.
+/// Minimum height of a neighbour that confirms a point, as a share of the height of the point. Both heights are
+/// measured from the local level.
 const MIN_HEIGHT_SHARE: f64 = 0.1;
-/// The same share with both heights measured from the surface. It is larger because a neighbour on a hump is above the
-/// surface too.
+/// Minimum height of a neighbour that confirms a point, as a share of the height of the point, if both heights are
+/// measured from the surface. It is larger because a neighbour on a hump is above the surface too.
 const MIN_SURFACE_HEIGHT_SHARE: f64 = 0.25;
 
-/// Marks the outliers that are not isolated as used, and adds them to the number of points used, the objective, RMS and
-/// PV.
+/// Changes outliers that a neighbour confirms into inliers, and adds them to the number of inliers, the objective, RMS
+/// and PV.
 pub(super) fn count_confirmed_outliers(
     deviations: &mut [Deviation],
     verdict: &mut RegistrationQuality,
@@ -58,7 +59,8 @@ pub(super) fn count_confirmed_outliers(
     verdict.rms_mm = (verdict.objective_mm2 / verdict.inliers as f64).sqrt();
 }
 
-/// Returns how many points on the part were left out of the fit although most of their neighbours were fitted.
+/// Returns the number of points on the part that were excluded from the fit although most of their neighbours were
+/// fitted.
 pub(super) fn count_contradicted(deviations: &[Deviation]) -> usize {
     let around = NeighbourIndex::new(deviations, 0.0);
     let is_left = |k: &usize| !deviations[around.indices[*k]].in_fit;
@@ -76,7 +78,7 @@ pub(super) fn count_contradicted(deviations: &[Deviation]) -> usize {
 struct NeighbourIndex {
     tree: PointTree,
     heights_mm: Vec<f64>,
-    /// Indices of these points among all points, ascending.
+    /// Index of each of these points among all measured points, ascending.
     indices: Vec<usize>,
     projections: Vec<Point>,
     /// Median of the heights, and half of the limit for an outlier.
@@ -103,7 +105,7 @@ impl NeighbourIndex {
         }
     }
 
-    /// Returns true if no neighbour deviates as this point does, relative to the level around the point.
+    /// Returns true if the point deviates from the level around it and no neighbour deviates in the same way.
     fn is_isolated(&self, k: usize) -> bool {
         let Ok(own) = self.indices.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self

@@ -10,7 +10,7 @@ use super::error::RegistrationError;
 use super::linearize::{Scaling, Sums};
 use super::solve::Spectrum;
 
-/// One step of the iteration.
+/// Record of one step of the iteration.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Iteration {
     /// Objective after the step, in mm^2: the sum of the squared distances, eq. (7), or of their robust loss.
@@ -21,7 +21,7 @@ pub struct Iteration {
     pub ball_radius: f64,
     /// True if the step was accepted. A step that raises the objective is undone.
     pub taken: bool,
-    /// Number of points that took part.
+    /// Number of points in the fit.
     pub points: usize,
 }
 
@@ -36,8 +36,8 @@ pub(crate) struct Problem<'a> {
     pub(crate) size_mm: f64,
     /// Locked coordinates of the twist: x, y, z, rx, ry, rz of the model frame.
     pub(crate) locked: [bool; 6],
-    /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
-    /// squares.
+    /// Minimum singular value of a direction that the surface determines, as a share of the root of the sum of all
+    /// squared singular values.
     pub(crate) min_singular_share: f64,
     /// Relative decrease 1 - f(l+1) / f(l) at which the iteration stops: epsilon in the paper.
     pub(crate) tolerance: f64,
@@ -46,7 +46,7 @@ pub(crate) struct Problem<'a> {
     pub(crate) max_iterations: usize,
 }
 
-/// End of a descent.
+/// Result of a descent.
 #[derive(Clone, Debug)]
 pub(crate) struct Descent {
     pub(crate) cmm_from_model: Pose,
@@ -57,18 +57,18 @@ pub(crate) struct Descent {
     pub(crate) converged: bool,
 }
 
-/// Length of a step that moves no point by more than rounding.
+/// Length of a step, in scaled coordinates, that moves no point by more than rounding.
 const MIN_STEP: f64 = 1e-14;
 
-/// Share of the tolerance below which a promised decrease is not tried. A pass over all points would only confirm that
-/// nothing decreases.
+/// Minimum predicted decrease of the objective for which a step is tried, as a share of the tolerance. With a smaller
+/// decrease a pass over all points would only confirm that nothing decreases.
 const MIN_DECREASE_SHARE: f64 = 1e-2;
 
-/// Length below which a step that raises the objective is noise, from rounding or from the edge of one triangle, and
-/// not a wrong direction.
+/// Step length below which an increase of the objective is noise, from rounding or from the edge of one triangle. The
+/// direction of such a step is not wrong.
 const NOISE_STEP: f64 = 1e-7;
 
-/// A pose, and the linear problem at the projections under it.
+/// Pose, with the linear problem at the projections of the points under this pose.
 struct LinearizedPose {
     pose: Pose,
     scaling: Scaling,
@@ -79,7 +79,7 @@ struct LinearizedPose {
 struct BallStep {
     scaled: Vector6<f64>,
     length: f64,
-    /// Upper bound of the decrease of the objective, by the linear problem.
+    /// Upper bound of the decrease of the objective, from the linear problem.
     predicted_decrease_mm2: f64,
     /// Number of directions that the surface determines.
     rank: usize,
@@ -89,8 +89,8 @@ impl Problem<'_> {
     /// Descends from a pose to the nearest minimum of the objective. The objective of the accepted steps never rises,
     /// eq. (14).
     ///
-    /// At the end the correspondences and the sums belong to the returned pose. `known` gives the sums at the start if
-    /// they are computed already.
+    /// At the end the correspondences and the sums belong to the returned pose. `known` holds the sums at `start` if
+    /// they are already computed. The steps are appended to `trace`.
     ///
     /// # Errors
     /// Fewer points in the fit than free coordinates.
@@ -163,14 +163,16 @@ impl Problem<'_> {
         Ok(BallStep { scaled: m, length: m.norm(), predicted_decrease_mm2: 2.0 * m.dot(&right), rank })
     }
 
-    /// Returns true if a step is not worth a trial. The first step of a registration is tried if it moves anything.
+    /// Returns true if a step is too small to be tried. The first step of a registration is tried if it moves any
+    /// point.
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
         let little =
             !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
         step.length < MIN_STEP || sums.objective_mm2 == 0.0 || little
     }
 
-    /// Returns the centre and the size to which the twist of a step from a pose refers.
+    /// Returns the scaling for a step from a pose: the centroid of the cloud in the model frame, and the size of the
+    /// cloud.
     pub(crate) fn scaling_at(&self, pose: &Pose) -> Scaling {
         Scaling { centre: pose.inverse().transform_point(&self.centroid), size_mm: self.size_mm }
     }

@@ -28,11 +28,11 @@ use crate::geometry::Vector;
 /// Limits for the lateral error of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapLimits {
-    /// Coverage factor of the standard uncertainties.
+    /// Coverage factor that multiplies the standard uncertainties.
     pub coverage_factor: f64,
-    /// Largest error of the map, as a share of the rms that it corrects.
+    /// Maximum error of the map, as a share of the rms that it corrects.
     pub max_error_share: f64,
-    /// Largest lateral error of the map in mm, with the coverage factor.
+    /// Maximum lateral error of the map in mm, with the coverage factor.
     pub max_lateral_mm: f64,
 }
 
@@ -66,7 +66,7 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
 }
 
-/// Returns in words why a registration does not allow a map; `None` if it does.
+/// Returns the reason, for people, why a registration does not allow a map; `None` if it does.
 ///
 /// The module documentation gives the criterion.
 pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
@@ -84,8 +84,8 @@ pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &Ma
         "the measured heights are good, but the shape of the part does not determine where they lie on it{weak}. The \
          correction may be displaced by {beside_mm:.2} mm, limit {:.2} mm. On slopes of the error map, up to {:.2} \
          µm/mm, this makes the correction wrong by {:.1} µm, limit {:.1} µm, {:.0} % of the {:.1} µm rms to be \
-         corrected; at edges and seams by more. Lock these directions in the recipe if the fixture holds the part \
-         better than that (registration.lock = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
+         corrected; at edges and seams by more. Lock these directions in the recipe if the fixture locates the part \
+         more exactly (registration.lock = [\"x\", \"y\", \"rz\"]), or measure edges or marks that determine them",
         limits.max_lateral_mm,
         1e3 * slope,
         1e3 * error_mm,

@@ -5,8 +5,8 @@ use nalgebra::{Matrix6, Vector6};
 use crate::geometry::{Point, Twist, Vector};
 use crate::surface::simd::{F64x4, LANES, Real, Vector3x4, cross, minus};
 
-/// Centre and size to which the twist of a step refers: rotations about the centroid of the cloud, translations in
-/// units of its size.
+/// Centre and size to which the twist of a step refers: rotations are about the centroid of the cloud, and translations
+/// are in units of the size of the cloud.
 ///
 /// About the origin of the model frame, every rotation of a distant part would look like a translation. About the
 /// centroid, the columns of A are as independent as the surface allows. In units of the size, a ball |m| <= alpha
@@ -71,7 +71,8 @@ impl FourSums {
         Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
     }
 
-    /// Adds four points. A point with weight 0 and loss 0 changes no sum; `used` is the number of points in the fit.
+    /// Adds four points. A point with weight 0 and loss 0 changes no sum; `used` is the number of points that are in
+    /// the fit.
     #[inline(always)]
     pub(crate) fn add(&mut self, row: &[F64x4; 6], distance: F64x4, weight: F64x4, loss_mm2: F64x4, used: usize) {
         let mut k = 0;
@@ -120,7 +121,7 @@ impl Sums {
         Self { gram: [0.0; 21], right: [0.0; 6], objective_mm2: 0.0, points: 0 }
     }
 
-    /// Adds one point with its weight and its share of the objective.
+    /// Adds one point with its row of A, its distance, its weight and its contribution to the objective.
     #[inline]
     pub(crate) fn add(&mut self, row: &[f64; 6], distance: f64, weight: f64, loss_mm2: f64) {
         let mut k = 0;

@@ -78,7 +78,7 @@ pub fn register(
     Ok(registration)
 }
 
-/// Estimates the pose without a test of how well it fits.
+/// Estimates the pose without checking how well it fits.
 fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.side() {
         part.check_fold(options, side)?;
@@ -97,7 +97,7 @@ fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result
     build_registration(part, &problem, descent, correspondences, trace, &initial, options)
 }
 
-/// Replaces an error by [`RegistrationError::Mirrored`] if a mirrored cloud is the cause.
+/// Replaces an error by [`RegistrationError::Mirrored`] if only the mirrored cloud fits.
 ///
 /// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
 fn explain_by_mirror_image(
@@ -116,7 +116,7 @@ fn explain_by_mirror_image(
     }
 }
 
-/// Converts the end of the iteration to the reported result.
+/// Converts the result of the iteration to the reported registration.
 fn build_registration(
     part: &Part,
     problem: &Problem,
@@ -143,8 +143,8 @@ fn build_registration(
 /// Difference of two distances that is only rounding, in mm.
 const ROUNDING_MM: f64 = 1e-12;
 
-/// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
-/// more points count than at the last accepted step.
+/// Returns the trace with the reported state as its last entry. An entry is appended if the last step was undone, or if
+/// the number of points or the objective differs from that of the last accepted step.
 fn with_final_state(
     mut trace: Vec<Iteration>,
     verdict: &RegistrationQuality,
@@ -165,7 +165,7 @@ fn with_final_state(
     trace
 }
 
-/// Rejects a fit of another part or of a mirror image.
+/// Rejects a fit that shows another part or a mirror image.
 ///
 /// # Errors
 /// A strip that is too narrow, a mirror image, or an rms above the limit.

@@ -40,10 +40,10 @@ pub enum ProbeSide {
     /// The side on which the measured points fit; the side of the normals where both fit alike.
     #[default]
     Auto,
-    /// Where the normals point: +z for a height over the plane, outwards for a mesh.
+    /// The side to which the normals point: +z for a height over the plane, outwards for a mesh.
     #[serde(alias = "normal")]
     Above,
-    /// The other side.
+    /// The side opposite to the normals.
     #[serde(alias = "opposite")]
     Below,
 }
@@ -110,10 +110,10 @@ pub struct RegistrationOptions {
     pub side: ProbeSide,
     /// Locked coordinates, which no step changes: x, y, z, rx, ry, rz of the model frame.
     pub locked: [bool; 6],
-    /// Loss of a distance.
+    /// Loss function of the distances.
     pub loss: Loss,
-    /// Limit for an outlier, in robust sigmas. A point farther from the surface is an outlier if no neighbour confirms
-    /// it. Infinity keeps every point.
+    /// Limit for an outlier, in robust standard deviations. A point farther from the surface is an outlier, unless a
+    /// neighbour confirms its deviation. With infinity no point is an outlier.
     pub outlier_sigmas: f64,
     /// Relative decrease 1 - f(l+1) / f(l) at which the iteration stops: epsilon in the paper.
     pub tolerance: f64,

@@ -11,7 +11,7 @@ use super::iterate::Problem;
 use super::options::{Method, RegistrationOptions, Start};
 use super::robust_loss::{Loss, ScaledLoss};
 
-/// Nominal surface, and the sizes that the limits refer to.
+/// Nominal surface to register to, with the sizes to which the limits refer.
 pub(super) struct Part<'a> {
     pub(super) nominal: &'a Nominal,
     /// Radius of the offset surface in mm: that of the probe, or 0 if the points are registered to the nominal surface
@@ -23,8 +23,8 @@ pub(super) struct Part<'a> {
     pub(super) centroid: Point,
     /// Rms size of the measured cloud, in mm.
     pub(super) size_mm: f64,
-    /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
-    /// squares.
+    /// Minimum singular value of a direction that the surface determines, as a share of the root of the sum of all
+    /// squared singular values.
     pub(super) min_singular_share: f64,
 }
 
@@ -85,7 +85,7 @@ impl<'a> Part<'a> {
             .with_lookup(lookup)
     }
 
-    /// Rejects a probe that does not fit into the surface.
+    /// Rejects a probe ball that does not fit into a concave place of the surface.
     pub(super) fn check_fold(&self, options: &RegistrationOptions, side: Side) -> Result<(), RegistrationError> {
         match self.surface(options, side).find_fold() {
             Some(fold) => Err(fold.into()),
@@ -116,7 +116,7 @@ impl<'a> Part<'a> {
     }
 }
 
-/// Rejects a cloud in which more than one point in a hundred occurs twice.
+/// Rejects a cloud if more than one in a hundred of the examined points repeats another point exactly.
 ///
 /// A hash of the coordinates selects a sample of some thousand points, for any size of the cloud. Two equal points are
 /// therefore either both in the sample or both not.
@@ -140,7 +140,7 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     Ok(())
 }
 
-/// Replaces an error of the size by the name of the one distant point that causes it, if there is one.
+/// Replaces an error of the size by an error that names a single distant point, if this point causes it.
 fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
     if let Some((index, distance_mm)) = find_far_off(measured) {
         return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };

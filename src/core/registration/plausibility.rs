@@ -10,33 +10,35 @@ use super::quality::format_length;
 use super::result::{FiguresWithOutliers, Registration};
 use super::start::sample_evenly;
 
-/// Largest share of the rms that another radius leaves, if the given radius is doubted. On a free-form surface of 64 mm
-/// radius, half the radius leaves a quarter in addition to the form error of a ground part. Double the radius leaves
-/// less.
+/// Maximum ratio of the rms with another radius to the rms with the given radius, at which the given radius is doubted.
+/// On a free-form surface of 64 mm radius, half the radius leaves a quarter in addition to the form error of a ground
+/// part. Double the radius leaves less.
 const MAX_RMS_SHARE: f64 = 0.65;
 
-/// Smallest relative error of the radius at which it is doubted. A diameter in place of a radius, or the wrong ball,
-/// exceeds it. The form error of a worn wheel has the same shape as the effect of a wrong radius: in one case it made
-/// the estimate 0.25 mm less than the 1.5 mm of the ball.
+/// Minimum relative error of the radius at which it is doubted. A diameter in place of a radius, or the wrong ball,
+/// exceeds it. The form error of a worn wheel has the same shape as the effect of a wrong radius: in one case the
+/// estimate was 0.25 mm less than the 1.5 mm of the ball.
 const MIN_RELATIVE_ERROR: f64 = 0.4;
 
-/// Smallest rms that a wrong radius explains, as a share of the cloud's size, at which it is doubted: 7 um on a part of
-/// 100 x 60 mm. A ground part bends less. The limit also excludes surfaces that hardly determine the radius.
+/// Minimum rms that a wrong radius explains, as a share of the cloud's size, at which the radius is doubted: 7 µm on a
+/// part of 100 x 60 mm. A ground part has less form error of this shape. The limit also excludes surfaces that hardly
+/// determine the radius.
 const MIN_RMS_PER_SIZE: f64 = 2e-4;
 
-/// Share of the given radius below which the points are contact points: the rest of the estimate is form error.
+/// Share of the given radius below which an estimated radius means contact points. The estimate is then only form
+/// error.
 const MAX_CONTACT_RADIUS_SHARE: f64 = 0.25;
 
-/// Smallest radius of a ball, in mm. A smaller value is an intended offset above the nominal surface, not a ball.
+/// Minimum radius of a ball, in mm. A smaller value is an intended offset above the nominal surface, not a ball.
 const MIN_BALL_RADIUS_MM: f64 = 0.1;
 
-/// Fewest points in excess of the seven unknowns. With fewer, the estimated radius is chance.
+/// Minimum number of points in excess of the seven unknowns. With fewer points the estimated radius is chance.
 const MIN_DEGREES_OF_FREEDOM: usize = 20;
 
-/// Number of points that another radius is fitted to.
+/// Number of points to which another radius is fitted.
 const REFIT_POINTS: usize = 2048;
 
-/// Limits for a warning: shares of the points, and the share of the surface that is covered.
+/// Limits above or below which a warning is given: shares of the points, and covered share of the surface.
 const MAX_OUTLIER_SHARE: f64 = 0.05;
 const MAX_OFF_PART_SHARE: f64 = 0.2;
 const MIN_COVERAGE: f64 = 0.5;
@@ -97,11 +99,11 @@ fn point_warnings(found: &Registration) -> Vec<String> {
     doubts
 }
 
-/// Estimates how many points off the part have points on the part in every direction.
+/// Estimates how many points off the part lie in a gap: they have points on the part in every direction.
 fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;
-    /// Most points of each kind that are examined.
+    /// Maximum number of points on the part, and of points off the part, that are examined.
     const MAX_EXAMINED: usize = 2000;
     let some_of = |is_off: bool, count: usize| -> Vec<[f64; 2]> {
         let of = found.deviations.iter().filter(|d| (d.status == PointStatus::OffPart) == is_off);
@@ -122,10 +124,10 @@ fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
 }
 
 impl Registration {
-    /// Returns why these points allow no judgement, or `None`. Too many of them contradict their neighbours, so it is
-    /// unknown which of the two groups is the part.
+    /// Returns the reason, for people, why these points allow no verdict; `None` if they do. They do not if too many of
+    /// them contradict their neighbours, since then it is unknown which of the two groups is the part.
     pub fn unjudgeable_reason(&self) -> Option<String> {
-        /// Largest share of the points on the part.
+        /// Maximum number of contradicting points, as a share of the points on the part.
         const MAX_CONTRADICTED_SHARE: f64 = 0.1;
         let StatusCounts { off_part, left_out_of_fit: left, .. } = StatusCounts::count(&self.deviations);
         if left as f64 <= MAX_CONTRADICTED_SHARE * (self.deviations.len() - off_part) as f64 {
@@ -163,25 +165,25 @@ fn nominal_noise_warning(part: &Part, found: &Registration) -> Option<String> {
     (scatter_mm > MIN_NOISE_MM.max(MIN_RMS_SHARE * found.quality.rms_mm)).then(|| {
         format!(
             "the nominal points have a noise of {} about a smooth surface, and each deviation has about as much: \
-             give them with more digits, or give the surface that they come from",
+             export them with more digits, or give the formula or mesh that they come from",
             format_length(scatter_mm),
         )
     })
 }
 
-/// Names the rejected points, and gives the figures that include them.
+/// Returns a warning that names the rejected points and gives the figures that include them; `None` if there are none.
 fn outlier_warning(found: &Registration) -> Option<String> {
     let FiguresWithOutliers { outliers: points, rms_mm, pv_mm, description: places } = found.figures_with_outliers()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
     Some(format!(
         "{were} rejected, because no neighbour confirms the deviation: {places}; with all points PV is {} and RMS \
-         {}: clean the place and touch it again",
+         {}: clean the part there and measure the point again",
         format_length(pv_mm),
         format_length(rms_mm),
     ))
 }
 
-/// Describes another probe radius that fits the points much better, if there is one.
+/// Returns a warning about another probe radius that fits the points much better; `None` if there is no such radius.
 pub(super) fn radius_warning(
     part: &Part,
     found: &Registration,
@@ -215,7 +217,7 @@ pub(super) fn radius_warning(
             format!(
                 "a probe radius of about {:.2} mm{side} fits the points to {other_rms} rms, the given {given_mm} mm \
                  to {rms}: check which ball was in the probe, and that the value is its radius, not its diameter; \
-                 otherwise the part itself is bent in this way, as after a wheel of a wrong radius",
+                 otherwise the part itself has this form error, for example from a wheel of another radius",
                 told_mm.abs()
             )
         }
@@ -249,10 +251,11 @@ fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
     other_rms_mm <= MAX_RMS_SHARE * rms_mm && taken2 >= (MIN_RMS_PER_SIZE * part.size_mm).powi(2)
 }
 
-/// Returns true if another radius is worth a fit: by the linear model it removes enough rms, and the noise leaves it
-/// well determined.
+/// Returns true if another radius is worth a fit. In the linear model it must remove enough of the rms, and the noise
+/// must leave it well determined.
 fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationOptions) -> bool {
-    /// The model is linear, and a wrong radius is far off. So this test lets through a little more than the final one.
+    /// Margin of this test over the final test. The model is linear and a wrong radius is far off, so this test is less
+    /// strict.
     const MARGIN: f64 = 1.15;
     let (given_mm, rms_mm) = (options.probe_radius_mm, found.quality.rms_mm);
     // With a locked coordinate, a wrong position of the fixture would look like a wrong radius.
@@ -269,8 +272,8 @@ fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationO
     })
 }
 
-/// Iterates the radius that the points give until it no longer changes, and returns it in mm. It may change sign, to
-/// the other side of the surface. Returns `None` if a fit fails.
+/// Estimates the radius repeatedly, each time from a new registration, until it no longer changes, and returns it in
+/// mm. A negative radius means a ball on the other side of the surface. Returns `None` if a fit fails.
 fn converged_radius_mm(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
     const MAX_ITERATIONS: usize = 5;
     let mut radius_mm = first_mm;

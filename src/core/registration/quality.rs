@@ -31,8 +31,8 @@ pub struct RegistrationQuality {
     pub pv_mm: f64,
     /// Standard deviation of the residuals in millimetres, corrected for the degrees of freedom.
     pub residual_sigma_mm: f64,
-    /// Covariance of the pose: of the twist [v; omega] in the model frame. Multiplied on the right, the twist takes the
-    /// true pose to the estimated one. Units: mm^2, mm rad, rad^2. Directions that are undetermined or locked have no
+    /// Covariance of the pose: of the twist [v; omega] in the model frame that, applied to the true pose from the
+    /// right, gives the estimated pose. Units: mm^2, mm rad, rad^2. Directions that are undetermined or locked have no
     /// variance here.
     ///
     /// Equation: s^2 (A^T A)^-1 with s^2 the residual variance (GUM, F.1; Golub and Van Loan, 5.5).
@@ -40,13 +40,13 @@ pub struct RegistrationQuality {
     /// Largest singular value of A divided by the smallest of the determined directions, with lengths in units of the
     /// cloud's rms size; 1 if no direction is determined.
     pub condition: f64,
-    /// Directions that the surface does not determine, and those with a larger uncertainty than a single point.
+    /// Directions that the surface does not determine, and directions with a larger uncertainty than a single point.
     pub weak_directions: Vec<WeakDirection>,
-    /// Share of the nominal surface that has points used on it, from 0 to 1.
+    /// Share of the nominal surface that is covered by inliers, from 0 to 1.
     pub coverage: f64,
-    /// Other poses that fit about as well, each with its rms over some hundred points in millimetres.
+    /// Other poses that fit about as well, each with its rms in millimetres over a sample of some hundred points.
     pub alternatives: Vec<(Pose, f64)>,
-    /// Warnings to read before one trusts the pose; empty if there are none.
+    /// Warnings that a person must read before trusting the pose; empty if there are none.
     pub warnings: Vec<String>,
     /// Number of steps of the iteration, including those that were undone.
     pub iterations: usize,
@@ -57,7 +57,7 @@ pub struct RegistrationQuality {
 /// Direction in which the pose is poorly determined.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct WeakDirection {
-    /// Description, for example "x and y shift: found again to 3.4 mm only".
+    /// Description, for example "x and y position repeats only to 3.4 mm".
     pub words: String,
     /// True if the surface does not determine the direction at all. The pose then stays at its start value in this
     /// direction.
@@ -67,7 +67,7 @@ pub struct WeakDirection {
     pub sigma_mm: Option<f64>,
 }
 
-/// Returns the verdict on the end of an iteration, with the coverage still at 0.
+/// Returns the quality of a registration at the end of an iteration; the coverage is still 0.
 pub(crate) fn assess_quality(
     problem: &Problem,
     descent: &Descent,
@@ -146,12 +146,12 @@ impl DistanceSummary {
     }
 }
 
-/// Returns warnings about facts that the figures alone do not show.
+/// Returns warnings about ambiguities that the figures do not show: the side, other poses, and a flat part.
 fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
     if !initial.side_known {
         warnings.push(
-            "the shape does not determine on which side of the surface the probe was; the side is assumed: state it"
+            "the shape does not determine the side of the probe; the side of the normals is assumed: set `side`"
                 .to_string(),
         );
     }
@@ -183,7 +183,7 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
         .sum()
 }
 
-/// Describes the motions that change no distance.
+/// Returns descriptions of the motions that change no distance.
 fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Scaling) -> Vec<WeakDirection> {
     if count == 0 {
         return Vec::new();
@@ -216,7 +216,7 @@ fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scali
     words
         .into_iter()
         .map(|w| WeakDirection {
-            words: format!("{w}: the shape does not determine it; it keeps its start value"),
+            words: format!("{w}: not determined by the shape; the pose keeps its start value"),
             held: true,
             sigma_mm: None,
         })
@@ -278,8 +278,9 @@ fn direction_name(v: &Vector) -> String {
     format!("({:.3}, {:.3}, {:.3})", u.x, u.y, u.z)
 }
 
-/// Describes the shifts and rotations that are less certain than a single point: along and about the model's axes, at
-/// the centroid of the cloud. Returns nothing if a direction is undetermined.
+/// Returns descriptions of the shifts along, and the rotations about, the model's axes that are less certain than a
+/// single point. Rotations are about the centroid of the cloud. Returns nothing if a direction is undetermined
+/// (`some_held`).
 fn uncertain_directions(
     scaled: &Matrix6<f64>,
     sigma_mm: f64,
@@ -326,11 +327,12 @@ pub(super) fn format_length(mm: f64) -> String {
     }
 }
 
-/// Returns the share of the surface that has points used on it, from 0 to 1.
+/// Returns the share of the surface that is covered by inliers, from 0 to 1.
 ///
-/// For many points it counts cubes with an edge of a fifteenth of the surface's rms size, small enough to show a
-/// missing corner. For few points, a place is covered if a point is near: within 1.1 times the spacing of that number
-/// of points spread evenly over the surface. So a full pattern leaves no gap, and a line covers only its own strip.
+/// For many points, cubes are counted whose edge is a fifteenth of the surface's rms size, small enough to show a
+/// missing corner. For few points, a place is covered if an inlier is within 1.1 times the spacing that the same number
+/// of points would have if they were spread evenly. So a full pattern leaves no gap, and a line covers only its own
+/// strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MAX_POINTS: usize = 50_000;
     // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
@@ -352,7 +354,7 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     sample.iter().filter(|p| cells.is_marked(p)).count() as f64 / sample.len() as f64
 }
 
-/// Returns the share of the places that have a point within a distance.
+/// Returns the share of the `places` that have an inlier within this distance, from 0 to 1.
 fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 {
     let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / within_mm).floor() as i64);
     let mut points: HashMap<[i64; 3], Vec<Point>> = HashMap::new();
@@ -379,8 +381,8 @@ struct CoverageCells {
 }
 
 impl CoverageCells {
-    /// Most cells along an axis. If a point far from all others extends the range beyond this, the last cell covers the
-    /// rest.
+    /// Maximum number of cells along an axis. If a point far from all others extends the range further, the last cell
+    /// covers the rest.
     const MAX_PER_AXIS: i64 = 256;
 
     fn new(points: &[Point], edge_mm: f64) -> Self {

@@ -22,12 +22,12 @@ pub(super) struct RadiusEstimate {
     pub(super) difference_mm: f64,
     /// Standard uncertainty of the estimate in mm, from the remaining residuals, which are assumed independent.
     pub(super) sigma_mm: f64,
-    /// Share of the rms that remains with the estimated radius.
+    /// Ratio of the rms with the estimated radius to the rms with the given radius.
     pub(super) rms_share: f64,
 }
 
 impl Registration {
-    /// Returns the radius that the points give as a seventh unknown; `None` if the residuals are zero.
+    /// Returns the estimate of the radius as a seventh unknown of the fit; `None` if the residuals are zero.
     ///
     /// ```text
     ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
@@ -74,8 +74,8 @@ impl Registration {
     }
 }
 
-/// Returns the decrease of a point's distance with each coordinate of the pose's twist. A move of the point along its
-/// normal does not change it.
+/// Returns the decrease of a point's distance with each coordinate of the pose's twist. It is the same for every point
+/// on the normal.
 fn row(deviation: &Deviation) -> Vector6<f64> {
     let (n, arm) = (deviation.normal, deviation.point.coords.cross(&deviation.normal));
     Vector6::new(n.x, n.y, n.z, arm.x, arm.y, arm.z)

@@ -22,8 +22,8 @@ pub(super) fn trim_and_refit(
     correspondences: &mut [Correspondence],
     trace: &mut Vec<Iteration>,
 ) -> Result<Descent, RegistrationError> {
-    /// Rounds after which points are only rejected and no longer accepted again, so that the sets cannot alternate for
-    /// ever.
+    /// Number of rounds in which a rejected point can be accepted again. Later rounds only reject points, so that the
+    /// sets cannot alternate for ever.
     const REVERSIBLE_ROUNDS: usize = 8;
     const MAX_ROUNDS: usize = 16;
     let mut problem = *problem;
@@ -62,15 +62,15 @@ pub(super) fn trim_and_refit(
     }
 }
 
-/// Numbers of points of a dense cloud that descend before the rest: first a few for the long way, then more for the
-/// rest of it.
+/// Numbers of points with which a dense cloud descends before all points do: first a few points far from the minimum,
+/// then more points nearer to it.
 const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 
-/// The same if the surface must be fitted at every place touched. Fewer points touch fewer places, and the rest then
-/// touch only the places near the end.
+/// The same numbers for a surface whose normals are fitted when they are first needed. Few points need few normals, and
+/// all points then need only those near the final pose.
 const COARSE_COUNTS_WITH_FITTED_NORMALS: [usize; 1] = [2048];
 
-/// Sets the start places of the projections near the points, and fits the normals there all at once.
+/// Sets the start facets of the projections near the points, and fits all normals there at once.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
     if !problem.surface.has_lazy_normals() {
         return;
@@ -82,11 +82,11 @@ fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Po
     }
 }
 
-/// Descends with `count` of the points to a pose from which all points need only a step or two. Its steps are added to
-/// the trace.
+/// Descends with a sample of `count` points, and returns a pose from which all points need only a step or two. The
+/// steps are appended to the trace.
 ///
-/// `screened` rejects outliers among the few points. This is possible near the end only; far from it outliers cannot be
-/// distinguished.
+/// With `screened`, outliers among the sample are rejected first. This is possible only near the minimum; far from it
+/// outliers cannot be distinguished.
 fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
@@ -106,7 +106,8 @@ fn descend_coarsely(
     Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
 }
 
-/// Rejects an end with too few points in the fit, or with none of the six directions determined.
+/// Rejects a descent with too few points in the fit, or one in which the surface determines no direction although not
+/// all are locked (`is_held`).
 fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
     if descent.sums.points * 2 < points {
         return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
@@ -117,7 +118,7 @@ fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Desce
     Ok(descent)
 }
 
-/// Sets the scale of a robust loss to the robust sigma of the current distances.
+/// Sets the scale of a robust loss to the robust standard deviation of the current distances, if distances are `known`.
 fn rescale_loss(problem: &mut Problem, options: &RegistrationOptions, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
@@ -125,7 +126,7 @@ fn rescale_loss(problem: &mut Problem, options: &RegistrationOptions, correspond
     }
 }
 
-/// Smallest noise in mm: no CMM repeats better, and rounding in a file can be all the noise there is.
+/// Minimum standard deviation of the noise, in mm. No CMM repeats better, and the noise of a file can be rounding only.
 pub(crate) const MIN_SIGMA_MM: f64 = 1e-5;
 
 fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
@@ -136,12 +137,12 @@ fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
     (median, sigma.max(MIN_SIGMA_MM))
 }
 
-/// Projects again the points that are beyond the edge or implausibly far away. Returns how many have a better
-/// projection elsewhere.
+/// Projects those points again that are beyond the edge or implausibly far away. Returns the number of points with a
+/// better projection elsewhere.
 ///
-/// A walk over the facets ends at the edge of a gap, and all of the part can lie beyond the gap.
+/// A walk over the facets ends at the edge of a gap, although the right facet can lie beyond the gap.
 fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
-    /// Distance in mm that no touch on the part exceeds, once the part is near its pose.
+    /// Distance in mm that no touch on the part exceeds when the pose is nearly right.
     const FAR_MM: f64 = 0.2;
     let may_be = |t: &Correspondence| t.is_off_part() || t.distance_mm.abs() > FAR_MM;
     if !correspondences.par_chunks(1 << 13).any(|some| some.iter().any(may_be)) {
@@ -168,8 +169,8 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
     correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
-/// Selects the points that take part in the fit, and returns how many changed. A rejected point can still be form:
-/// [`super::isolated_touches`].
+/// Selects the points that take part in the fit, and returns the number of points that changed. With `both_ways` a
+/// rejected point can be accepted again. A rejected point can still be form, see [`super::isolated_touches`].
 ///
 /// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
 /// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.

@@ -12,7 +12,7 @@ use super::quality::RegistrationQuality;
 pub struct Registration {
     /// Pose that maps model coordinates to CMM coordinates: g in the paper.
     pub cmm_from_model: Pose,
-    /// Deviations, one per measured point, in the given order.
+    /// Deviations, one for each measured point, in the order of the points.
     pub deviations: Vec<Deviation>,
     /// Trace of the iteration, including the steps that were undone.
     pub trace: Vec<Iteration>,
@@ -29,7 +29,7 @@ pub struct FiguresWithOutliers {
     pub outliers: usize,
     /// Root mean square of the deviations of all points on the part, in millimetres.
     pub rms_mm: f64,
-    /// Largest minus smallest deviation of these points, in millimetres.
+    /// Largest minus smallest deviation of all points on the part, in millimetres.
     pub pv_mm: f64,
     /// Text that names the first outliers, with their places in the model frame and their deviations.
     pub description: String,
@@ -39,7 +39,7 @@ pub struct FiguresWithOutliers {
 const MAX_NAMED: usize = 5;
 
 impl Registration {
-    /// Returns the outliers, each with its index.
+    /// Returns the outliers, each with the index of its point.
     pub fn outliers(&self) -> impl Iterator<Item = (usize, &Deviation)> {
         self.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Outlier)
     }

@@ -7,12 +7,13 @@ use serde::{Deserialize, Serialize};
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Loss {
-    /// As its square, eq. (7).
+    /// Square of the distance, eq. (7).
     #[default]
     None,
-    /// As its square near the surface and linearly beyond 1.345 robust sigmas: 95 % efficient on Gaussian errors.
+    /// Square of the distance near the surface, and linear beyond 1.345 robust standard deviations: 95 % efficient on
+    /// Gaussian errors.
     Huber,
-    /// As the biweight with 4.685 robust sigmas: a point farther away has no effect.
+    /// Biweight with 4.685 robust standard deviations: a point farther away has no effect.
     Tukey,
 }
 
@@ -23,7 +24,7 @@ pub(crate) struct ScaledLoss {
     limit_mm: f64,
 }
 
-/// Standard deviation of Gaussian errors per median of |d|: 1 / Phi^-1(3/4).
+/// Ratio of the standard deviation of Gaussian errors to the median of their absolute values: 1 / Phi^-1(3/4).
 const SIGMA_PER_MAD: f64 = 1.482_602_218_505_602;
 
 impl ScaledLoss {
@@ -36,7 +37,8 @@ impl ScaledLoss {
         Self { loss, limit_mm: tuning * sigma_mm }
     }
 
-    /// Returns the weight of a distance and its share of the objective. The share is d^2 near zero for every loss.
+    /// Returns the weight of a distance, and its contribution to the objective in mm^2. Near zero this is d^2 for every
+    /// loss.
     #[inline]
     pub(crate) fn weigh(&self, distance: f64) -> (f64, f64) {
         let square = distance * distance;

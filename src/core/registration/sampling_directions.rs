@@ -10,14 +10,16 @@ use super::iterate::{Descent, Problem, free_projector};
 use super::solve::Spectrum;
 use crate::surface::{FacetIndex, OffsetSurface};
 
-/// Share of the singular value above which a direction is not examined.
+/// Maximum singular value of a direction that is examined, as a share of the root of the sum of all squared singular
+/// values.
 const MAX_DOUBTFUL_SHARE: f64 = 1e-4;
-/// Relative change above which a direction comes from the sampling.
+/// Relative change of a direction's contribution above which the direction comes from the sampling.
 const MAX_RELATIVE_CHANGE: f64 = 0.5;
-/// Most points that are examined.
+/// Maximum number of points that are examined.
 const MAX_EXAMINED: usize = 400;
 
-/// Returns the share below which directions come from the sampling; `None` if the part itself determines all of them.
+/// Returns the share of the singular values below which directions come from the sampling; `None` if the part itself
+/// determines all directions.
 pub(super) fn sampling_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
     let free = free_projector(&problem.locked, &descent.scaling);
     let gram = descent.sums.gram();

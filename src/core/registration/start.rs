@@ -31,13 +31,13 @@ pub(crate) struct InitialPose {
     pub(crate) alternatives: Vec<Candidate>,
 }
 
-/// A pose, and how well a sample of the points fits under it.
+/// Pose, with figures of how well a sample of the points fits under it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Candidate {
     pub(crate) cmm_from_model: Pose,
     /// Root mean square of the smallest nine tenths of the distances, in millimetres.
     pub(crate) rms_mm: f64,
-    /// The same over the points on the part only.
+    /// Root mean square of the smallest nine tenths of the distances of the points on the part, in millimetres.
     on_part_rms_mm: f64,
     /// Share of the points whose projections lie beyond the edge.
     off_part_share: f64,
@@ -45,33 +45,35 @@ pub(crate) struct Candidate {
 }
 
 impl Candidate {
-    /// Orders candidates by fit, the better first. Of two that fit alike, the one with more points on the part is
-    /// first.
+    /// Orders candidates by fit, the better first. Of two candidates that fit alike, the one with more points on the
+    /// part is first.
     fn by_fit(&self, other: &Self) -> std::cmp::Ordering {
         let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part_share);
         badness(self).total_cmp(&badness(other))
     }
 }
 
-/// Numbers of points for the first look at a candidate, its score, its refinement and the comparison.
+/// Numbers of points for the first score of a candidate, for its second score, for its refinement, and for the
+/// comparison.
 const FIRST_SCORE_POINTS: usize = 10;
 const SCORE_POINTS: usize = 40;
 const REFINE_POINTS: usize = 160;
 const COMPARE_POINTS: usize = 640;
-/// Number of candidates after the first look.
+/// Maximum number of candidates that remain after the first score.
 const MAX_SCORED: usize = 300;
-/// Number of measured places to lay on the surface, and of places of the surface for each.
+/// Number of features of the measured points to match, and number of features of the surface that are tried for each.
 const MEASURED_FEATURES: usize = 24;
 const MATCHES_PER_FEATURE: usize = 36;
-/// Number of candidates to refine.
+/// Maximum number of candidates that are refined.
 const MAX_REFINED: usize = 24;
-/// Most candidates to compare on both sides.
+/// Maximum number of candidates that are compared on both sides.
 const MAX_COMPARED: usize = 6;
 
-/// Smallest ratio of the two rms at which one side fits better. Form error alone gives a smaller ratio.
+/// Minimum ratio of the rms on one side to that on the other at which the other side fits better. Form error alone
+/// gives a smaller ratio.
 const MIN_SIDE_RATIO: f64 = 2.0;
 
-/// Largest excess of the share of points off the part at which a side still fits better.
+/// Maximum difference of the shares of points off the part at which the side with more of them can still fit better.
 const MAX_OFF_PART_EXCESS: f64 = 0.05;
 
 /// Returns the initial pose and the side of the probe.
@@ -90,12 +92,12 @@ pub(crate) fn initial_pose(
     }
 }
 
-/// Returns the rms in mm of the best fit of the mirrored cloud; `None` if it cannot be registered at all.
+/// Returns the rms in mm of the best fit of the mirrored cloud; `None` if no mirrored pose is found.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
-/// Returns the rms in mm of the best fit of the cloud as measured, with nothing locked.
+/// Returns the rms in mm of the best fit of the cloud as measured, with no coordinate locked.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
@@ -123,7 +125,7 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
     sample_evenly(measured, 4 * COMPARE_POINTS).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms in mm of the best fit on one side over all poses, with nothing locked.
+/// Returns the rms in mm of the best fit on one side over all poses, with no coordinate locked.
 fn searched_rms(part: &Part, points: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let options = RegistrationOptions { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
@@ -302,20 +304,21 @@ impl<'a> Search<'a> {
         between.angle_rad() + shift / self.part.size_mm
     }
 
-    /// Returns the distance in mm above which a point makes a candidate no worse.
+    /// Returns the distance in mm at which larger distances are truncated in a score.
     fn truncation_mm(&self) -> f64 {
         0.1 * self.part.size_mm
     }
 
-    /// Returns the root mean square, in mm, of the truncated distances from the part itself, not from its continuation.
+    /// Returns the root mean square, in mm, of the truncated distances from the part itself. The surface is not
+    /// continued beyond the edge.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
         let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Returns how well points fit under a pose, from the smallest nine tenths of the distances. Outliers in the rest
-    /// have no influence.
+    /// Returns the pose with its figures of fit, from the smallest nine tenths of the distances. Outliers in the
+    /// remaining tenth have no influence.
     fn assess_candidate(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
@@ -337,7 +340,7 @@ impl<'a> Search<'a> {
         Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part_share: off_part, side: surface.side() }
     }
 
-    /// Returns the squared distances from the part itself in mm^2, including the distance beyond its edge.
+    /// Returns the squared distances from the part itself in mm^2. The distance beyond the edge is included.
     fn squared_distances_mm2<'b>(
         &self,
         surface: &'b OffsetSurface,
@@ -352,7 +355,8 @@ impl<'a> Search<'a> {
         })
     }
 
-    /// Descends under a loss that ignores gross outliers. Its scale follows the distances as they decrease.
+    /// Descends from a start pose with a loss that ignores gross outliers. The scale of the loss follows the distances
+    /// as they decrease.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let (middle, size_mm) = centroid_and_size(points);
         let mut problem = Problem {
@@ -380,14 +384,15 @@ impl<'a> Search<'a> {
         self.assess_candidate(&problem.surface, pose, points)
     }
 
-    /// Returns the pose with the smallest rotation from the frame of the file, among those that fit as well as the
-    /// best. If the surface does not determine a rotation, only that frame does.
+    /// Returns the pose with the smallest rotation from the frame of the file, among the poses that fit as well as the
+    /// best. If the surface does not determine a rotation, only the frame of the file does.
     fn prefer_file_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
         /// Largest ratio of two rms that differ by chance.
         const MAX_RMS_RATIO: f64 = 1.1;
         /// Smallest difference of rms that distinguishes two fits, in mm.
         const MIN_DIFFERENCE_MM: f64 = 1e-5;
-        /// Largest ratio of rms for a fit that is not yet converged.
+        /// Maximum ratio of the rms of a candidate that is not yet converged to the best rms, at which it is still
+        /// considered.
         const MAX_UNCONVERGED_RATIO: f64 = 3.0;
         /// Difference below which two poses are the same.
         const MAX_POSE_DISTANCE: f64 = 0.01;
@@ -418,7 +423,7 @@ impl<'a> Search<'a> {
             .unwrap_or(best)
     }
 
-    /// Returns other poses that fit nearly as well as the best.
+    /// Returns the poses that fit nearly as well as the best one and differ clearly from it.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
@@ -459,7 +464,8 @@ impl<'a> Search<'a> {
         starts
     }
 
-    /// Returns poses that lay measured places on places of the offset surface with similar curvature.
+    /// Returns poses that map features of the measured points to features of the offset surface with similar
+    /// curvatures.
     fn by_curvature(&self, side: Side) -> Vec<Pose> {
         let on_nominal = self.part.nominal.features();
         if on_nominal.len() < MATCHES_PER_FEATURE {
@@ -473,15 +479,16 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Rejects the points beyond the edge, unless the pose is so far off that at least half of them are beyond it.
+/// Excludes the points beyond the edge from the fit. If at least half of the points are beyond it, the pose is too far
+/// off and no point is excluded.
 fn exclude_off_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
     correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
 }
 
-/// Returns the features whose two curvatures differ most, because their directions are certain: a sample spread over
-/// the better half.
+/// Returns a sample of the features in the better half by the difference of their two curvatures. With a large
+/// difference the principal directions are certain.
 fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
     features.truncate((features.len() / 2).max(MEASURED_FEATURES));
@@ -489,8 +496,8 @@ fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature
     features.into_iter().step_by(stride).collect()
 }
 
-/// Returns poses that lay a measured feature on the places of the surface with the most similar curvature, in both
-/// directions.
+/// Returns the poses that map a measured feature to the features of the surface with the most similar curvatures, each
+/// with both matches of the principal directions.
 fn poses_by_feature(measured: &CurvatureFeature, offset: &[CurvatureFeature]) -> Vec<Pose> {
     let unlike = |f: &CurvatureFeature| {
         (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
@@ -509,7 +516,7 @@ fn poses_by_feature(measured: &CurvatureFeature, offset: &[CurvatureFeature]) ->
         .collect()
 }
 
-/// Origin and right-handed axes.
+/// Frame: origin and right-handed axes.
 struct Frame {
     origin: Point,
     axes: nalgebra::Matrix3<f64>,

@@ -24,8 +24,8 @@ use super::plane_projection::{PlaneProjection, Projector, is_line};
 /// Spacings of the two coarser samplings of a grid, in spacings of the whole grid.
 const GRID_STRIDES: [usize; 2] = [3, 6];
 
-/// Scattered points are thinned to one point in 4 and one in 16. Clouds of less than `FEW` points are thinned as in
-/// `OF_FEW`.
+/// One point in 4 and one in 16 remain in the two coarser samplings of scattered points. For a cloud of less than
+/// `FEW_POINTS` points, `THINNING_FACTORS_OF_FEW` is used instead.
 const THINNING_FACTORS: [usize; 2] = [4, 16];
 const THINNING_FACTORS_OF_FEW: [usize; 2] = [2, 4];
 const FEW_POINTS: usize = 600;
@@ -41,13 +41,14 @@ const MIN_PLAUSIBLE_ORDERS: [f64; 2] = [1.2, 1.8];
 /// Maximum number of withheld points that are measured.
 const MAX_MEASURED: usize = 150_000;
 
-/// Width of the border, in spacings. A place is inside if the sampling continues at least this far in all directions.
+/// Width of the border, in spacings. A place is inside if the sampling continues at least this far from it in all
+/// directions.
 const BORDER_SPACINGS: f64 = 2.0;
 
 /// Minimum number of places inside that an estimate needs.
 const MIN_INSIDE: usize = 30;
 
-/// Points that a nominal surface is made from.
+/// Points from which a nominal surface is made.
 #[derive(Clone, Copy, Debug)]
 pub enum NominalPoints<'a> {
     /// Points in any order, on a grid or scattered; also the vertices of a mesh.
@@ -57,7 +58,7 @@ pub enum NominalPoints<'a> {
         /// Projection in which scattered points are triangulated.
         projection: PlaneProjection,
     },
-    /// Grid with known normals, row by row; NaN at a node that does not exist.
+    /// Grid with known normals, row by row; points are NaN at a node that does not exist.
     Grid {
         /// Nodes along the first direction.
         columns: usize,
@@ -99,7 +100,7 @@ pub struct ErrorEstimate {
     /// Reliability of the estimate.
     pub reliability: Reliability,
     spacing_mm: f64,
-    /// Spacing of the coarser of the two samplings, in millimetres.
+    /// Mean spacing of the coarser of the two samplings, in millimetres.
     coarsest_mm: f64,
 }
 
@@ -128,19 +129,19 @@ pub struct MaxError {
 /// Reliability of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reliability {
-    /// The error falls with the spacing as expected.
+    /// The error falls with the spacing as expected, so that it can be extrapolated.
     Extrapolated,
-    /// The error hardly falls with the spacing: the points contain rounding or noise, and the estimate is the size of
-    /// that noise.
+    /// The error hardly falls with the spacing: the points contain rounding errors or noise, and the estimate is the
+    /// size of this noise.
     Rounding,
     /// The coarser samplings do not resolve the features of the surface: the estimate is a guess.
     TooCoarse,
 }
 
 impl ErrorEstimate {
-    /// Returns the spacing at which the PV error inside equals `wanted_pv_mm`, in millimetres. Returns `None` if the
-    /// points are not exact enough for it at any spacing. The result is never coarser than the coarser of the two
-    /// samplings.
+    /// Returns the spacing, in millimetres, at which the PV error inside equals `wanted_pv_mm`, but not more than the
+    /// spacing of the coarser of the two samplings. Returns `None` if rounding or noise of the points exceeds this
+    /// error at any spacing.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
         if self.reliability == Reliability::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
@@ -150,7 +151,7 @@ impl ErrorEstimate {
     }
 }
 
-/// Estimates how exact the distances to the surface through these points are.
+/// Estimates the errors of the distances to the surface through these points.
 ///
 /// Frame: model. Units: millimetres.
 ///
@@ -199,7 +200,7 @@ pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceErro
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
 
-/// Errors measured at the points that a coarser sampling withholds.
+/// Errors at the points that a coarser sampling withholds.
 struct WithheldErrors {
     inside: Vec<WithheldPoint>,
     border: Vec<WithheldPoint>,
@@ -325,7 +326,8 @@ fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Wi
     WithheldErrors { inside: strip(inside), border: strip(border), spacing_mm }
 }
 
-/// Extrapolates the errors of two coarser samplings to the whole sampling.
+/// Extrapolates the errors of two coarser samplings to the whole sampling. `kind` is 0 for the flat and 1 for the
+/// curved distance.
 fn extrapolate_errors(
     fine: &WithheldErrors,
     coarse: &WithheldErrors,
@@ -362,7 +364,7 @@ fn extrapolate_errors(
     }
 }
 
-/// Returns the order at which the error fell from the coarse to the fine sampling; `step` is the ratio of their
+/// Returns the order at which the error falls from the coarse to the fine sampling; `step` is the ratio of their
 /// spacings.
 fn observed_order(fine: &ErrorFigures, coarse: &ErrorFigures, step: f64) -> f64 {
     let ratio = coarse.rms_mm / fine.rms_mm;

@@ -1,4 +1,4 @@
-//! Curvature features: they distinguish the places of a surface whatever its pose.
+//! Curvature features: places of a surface, distinguished by their curvature in any pose.
 
 use rayon::prelude::*;
 
@@ -8,7 +8,7 @@ use super::facet::Side;
 use super::normals::fit_to_neighbours;
 use super::plane_projection::principal_axes;
 
-/// Place of a surface with its normal and its principal curvatures.
+/// Place of a surface, with its normal and its principal curvatures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct CurvatureFeature {
     pub(crate) point: Point,
@@ -25,7 +25,7 @@ impl CurvatureFeature {
         self.curvatures[1] - self.curvatures[0]
     }
 
-    /// Returns the same place as seen from the other side of the surface.
+    /// Returns the same feature for the opposite direction of the normal.
     pub(crate) fn flipped(&self) -> Self {
         Self {
             point: self.point,
@@ -35,7 +35,8 @@ impl CurvatureFeature {
         }
     }
 
-    /// Returns the place on the offset surface, with its normal towards `side`; `None` if the offset folds there.
+    /// Returns the feature of the offset surface at this place, with its normal towards `side`; `None` if the offset
+    /// surface folds there.
     ///
     /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions do not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
@@ -49,7 +50,7 @@ impl CurvatureFeature {
     }
 }
 
-/// Number of nearest points that a local fit asks for, the point itself included.
+/// Number of nearest points that a local fit uses, including the point itself.
 const NEIGHBOURS: u32 = 25;
 
 /// Fits the curvature at each of some scattered points; uses their normals if these are known.

@@ -11,23 +11,25 @@ use super::mesh_topology::BORDER;
 use super::plane_projection::Projector;
 use super::triangulation::{SortedSites, Triangulation};
 
-/// Triangles and, for each corner, the neighbour across the opposite edge.
+/// Triangles and, for each corner, the neighbour across the edge opposite to the corner.
 pub(crate) struct Triangles {
     pub(crate) corners: Vec<[u32; 3]>,
     pub(crate) neighbours: Vec<[u32; 3]>,
 }
 
-/// Limit of height over border edge: a flatter border triangle is a needle of the convex hull, not a piece of surface.
+/// Minimum ratio of height to border edge of a border triangle. A flatter triangle is a needle of the convex hull, not
+/// a piece of the surface.
 const NEEDLE: f64 = 0.05;
 
-/// Limit of the longest edge over the usual length around its corners: a triangle with a longer edge bridges a hole.
+/// Maximum ratio of the longest edge of a triangle to the usual edge length around its corners. A triangle with a
+/// longer edge bridges a hole.
 const BRIDGE: f64 = 6.0;
 
-/// Limit of the extent of the points over the side of a square of as many points at the usual distance. A wider cloud
-/// is searched for a point that is far off the others.
+/// Maximum ratio of the extent of the points to the side of a square that the same number of points would fill at the
+/// usual distance. In a wider cloud a point far from the others is searched for.
 const WIDE: f64 = 100.0;
 
-/// Limit of the distance of two points over the usual length: nearer points are near-duplicates.
+/// Minimum ratio of the distance of two points to the usual edge length. Nearer points are near-duplicates.
 const TWINS: f64 = 1e-4;
 
 /// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
@@ -74,8 +76,8 @@ pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Poin
     Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
-/// Returns the keys and the indices of the places in the order of a Z-curve. Places with equal keys are ordered by u,
-/// then by v.
+/// Returns the keys and the indices of the places, sorted along a Z-curve. Places with equal keys are sorted by u, then
+/// by v.
 pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
@@ -96,7 +98,7 @@ pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     along
 }
 
-/// Inserts a zero before each bit.
+/// Returns the bits with a zero inserted before each of them.
 fn spread_bits(bits: u32) -> u64 {
     let mut bits = u64::from(bits);
     bits = (bits | bits << 16) & 0x0000_FFFF_0000_FFFF;
@@ -138,7 +140,8 @@ impl EdgeLengths {
     }
 }
 
-/// Returns two points so near each other that the surface between them consists of rounding errors.
+/// Returns two points that are so near to each other that the surface between them consists of rounding errors; `None`
+/// if there are none.
 fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
     let least = TWINS * lengths.median_max_edge;
     let facet = lengths.min_edge.par_iter().position_first(|shortest| *shortest < least)?;
@@ -185,7 +188,7 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     })
 }
 
-/// Returns the triangles that are far longer than is usual around their corners.
+/// Returns the triangles with edges far longer than usual around their corners.
 fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
@@ -204,8 +207,8 @@ fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
         .collect()
 }
 
-/// Returns the usual length at the corners of some triangles. It is the lower quartile of the longest edges of the
-/// triangles around a corner, because at the rim of a hole half of these triangles may be bridges.
+/// Returns the usual edge length at the corners of the triangles `suspects`. At a corner it is the lower quartile of
+/// the longest edges of the triangles there, because at the rim of a hole half of these triangles can be bridges.
 ///
 /// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller compares
 /// with the largest value of the three corners. A stray point would justify its own bridges. Therefore the value of a
@@ -230,7 +233,7 @@ fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> Hash
     neighbours.iter().map(confirmed).collect()
 }
 
-/// Returns the triangles at each of some vertices.
+/// Returns for each of these vertices the triangles that meet there.
 fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u32, Vec<u32>> {
     let mut is_wanted = vec![false; t.corners.par_iter().flatten_iter().max().map_or(0, |most| *most as usize + 1)];
     vertices.for_each(|c| is_wanted[c as usize] = true);

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-/// Reason why a nominal surface or its offset cannot be made.
+/// Reason why a nominal surface or its offset surface cannot be created.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -16,10 +16,10 @@ pub enum SurfaceError {
         index + 1, at[0], at[1], at[2]
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
-    #[error("all {points} nominal points lie on one line; a surface requires points off the line")]
+    #[error("all {points} nominal points lie on one line; give points that do not lie on one line")]
     Collinear { points: usize },
     #[error(
-        "nominal points {} and {} share one place at ({:.6}, {:.6}, {:.6}) mm; remove the duplicate",
+        "nominal points {} and {} are both at ({:.6}, {:.6}, {:.6}) mm; remove one of them",
         first + 1, second + 1, at[0], at[1], at[2]
     )]
     DuplicatePoints { first: usize, second: usize, at: [f64; 3] },
@@ -35,8 +35,8 @@ pub enum SurfaceError {
     #[error("the nominal mesh has no triangle; give a file with faces")]
     NoTriangles,
     #[error(
-        "a triangle of the nominal mesh names vertex {vertex}, but there are {points} (counted from 0); export the \
-         mesh again"
+        "a triangle of the nominal mesh names vertex {vertex}, but the mesh has {points} vertices, counted \
+         from 0; export the mesh again"
     )]
     VertexOutOfRange { vertex: u32, points: usize },
     #[error(

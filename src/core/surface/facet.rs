@@ -1,5 +1,5 @@
-//! Geometry of one facet: its corners on the offset surface, the projection (foot) of a point onto it, and the curved
-//! distance there.
+//! Geometry of one facet: its corners on the offset surface, the projection of a point onto it, and the curved distance
+//! of the point.
 //!
 //! A corner is offset along its normal, S_e = S + r n, eq. (3). The flat distance is that of the paper, eq. (1) and
 //! (2). The curved distance accounts for the bulge of the surface between its corners. With barycentric weights b and
@@ -10,19 +10,19 @@
 //! ```
 //!
 //! This is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001), with its heights
-//! taken along the normals of the surface instead of the normal of the facet. The foot of the perpendicular on the flat
-//! facet is off by the distance times the tilt of the surface against the facet. So the distance along the normal n(b)
-//! of the surface is d (N.n(b)) - h(b), with the flat distance d and the flat normal N. It is exact to third order in
-//! the size of a facet.
+//! taken along the normals of the surface instead of the normal of the facet. The projection onto the flat facet is
+//! displaced by the distance times the tilt of the surface against the facet. So the distance along the normal n(b) of
+//! the surface is d (N.n(b)) - h(b), with the flat distance d and the flat normal N. It is exact to third order in the
+//! size of a facet.
 //!
-//! The code is generic over [`Real`], so that one text serves one facet or four in parallel lanes.
+//! The code is generic over [`Real`], so that the same code works for one facet and for four in parallel lanes.
 
 use crate::geometry::{Point, Vector};
 
 use super::simd::{F64x4, LANES, Real, Vector3x4, cross, dot, minus, times};
 
-/// Point of a surface with its unit normal. The two are adjacent in memory because a point location needs both; apart
-/// they would cost twice the cache lines.
+/// Point of a surface with its unit normal. A point location needs both; they are adjacent in memory, because two
+/// separate arrays would need twice the cache lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Vertex {
     pub(crate) point: Point,
@@ -41,7 +41,7 @@ pub enum Side {
 }
 
 impl Side {
-    /// Returns +1 on the side of the normals and -1 on the other.
+    /// Returns +1 for the side of the normals and -1 for the opposite side.
     pub fn sign(self) -> f64 {
         match self {
             Self::Normal => 1.0,
@@ -58,15 +58,15 @@ impl Side {
     }
 }
 
-/// Triangles as a point location needs them; counter-clockwise as seen from the side of the normals.
+/// Triangles for a point location; counter-clockwise as seen from the side of the normals.
 pub(crate) trait Facets: Sync {
     /// Returns the three corners of a facet.
     fn corners(&self, facet: u32) -> [u32; 3];
 
-    /// Returns the facet to visit next for a point with these barycentric weights; `None` if the surface ends there.
+    /// Returns the next facet on the way to a point with these barycentric weights; `None` if the surface ends there.
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
 
-    /// Returns true if the surface ends at the edge of a facet that is opposite to a corner.
+    /// Returns true if the surface ends at the edge of a facet that is opposite to this corner.
     fn ends_at(&self, facet: u32, corner: usize) -> bool;
 
     /// Returns a facet from which to start the search for a point.
@@ -80,11 +80,11 @@ pub(crate) type Corner<T> = ([T; 3], [T; 3]);
 pub(crate) struct Facet<T> {
     corners: [[T; 3]; 3],
     normals: [[T; 3]; 3],
-    /// Normal of the flat facet, not of unit length, in the sense in which the corners turn. `squared` is its squared
-    /// length.
+    /// Normal of the flat facet, not of unit length; its direction follows from the order of the corners.
+    /// `area_normal_squared` is its squared length.
     pub(crate) area_normal: [T; 3],
     pub(crate) area_normal_squared: T,
-    /// +1 on the side of the normals, -1 on the other.
+    /// +1 for the side of the normals, -1 for the opposite side.
     sign: T,
 }
 
@@ -136,13 +136,13 @@ impl<T: Real> Facet<T> {
         weighted(&self.corners, b)
     }
 
-    /// Returns the unit normal of the curved surface.
+    /// Returns the unit normal of the curved surface at these weights.
     #[inline(always)]
     pub(crate) fn normal(&self, b: &[T; 3]) -> [T; 3] {
         T::unit(&weighted(&self.normals, b))
     }
 
-    /// Returns the height of the curved surface over the flat facet, positive on the probe's side.
+    /// Returns the height of the curved surface above the flat facet at these weights, positive on the probe's side.
     #[inline(always)]
     pub(crate) fn height(&self, b: &[T; 3]) -> T {
         let zero = T::splat(0.0);
@@ -165,8 +165,8 @@ impl<T: Real> Facet<T> {
         (dot(w, &flat), flat)
     }
 
-    /// Returns the curved distance of a point and the normal at its foot. `w` is the vector from the first corner to
-    /// the point; `b` are the weights of the foot.
+    /// Returns the curved distance of a point and the normal at its projection. `w` is the vector from the first corner
+    /// to the point; `b` are the barycentric weights of the projection.
     #[inline(always)]
     pub(crate) fn curved_distance(&self, w: &[T; 3], b: &[T; 3]) -> (T, [T; 3]) {
         let (flat_mm, flat) = self.flat_distance(w);

@@ -1,4 +1,5 @@
-//! Folds of an offset surface: a probe does not fit into a place that is more concave than the probe itself.
+//! Folds of an offset surface. It folds where the nominal surface is more concave than the probe: the probe does not
+//! fit there.
 
 use rayon::prelude::*;
 
@@ -11,19 +12,19 @@ use super::offset::{FacetIndex, OffsetSurface};
 use super::patch::{Patch, Topology};
 use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
 
-/// Maximum number of facets of a mesh that are checked in addition to the touched ones. It is limited because a mesh
-/// fits its normals only where they are needed.
+/// Maximum number of facets of a mesh that are checked in addition to those near the measured points. It is limited
+/// because a mesh fits a normal only when it is needed.
 const MAX_CHECKED_FACETS: usize = 2048;
 
-/// Step of the first check of a grid, in nodes. This check uses a probe `DOUBT` times as large; every facet is checked
-/// only if that probe nearly folds somewhere. A surface whose curvature changes by a third between neighbouring nodes
-/// is sampled too coarsely to be known.
+/// Step of the first check of a grid, in nodes. This check uses a probe that is `PROBE_ENLARGEMENT` times as large.
+/// Every facet is checked only if the offset of that probe folds somewhere. If the curvature changes by a third between
+/// neighbouring nodes, the sampling is too coarse to show the surface.
 const STEP: usize = 2;
 const PROBE_ENLARGEMENT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
-    /// Returns the worst place where the offset surface folds, if there is one. Checks a whole grid, and up to
-    /// `LOOKED_AT` facets of a mesh.
+    /// Returns the worst place where the offset surface folds as an error; `None` if it does not fold. All facets of a
+    /// grid are checked, and up to [`MAX_CHECKED_FACETS`] facets of a mesh.
     pub(crate) fn find_fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
@@ -32,8 +33,8 @@ impl OffsetSurface<'_> {
         self.worst_fold(patches.iter().flat_map(|patch| self.folded_facets(patch).into_iter().map(move |f| (patch, f))))
     }
 
-    /// Returns the worst place where the offset surface folds among the touched places of a mesh.
-    /// [`OffsetSurface::find_fold`] checks a grid as a whole.
+    /// Returns the worst place where the offset surface folds as an error, among these facets of a mesh; `None` if
+    /// there is none. [`OffsetSurface::find_fold`] checks a whole grid.
     pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = FacetIndex>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
         let is_mesh = |patch: &Patch| matches!(patch.topology, Topology::Mesh(_));
@@ -46,7 +47,7 @@ impl OffsetSurface<'_> {
         self.worst_fold(there.into_iter())
     }
 
-    /// Returns the worst of some folded facets as an error.
+    /// Returns the error for the worst of some folded facets; `None` if there are none.
     fn worst_fold<'a>(&self, folded: impl Iterator<Item = (&'a Patch, u32)>) -> Option<SurfaceError> {
         let worst = folded.map(|(p, f)| (self.min_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -80,7 +81,7 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the wide facets along a row of nodes.
+    /// Returns the facets that are [`STEP`] nodes wide along a row of nodes.
     fn wide_row<'a>(&self, grid: &GridTopology, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
@@ -91,7 +92,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns true if the offset turns a facet over or flattens it: E + r B is no longer positive definite.
+    /// Returns true if the offset reverses a facet or makes it flat: E + r B (see [`Self::fundamental_forms`]) is not
+    /// positive definite.
     #[inline]
     fn is_folded(&self, patch: &Patch, corners: [u32; 3]) -> bool {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
@@ -100,8 +102,8 @@ impl OffsetSurface<'_> {
         is_not_positive_definite(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
-    /// Returns the smallest normal curvature of a facet in 1/mm, negative where it is concave as seen from the probe's
-    /// side. It is the smallest eigenvalue of E^-1 B.
+    /// Returns the smallest normal curvature of a facet in 1/mm, negative if the facet is concave as seen from the
+    /// probe's side. It is the smallest eigenvalue of E^-1 B (see [`Self::fundamental_forms`]).
     fn min_curvature(&self, patch: &Patch, facet: u32) -> f64 {
         let ([e, f, g], [l, m, k]) = self.fundamental_forms(patch, patch.corners(facet));
         let det = e * g - f * f;
@@ -110,7 +112,8 @@ impl OffsetSurface<'_> {
         mean - (mean * mean - gauss).max(0.0).sqrt()
     }
 
-    /// Returns the first and second fundamental forms over two edges of a facet, as seen from the probe's side.
+    /// Returns the first and the second fundamental form, E and B, over two edges of a facet, as seen from the probe's
+    /// side. Each is given by its entries 11, 12 and 22.
     ///
     /// Along an edge e the normal changes by dn = K e. With E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j,
     /// K is E^-1 B. The offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
@@ -135,7 +138,7 @@ struct WideRow<'a> {
 impl pulp::NullaryFnOnce for WideRow<'_> {
     type Output = bool;
 
-    /// Returns true if any of the facets nearly folds; facets at holes do not count.
+    /// Returns true if the offset by `reach` folds any of the facets; facets at holes do not count.
     #[inline(always)]
     fn call(self) -> bool {
         let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);

@@ -1,4 +1,4 @@
-//! Grid of nodes as a surface: two triangles per cell, by arithmetic, without any triangulation.
+//! Grid of nodes as a surface: two triangles in each cell, computed from the indices, without any triangulation.
 
 use rayon::prelude::*;
 
@@ -19,8 +19,8 @@ pub(crate) struct GridTopology {
     rows: u32,
     /// True for each node that exists; empty if all nodes exist.
     present: Vec<bool>,
-    /// First corner, and nodes per millimetre, of a grid that is regular in x and y. With them a search begins near its
-    /// end.
+    /// First corner in mm, and nodes per millimetre, along x and y; `None` for a grid that is not regular in x and y.
+    /// With these a search starts near the right cell.
     regular: Option<([f64; 2], [f64; 2])>,
 }
 
@@ -71,7 +71,7 @@ impl GridTopology {
         self.rows as usize
     }
 
-    /// Returns the lower facets of a row of cells with their corners, including facets at holes.
+    /// Returns the lower right facet of each cell in a row of cells, with its corners. Facets at holes are included.
     pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
         let first = row as u32 * self.columns;
         (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
@@ -87,7 +87,7 @@ impl GridTopology {
         self.present.is_empty() || self.present[node]
     }
 
-    /// Returns the other nodes of the block that extends `reach` nodes to all sides of a node, without holes.
+    /// Returns the existing nodes within `reach` rows and columns of a node, without the node itself.
     pub(crate) fn block_around(&self, node: u32, reach: u32) -> Vec<u32> {
         let (i, j) = (node % self.columns, node / self.columns);
         let within = |k: u32, count: u32| k.saturating_sub(reach)..(k + reach + 1).min(count);
@@ -95,7 +95,7 @@ impl GridTopology {
         nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
     }
 
-    /// Returns a facet at a node, or a facet of the nearest whole cell.
+    /// Returns a facet at a node. If the node has no facet, returns a facet of the nearest cell whose four nodes exist.
     pub(crate) fn facet_near(&self, node: u32) -> u32 {
         let (i, j) = (node % self.columns, node / self.columns);
         let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
@@ -118,8 +118,8 @@ impl GridTopology {
         (node % self.columns, node / self.columns)
     }
 
-    /// Returns the cell at (u, v) steps from a cell, clamped to the grid. If that cell is not whole, halves the steps
-    /// until they lead to a whole cell; returns `None` if there is none.
+    /// Returns the cell at (u, v) steps from a cell, clamped to the grid. If a node of that cell does not exist, the
+    /// steps are halved until they lead to a cell whose four nodes exist; `None` if there is no such cell.
     fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
         let clamp =
             |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
@@ -136,7 +136,7 @@ impl GridTopology {
         }
     }
 
-    /// Returns the whole cell nearest to a cell; searches in rings of growing size.
+    /// Returns the nearest cell whose four nodes exist; searches in rings of growing size.
     fn nearest_whole_cell(&self, i: u32, j: u32) -> (u32, u32) {
         if self.cell_is_whole(i, j) {
             return (i, j);
@@ -163,7 +163,7 @@ impl Facets for GridTopology {
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }
 
-    /// Jumps directly to the cell that the affine continuation of this facet points at.
+    /// Returns a facet of the cell to which the barycentric weights point, if the facet is continued as a plane.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let (u, v) =
@@ -212,7 +212,7 @@ fn extremes(points: &[Point]) -> ([f64; 2], [f64; 2]) {
     points.par_iter().map(|p| ([p.x, p.y], [p.x, p.y])).reduce(|| none, merge)
 }
 
-/// Weights of the first derivative at each place of a window of equally spaced nodes, for windows of 2 to 5 nodes.
+/// Weights of the first derivative at each node of a window of equally spaced nodes, for windows of 2 to 5 nodes.
 ///
 /// Each row differentiates the polynomial through its window exactly. Five nodes determine a quartic, so that a
 /// bi-cubic patch of surface has its exact normal at every node, also at the border.
@@ -233,8 +233,8 @@ const DERIVATIVES: [&[&[f64]]; 6] = [
     ],
 ];
 
-/// Fits the unit normals of a structured grid, on the side where column, row and normal are right-handed. Returns them
-/// together with the points.
+/// Fits the unit normals of a structured grid, and returns them together with the points. The directions of column, row
+/// and normal are right-handed.
 ///
 /// Shapes: one vertex per node, in grid order. The normal is NaN at holes and at nodes that have no neighbour along one
 /// of the two grid lines. Equation: the tangents are the derivatives of the quartics through five nodes along each grid
@@ -328,8 +328,8 @@ impl NodeBlock<'_> {
     }
 }
 
-/// Returns the derivative along one grid line at its `at`-th node of `count`, from the window of present nodes around
-/// it. Returns NaN if the node is a hole or has no neighbour on the line.
+/// Returns the derivative along one grid line at its node number `at` of `count`, from a window of existing nodes
+/// around this node. Returns NaN if the node is a hole or has no neighbour on the line.
 fn line_derivative(
     points: &[Point],
     lattice: &GridTopology,

@@ -5,19 +5,19 @@ use crate::geometry::{Point, PointTree, Vector};
 use super::error::SurfaceError;
 use super::facet::Facets;
 
-/// Marks an edge without a neighbour: the surface ends there.
+/// Neighbour number of an edge without a neighbour: the surface ends there.
 pub(crate) const BORDER: u32 = u32::MAX;
 
-/// Maximum number of facets in the tree that gives a start to a search without an earlier place.
+/// Maximum number of facets in the search tree that gives the first facet of a search without an earlier result.
 const MAX_START_FACETS: usize = 1 << 15;
 
 /// Triangle mesh in which each facet knows its neighbours.
 #[derive(Debug)]
 pub(crate) struct MeshTopology {
     corners: Vec<[u32; 3]>,
-    /// Facet across the edge opposite to corner k; [`BORDER`] if there is none.
+    /// Facet across the edge opposite to corner k; [`BORDER`] if there is no such facet.
     neighbours: Vec<[u32; 3]>,
-    /// One facet at each vertex; at a vertex on the border, the first one counter-clockwise.
+    /// One facet at each vertex. At a vertex on the border it is the first facet in counter-clockwise order.
     vertex_facets: Vec<u32>,
     start_tree: PointTree,
     start_facets: Vec<u32>,
@@ -66,7 +66,7 @@ impl MeshTopology {
         Ok(Self { corners, neighbours, vertex_facets: facet_of, start_tree: starts, start_facets })
     }
 
-    /// Returns true if no triangle has a border edge: the mesh encloses a whole solid.
+    /// Returns true if no triangle has a border edge, so that the mesh encloses a solid.
     pub(crate) fn is_closed(&self) -> bool {
         self.neighbours.iter().flatten().all(|neighbour| *neighbour != BORDER)
     }
@@ -115,9 +115,9 @@ impl MeshTopology {
 }
 
 impl MeshTopology {
-    /// Collects the neighbours of a vertex counter-clockwise, and after them their further neighbours, each once.
-    /// Returns the number of vertices in the first ring and in both rings together. Returns `None` if the surface ends
-    /// within the rings or `ring` is too small.
+    /// Collects the neighbours of a vertex counter-clockwise, and after them the further neighbours of these, each
+    /// once. Returns the number of vertices in the first ring, and in both rings together. Returns `None` if the
+    /// surface ends within the rings or if `ring` is too small.
     ///
     /// The facets around a neighbour are visited only on the side away from the vertex: from beyond one edge of the
     /// first ring to beyond the next.
@@ -172,7 +172,7 @@ impl Facets for MeshTopology {
         self.corners[facet as usize]
     }
 
-    /// Crosses the edge that the point lies farthest beyond, among the edges that have a neighbour.
+    /// Returns the neighbour across the edge that the point is farthest beyond, among the edges with a neighbour.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let across = &self.neighbours[facet as usize];
@@ -221,7 +221,7 @@ fn facet_neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 
     Ok(neighbours)
 }
 
-/// Returns an error that names the triangles that are there twice, if there are any.
+/// Returns an error about the triangles that exist twice; `None` if there are none.
 fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> {
     let mut sorted: Vec<[u32; 3]> = corners.to_vec();
     sorted.iter_mut().for_each(|corners| corners.sort_unstable());
@@ -233,7 +233,7 @@ fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> 
 }
 
 /// Returns one facet at each vertex. At the border it is the facet from which the counter-clockwise order visits all
-/// the others.
+/// facets of the vertex.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
     for (facet, c) in corners.iter().enumerate() {

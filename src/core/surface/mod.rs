@@ -2,12 +2,12 @@
 //! from it.
 //!
 //! ```text
-//!  points --+-- regular grid? ----------------> grid lattice   (no triangulation; normals from the grid lines)
-//!           +-- projection -> Delaunay -------> mesh lattice   (flat arrays; normals fitted where touched)
+//!  points --+-- regular grid? ----------------> GridTopology   (no triangulation; normals from the grid lines)
+//!           +-- projection -> Delaunay -------> MeshTopology   (flat arrays; a normal is fitted when first needed)
 //!  mesh ----------------------------------------^
-//!  formula -> sampled, exact normals -> grid lattice
+//!  formula -> sampled, exact normals ---------> GridTopology
 //!                                                    \
-//!                                                     OffsetSurface: foot, distance, normal of any point
+//!                                                     OffsetSurface: projection, distance, normal of any point
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frame: all coordinates are in the model frame {M}. Units: millimetres.

@@ -1,4 +1,4 @@
-//! A nominal surface, made from points, a grid, a mesh or several patches, and its properties.
+//! Nominal surface, created from points, a grid, a mesh or several patches, with its properties.
 
 use std::sync::OnceLock;
 
@@ -19,21 +19,22 @@ use super::offset::FacetIndex;
 use super::patch::{Patch, Topology};
 use super::plane_projection::{PlaneProjection, is_line, principal_axes};
 
-/// Nominal surface: one or several patches of points with normals, ready for distances.
+/// Nominal surface: one or several patches of points with normals, to which distances can be computed.
 #[derive(Debug)]
 pub struct Nominal {
     patches: Vec<Patch>,
     kind: NominalKind,
     outline: Option<Aperture>,
-    /// Curvature features at some places; computed when a pose is searched for.
+    /// Curvature features of some places; computed when a pose is searched for the first time.
     features: OnceLock<Vec<CurvatureFeature>>,
     /// Rms distances of the points from their centroid and from their best-fit plane.
     extent_mm: OnceLock<[f64; 2]>,
-    /// Some of the points and a facet at each; made when a search for a foot has no start.
+    /// Sample of the points with a facet at each; computed when a projection without a start facet is searched for the
+    /// first time.
     start_facets: OnceLock<(PointTree, Vec<FacetIndex>)>,
 }
 
-/// Source that a nominal surface was made from.
+/// Source from which a nominal surface was created.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NominalKind {
     /// Points on a regular grid, or a grid of (u, v) parameters.
@@ -48,7 +49,7 @@ pub enum NominalKind {
         /// The projection, never `Auto`.
         projection: PlaneProjection,
     },
-    /// A mesh that came with its triangles.
+    /// A mesh that was given with its triangles.
     Mesh,
     /// Several patches.
     Patches {
@@ -58,7 +59,8 @@ pub enum NominalKind {
 }
 
 impl Nominal {
-    /// Makes a surface from points in any order. A regular grid in xy is used as it is; other points are triangulated.
+    /// Creates a surface from points in any order. A regular grid in x and y is used directly; other points are
+    /// triangulated.
     ///
     /// Shapes: at least 9 points. The order of the points does not matter.
     ///
@@ -84,7 +86,7 @@ impl Nominal {
         Self::from_triangulated_points(points, projection)
     }
 
-    /// Makes a surface from points by triangulation, even if they form a grid.
+    /// Creates a surface from points by triangulation, even if they form a grid.
     ///
     /// # Errors
     /// Returns the same errors as [`Nominal::from_points`].
@@ -98,7 +100,7 @@ impl Nominal {
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
 
-    /// Makes a surface from a structured grid of points, one for each pair of parameters (u, v).
+    /// Creates a surface from a structured grid of points, one for each pair of parameters (u, v).
     ///
     /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side
     /// where u, v and the normal are right-handed.
@@ -110,7 +112,7 @@ impl Nominal {
         Ok(Self::from_grid_topology(GridTopology::new(columns, rows, &points, false), &points))
     }
 
-    /// Makes a surface from a regular xy grid of points whose unit normals are known.
+    /// Creates a surface from a grid of points that is regular in x and y, with known unit normals.
     ///
     /// # Errors
     /// Returns the same errors as [`Nominal::from_parameter_grid`].
@@ -126,7 +128,7 @@ impl Nominal {
         Ok(Self::new(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
 
-    /// Makes a surface from a mesh. The normals are on the side from which the triangles turn counter-clockwise.
+    /// Creates a surface from a mesh. The normals are on the side from which the triangles are counter-clockwise.
     ///
     /// # Errors
     /// Returns an error if a coordinate is not finite, there is no triangle, an index is out of range, more than two
@@ -139,7 +141,8 @@ impl Nominal {
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Mesh))
     }
 
-    /// Joins several surfaces into one of several patches. A point belongs to the patch that its foot lies on.
+    /// Joins several surfaces into one surface of several patches. A point belongs to the patch that its projection
+    /// lies on.
     ///
     /// # Errors
     /// Returns an error if the list is empty.
@@ -159,7 +162,7 @@ impl Nominal {
         })
     }
 
-    /// Sets the outline of the part in xy: a point whose foot lies outside it is off the part.
+    /// Sets the outline of the part in x and y: a point whose projection lies outside it is off the part.
     pub fn with_outline(self, outline: Aperture) -> Self {
         Self { outline: Some(outline), ..self }
     }
@@ -180,7 +183,7 @@ impl Nominal {
         }
     }
 
-    /// Rejects a mesh that encloses a whole solid: the face of a part has a border.
+    /// Rejects a mesh that encloses a solid. The face of a part has a border.
     ///
     /// # Errors
     /// Returns an error if a patch is a closed solid.
@@ -191,12 +194,12 @@ impl Nominal {
         }
     }
 
-    /// Returns what the surface was made from.
+    /// Returns the source of the surface.
     pub fn kind(&self) -> NominalKind {
         self.kind
     }
 
-    /// Returns the outline of the part, if one was set.
+    /// Returns the outline of the part; `None` if none was set.
     pub fn outline(&self) -> Option<&Aperture> {
         self.outline.as_ref()
     }
@@ -205,7 +208,7 @@ impl Nominal {
         &self.patches
     }
 
-    /// Returns every point of the surface, without holes.
+    /// Returns every point of the surface; holes are skipped.
     pub fn points(&self) -> impl Iterator<Item = &Point> {
         self.patches
             .iter()
@@ -213,7 +216,7 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns every point moved along its normal by a length in millimetres, eq. (3), without holes.
+    /// Returns every point shifted along its normal by a length in millimetres, eq. (3); holes are skipped.
     pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
         let moved = move |vertex: Vertex| vertex.point + vertex.normal * by_mm;
         self.patches
@@ -222,7 +225,7 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns the number of points, without holes.
+    /// Returns the number of points; holes do not count.
     pub fn len(&self) -> usize {
         self.points().count()
     }
@@ -232,7 +235,7 @@ impl Nominal {
         self.len() == 0
     }
 
-    /// Returns some vertices and their normals, spread over the surface.
+    /// Returns about `count` vertices with their normals, spread over the surface.
     fn sampled_vertices(&self, count: usize) -> Vec<(Point, Vector)> {
         let share = count / self.patches.len();
         self.patches
@@ -248,7 +251,7 @@ impl Nominal {
         normals.fold(0.0, f64::max)
     }
 
-    /// Returns some points spread over the surface.
+    /// Returns about `count` points, spread over the surface.
     pub(crate) fn sample(&self, count: usize) -> Vec<Point> {
         let share = (count / self.patches.len()).max(1);
         self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| *patch.point(v))).collect()
@@ -280,9 +283,9 @@ impl Nominal {
         if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
     }
 
-    /// Returns the estimated error of fitted normals, in radians; 0 for a grid and for given normals.
+    /// Returns the estimated rms error of fitted normals, in radians; 0 for a grid and for given normals.
     ///
-    /// The estimate is the rms change of the normal when the fit asks for twice as many neighbours.
+    /// The estimate is the rms change of the normal when the fit uses twice as many neighbours.
     pub(crate) fn normal_error_rad(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
@@ -302,10 +305,9 @@ impl Nominal {
         nominal_noise::noise_sigma_mm(&self.patches)
     }
 
-    /// Returns facets at the points of the surface that are nearest to a place, by distance in space and not along a
-    /// projection.
+    /// Returns facets at the points of the surface that are nearest to a place, by their distance in space.
     pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = FacetIndex> {
-        /// Number of points in the search tree, and number of places returned.
+        /// Number of points in the search tree, and number of facets returned.
         const TREE_POINTS: usize = 20_000;
         const RETURNED: u32 = 3;
         let (nearest, places) = self.start_facets.get_or_init(|| {

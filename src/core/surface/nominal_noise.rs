@@ -1,7 +1,7 @@
 //! Noise of the points of a nominal surface about a smooth surface.
 //!
-//! A cubic is fitted to a few neighbours of a point and to about twice as many. The residual of a smooth surface grows
-//! with the fourth power of the distance; the residual of noise is the same in both fits.
+//! A cubic is fitted to a few neighbours of a point, and another one to about twice as many. On a smooth surface the
+//! residual grows with the fourth power of the distance; with noise the residual is the same in both fits.
 
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
@@ -14,8 +14,8 @@ use crate::geometry::Point;
 const TERMS: usize = 10;
 /// Number of points that are checked.
 const CHECKED_POINTS: usize = 100;
-/// Limit of the residual with many neighbours over that with few. A larger ratio means that the residual is the form of
-/// the surface itself.
+/// Maximum ratio of the residual with many neighbours to that with few. A larger ratio means that the residual is the
+/// form of the surface itself.
 const MAX_GROWTH: f64 = 2.0;
 
 /// Returns the standard deviation of the noise of the points along the normal, in millimetres; 0 if the points show
@@ -32,7 +32,8 @@ pub(super) fn noise_sigma_mm(patches: &[Patch]) -> f64 {
     if many > MAX_GROWTH * few { 0.0 } else { many }
 }
 
-/// Returns the mean squared residuals of cubics that are fitted to few neighbours and to many.
+/// Returns the residual variances of two cubics about a vertex, fitted to few neighbours and to many; `None` if there
+/// are too few neighbours or they do not determine a cubic.
 fn residual_variances(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     let around = tangent_frame_neighbours(patch, vertex);
     // The point itself is included; these are the smallest numbers that leave a few degrees of freedom.
@@ -40,7 +41,8 @@ fn residual_variances(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     Some([of(NEIGHBOURS + 3)?, of(2 * NEIGHBOURS + 3)?])
 }
 
-/// Returns a point and its neighbours in coordinates along two tangents and the normal, the nearest first.
+/// Returns a point and its neighbours, sorted by distance. The coordinates are along two tangents and the normal at the
+/// point.
 fn tangent_frame_neighbours(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     let wanted = 2 * NEIGHBOURS + 3;
     let others: Vec<u32> = match &patch.topology {

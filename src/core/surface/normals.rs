@@ -6,15 +6,15 @@ use super::facet::Facets;
 use super::mesh_topology::MeshTopology;
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 
-/// Number of neighbours that a fit asks for: nine unknowns and a margin. Two rings of a triangulation have eighteen; at
+/// Number of neighbours that a fit requires: nine unknowns and a margin. Two rings of a triangulation have eighteen; at
 /// a border they have about ten, so that a third ring is added there.
 pub(crate) const NEIGHBOURS: usize = 14;
 
 /// Maximum number of neighbours in a fit.
 const MAX_NEIGHBOURS: usize = 64;
 
-/// Smallest accepted ratio of a pivot to the largest diagonal entry. A smaller pivot means that the neighbours do not
-/// determine the cubic.
+/// Minimum ratio of a pivot to the largest diagonal entry. A smaller pivot means that the neighbours do not determine
+/// the cubic.
 const WEAK_PIVOT: f64 = 1e-9;
 
 /// Result of a local fit: the surface at a vertex.
@@ -41,7 +41,7 @@ pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wa
     fit_to_neighbours(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
-/// Fits like [`fit_to_ring`] to neighbours from another source, about an approximate normal.
+/// Fits as [`fit_to_ring`] does, but to given neighbours of a point. `mean` is the approximate normal.
 pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
     let mut local = [[0.0; 3]; MAX_NEIGHBOURS];
@@ -63,8 +63,8 @@ pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterat
     LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
 }
 
-/// Fits the normals of four vertices in parallel lanes. Each agrees with [`fit_to_ring`] to rounding and does not
-/// depend on the other three vertices.
+/// Fits the normals of four vertices in parallel lanes. Each normal equals that of [`fit_to_ring`] except for rounding,
+/// and does not depend on the other three vertices.
 #[inline(always)]
 pub(crate) fn fit_normals_x4(points: &[Point], mesh: &MeshTopology, vertices: &[u32; LANES]) -> [Vector; LANES] {
     let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MAX_NEIGHBOURS], max_count: 0 };
@@ -88,8 +88,8 @@ pub(crate) fn fit_normals_x4(points: &[Point], mesh: &MeshTopology, vertices: &[
     })
 }
 
-/// Neighbours of four vertices, each in the frame of its vertex and in units of their mean distance; shorter rings are
-/// padded with zeros.
+/// Neighbours of four vertices, each in the frame of its vertex and in units of the mean distance of its neighbours.
+/// Shorter rings are padded with zeros.
 struct Rings {
     local: [Vector3x4; MAX_NEIGHBOURS],
     max_count: usize,
@@ -278,8 +278,8 @@ fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     Some(solution)
 }
 
-/// Computes the Cholesky factor of a symmetric matrix in place, in its lower half, and returns the inverses of its
-/// pivots; `None` if a pivot is not above the limit.
+/// Replaces the lower half of a symmetric matrix by its Cholesky factor, and returns the inverses of the pivots; `None`
+/// if a pivot is not above `least_pivot`.
 #[inline(always)]
 fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
     let mut inverse_pivots = [0.0; N];
@@ -310,14 +310,15 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
-/// Returns at least `wanted` neighbours of a vertex, ring by ring: fewer if there are no more, and at most `MAX`.
+/// Returns the neighbours of a vertex in whole rings, nearest ring first, until there are `wanted` or more. Fewer are
+/// returned if the mesh has no more. No more than [`MAX_NEIGHBOURS`] are returned.
 pub(super) fn ring_around(mesh: &MeshTopology, vertex: u32, wanted: usize) -> Vec<u32> {
     let mut ring = [0; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
     ring[..found].to_vec()
 }
 
-/// Collects whole rings of neighbours around a vertex until there are at least `wanted`; returns their number.
+/// Writes whole rings of neighbours of a vertex into `ring` until there are `wanted` or more, and returns their number.
 fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u32; MAX_NEIGHBOURS]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
         Some([first, _]) if first >= wanted => return first,
@@ -334,7 +335,8 @@ fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u3
     count
 }
 
-/// Adds the neighbours of one vertex that are not in the ring yet; returns the new number.
+/// Adds the neighbours of the vertex `of` that are not yet in the ring around `vertex`; returns the new number of
+/// entries.
 #[inline(always)]
 fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIGHBOURS], mut count: usize) -> usize {
     mesh.visit_neighbours(of, |candidate| {

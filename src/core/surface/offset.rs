@@ -1,5 +1,5 @@
-//! The offset surface, on which the centre of a probe travels, and the foot of a point on it: its projection. The
-//! formulas are in [`super::facet`].
+//! Offset surface, on which the centre of a probe travels, and the projection of a point onto it. The formulas are in
+//! [`super::facet`].
 
 use crate::geometry::{Point, Vector};
 
@@ -14,7 +14,7 @@ use super::simd::{dot, minus};
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum DistanceModel {
-    /// The cubic that its corners and normals define.
+    /// The cubic that the corners of a facet and their normals define.
     #[default]
     Curved,
     /// Flat, eq. (2).
@@ -24,14 +24,14 @@ pub enum DistanceModel {
 /// Rule that assigns a point to a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Lookup {
-    /// The facet that holds the foot of the point's perpendicular.
+    /// The facet that contains the projection of the point.
     #[default]
     ContainingFacet,
     /// The facet that the point lies above or below along z, as in section 2.1 of the paper.
     AlongZ,
 }
 
-/// Offset of a nominal surface: a view that holds no points of its own.
+/// Offset of a nominal surface: a view of the nominal surface, without points of its own.
 #[derive(Clone, Copy, Debug)]
 pub struct OffsetSurface<'a> {
     nominal: &'a Nominal,
@@ -42,7 +42,7 @@ pub struct OffsetSurface<'a> {
     lookup: Lookup,
 }
 
-/// Start of a search for a foot: the facet where the last search ended.
+/// Facet as the start of a search: the facet where the last search for this point ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FacetIndex {
     patch: u32,
@@ -50,15 +50,15 @@ pub struct FacetIndex {
 }
 
 impl FacetIndex {
-    /// Unknown place: the search chooses its own start.
+    /// Unknown facet: the search chooses its own start.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
-    /// Returns the place of a facet of a patch.
+    /// Returns the index of a facet of a patch.
     pub(crate) fn new(patch: u32, facet: u32) -> Self {
         Self { patch, facet }
     }
 
-    /// Returns the place of a facet of a surface with a single patch.
+    /// Returns the index of a facet of a surface with a single patch.
     pub(crate) fn in_first_patch(facet: u32) -> Self {
         Self { patch: 0, facet }
     }
@@ -72,23 +72,24 @@ impl FacetIndex {
     }
 }
 
-/// Foot of a point on the offset surface.
+/// Projection of a point onto the offset surface.
 #[derive(Clone, Copy, Debug)]
 pub struct PointProjection {
-    /// Facet that holds the foot.
+    /// Facet that contains the projection.
     pub facet: FacetIndex,
     /// Signed distance of the point from the offset surface, in millimetres; positive on the probe's side.
     pub distance_mm: f64,
-    /// Unit normal at the foot, towards the probe's side.
+    /// Unit normal at the projection, towards the probe's side.
     pub normal: Vector,
-    /// Distance of the foot beyond the edge of the surface, in millimetres; 0 on the part.
+    /// Distance of the projection beyond the edge of the surface, in millimetres; 0 on the part.
     pub beyond_edge_mm: f64,
-    /// The same distance, in steps of the nominal sampling.
+    /// Distance of the projection beyond the edge, in steps of the nominal sampling.
     pub beyond_edge_steps: f64,
 }
 
 impl PointProjection {
-    /// Orders feet by their distance beyond an edge, then by the absolute distance of the point.
+    /// Orders projections by their distance beyond an edge, then by the absolute distance of the point from the
+    /// surface.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
         self.beyond_edge_mm
             .total_cmp(&other.beyond_edge_mm)
@@ -96,19 +97,19 @@ impl PointProjection {
     }
 }
 
-/// Largest distance beyond the edge, in steps of the sampling, at which the curved facet is continued. A foot within it
-/// counts as on the part.
+/// Maximum distance beyond the edge, in steps of the sampling, up to which the curved facet is continued. A projection
+/// within this distance counts as on the part.
 const MAX_CONTINUATION_STEPS: f64 = 0.5;
 
-/// Maximum number of steps of a search; then it takes the facet it has reached. A search that converges needs far
-/// fewer.
+/// Maximum number of steps of a search. After that the search ends at the facet that it has reached. A search that
+/// converges needs far fewer steps.
 const MAX_STEPS: usize = 4096;
 
-/// Weights count as inside down to this negative value.
+/// Minimum barycentric weight of a place that counts as inside a facet; slightly negative because of rounding.
 pub(super) const MIN_INSIDE_WEIGHT: f64 = -1e-10;
 
 impl<'a> OffsetSurface<'a> {
-    /// Offsets a nominal surface by a probe radius.
+    /// Creates the offset of a nominal surface by a probe radius.
     ///
     /// Units: millimetres. A radius of 0 is the nominal surface itself.
     ///
@@ -121,7 +122,7 @@ impl<'a> OffsetSurface<'a> {
         Ok(Self { nominal, radius_mm, side, distance_model: DistanceModel::default(), lookup: Lookup::default() })
     }
 
-    /// Sets how the surface runs between the corners.
+    /// Sets the shape of the surface between the corners of a facet.
     pub fn with_distance_model(self, distance: DistanceModel) -> Self {
         Self { distance_model: distance, ..self }
     }
@@ -162,7 +163,8 @@ impl<'a> OffsetSurface<'a> {
         (b - a).cross(&(c - a)).norm().sqrt()
     }
 
-    /// Finds the foot of a point in the model frame; starts from the place where the last search for it ended.
+    /// Returns the projection of a point in the model frame. The search starts from the facet where the last search for
+    /// this point ended.
     ///
     /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
     /// plane at the nearest point of the edge.
@@ -174,11 +176,11 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Returns the foot on the patch that a point belongs to: the nearest foot inside a patch, otherwise the foot that
-    /// is least beyond an edge.
+    /// Returns the projection onto the patch that a point belongs to: the nearest projection inside a patch, otherwise
+    /// the projection that is least beyond an edge.
     ///
-    /// The offsets of patches that only touch leave a gap over a convex seam. If a foot is slightly beyond two patches
-    /// at about the same height, it lies in that gap, and therefore on the part.
+    /// The offset surfaces of two patches that only touch leave a gap over a convex seam. If a projection is slightly
+    /// beyond the edges of two patches at about the same height, it lies in this gap, and therefore on the part.
     fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
         let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
@@ -202,11 +204,11 @@ impl<'a> OffsetSurface<'a> {
         best
     }
 
-    /// Searches for the foot of a point from the places of the surface nearest to it, without an earlier place; returns
-    /// the nearest foot found.
+    /// Searches for the projection of a point from the places of the surface nearest to the point, and returns the
+    /// nearest one found.
     ///
-    /// A search walks downhill. In a gutter that starts from the wrong wall, it ends at a foot on the other side, where
-    /// no neighbour is nearer.
+    /// A search moves only to nearer facets. A search that starts on the wrong wall of a gutter can end there, because
+    /// no neighbouring facet is nearer.
     #[cold]
     pub(crate) fn project_without_start(&self, p: &Point) -> PointProjection {
         let found = self
@@ -225,8 +227,8 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Walks over the flat facets of the nominal surface to about where the foot is, and returns that facet. No normal
-    /// has to be fitted on the way: the point is moved back to the surface along the normal of each facet.
+    /// Walks over the flat facets of the nominal surface to a facet near the projection, and returns this facet. No
+    /// normal is fitted on the way: the point is moved back to the nominal surface along the normal of each flat facet.
     #[inline]
     fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
         let mut facet = if start == u32::MAX { facets.start(p) } else { start };
@@ -251,12 +253,12 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
-    /// Finds a facet of the first patch near the foot of a point, without fitting its normals.
+    /// Returns a facet of the first patch near the projection of a point, without fitting its normals.
     pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: FacetIndex) -> FacetIndex {
         FacetIndex { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
-    /// Walks from facet to facet until one holds the foot, then measures the distance there.
+    /// Walks from facet to facet until one contains the projection, then computes the distance there.
     #[inline]
     fn search_projection<F: Facets>(
         &self,
@@ -300,7 +302,7 @@ impl<'a> OffsetSurface<'a> {
         Facet::new([a, b, c].map(|vertex| offset_corner(vertex, sign, self.radius_mm)), sign)
     }
 
-    /// Returns the barycentric weights of the foot on the plane of the flat facet.
+    /// Returns the barycentric weights of the projection of a point onto the plane of the flat facet.
     #[inline(always)]
     fn weights(&self, facet: &Facet<f64>, p: &Point) -> [f64; 3] {
         let mut w = facet.vector_from_corner(0, &p.coords.into());
@@ -350,7 +352,7 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Returns the distance from the tangent plane at a place of the edge, and the normal of that plane.
+    /// Returns the distance of a point from the tangent plane at a place of the edge, and the normal of this plane.
     #[cold]
     fn tangent_plane_distance(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
         let (on_flat, flat) = (Vector::from(facet.point(at)), Vector::from(facet.flat_normal()));
@@ -362,7 +364,8 @@ impl<'a> OffsetSurface<'a> {
     }
 }
 
-/// Returns the weights of the nearest place of a facet for a point that lies beyond its most negative edge.
+/// Returns the barycentric weights of the place of a facet that is nearest to a point beyond the edge with the most
+/// negative weight.
 fn clamped_weights(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);

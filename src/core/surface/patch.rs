@@ -1,8 +1,8 @@
 //! One patch of a nominal surface: points, unit normals, and the triangles between them.
 //!
-//! A grid computes its triangles by arithmetic and has all its normals, each stored next to its point. A mesh stores
-//! its triangles in flat arrays and fits a normal when a triangle is first touched. So the work depends on the measured
-//! region and not on the whole cloud.
+//! A grid computes its triangles from indices and has all its normals, each stored next to its point. A mesh stores its
+//! triangles in flat arrays and fits a normal when it is first needed. So the work depends on the measured region and
+//! not on the whole cloud.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,7 +16,7 @@ use super::mesh_topology::MeshTopology;
 use super::normals;
 use super::simd::LANES;
 
-/// Smooth piece of surface that one lattice of triangles covers.
+/// Smooth piece of a surface, covered by the triangles of one grid or one mesh.
 #[derive(Debug)]
 pub(crate) struct Patch {
     pub(crate) topology: Topology,
@@ -26,7 +26,7 @@ pub(crate) struct Patch {
 /// Triangles of a patch.
 #[derive(Debug)]
 pub(crate) enum Topology {
-    /// Two triangles per cell, by arithmetic.
+    /// Two triangles in each cell of a grid, computed from indices.
     Grid(GridTopology),
     /// Triangles and their neighbours in flat arrays.
     Mesh(MeshTopology),
@@ -39,7 +39,7 @@ enum Vertices {
 }
 
 impl Patch {
-    /// Makes a patch from a grid and its nodes, whose normals are all known.
+    /// Creates a patch from a grid and its nodes, whose normals are all known.
     pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridTopology) -> Self {
         Self { topology: Topology::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
@@ -52,7 +52,7 @@ impl Patch {
         }
     }
 
-    /// Makes a patch from a mesh whose normals are fitted when a triangle is first touched.
+    /// Creates a patch from a mesh. A normal is fitted when it is first needed.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshTopology) -> Self {
         let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
         Self { topology: Topology::Mesh(lattice), vertices: Vertices::Lazy(points, cells) }
@@ -110,7 +110,7 @@ impl Patch {
             .filter(|&v| self.point(v).x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite()))
     }
 
-    /// Returns a facet at a vertex, or near a vertex that has no facet.
+    /// Returns a facet at a vertex; if the vertex has no facet, a facet near it.
     pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
         match &self.topology {
             Topology::Grid(grid) => grid.facet_near(vertex),
@@ -118,7 +118,7 @@ impl Patch {
         }
     }
 
-    /// Returns true if the normals are fitted to scattered neighbours, and not given or exact.
+    /// Returns true if the normals are fitted to scattered neighbours.
     pub(crate) fn has_scattered_normals(&self) -> bool {
         matches!(self.vertices, Vertices::Lazy(..))
     }
@@ -149,8 +149,8 @@ impl Patch {
         }
     }
 
-    /// Fits the normals of many vertices that are not known yet, on all cores and four at a time. This is several times
-    /// faster than one by one when they are touched, and gives the same bits.
+    /// Fits the unknown normals of many vertices, on all cores and four at a time. This is several times faster than
+    /// fitting each when it is first needed, and gives the same bits.
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
         /// Number of vertices per task.
         const CHUNK: usize = 256;
@@ -196,8 +196,8 @@ impl pulp::NullaryFnOnce for NormalFitX4<'_> {
 
 /// Normal that is computed once, by the thread that first needs it.
 ///
-/// Every thread that finds it unknown computes the same value, so that a race costs time but changes nothing. NaN means
-/// unknown.
+/// Every thread that finds the normal unknown computes the same value, so that a race costs time but changes nothing.
+/// NaN means unknown.
 #[derive(Debug)]
 struct NormalCell([AtomicU64; 3]);
 

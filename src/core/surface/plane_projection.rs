@@ -1,4 +1,5 @@
-//! Projections to a plane in which a surface can be triangulated: one place of the plane for each place of the surface.
+//! Projections to a plane in which a surface can be triangulated: each place of the surface has its own place in the
+//! plane.
 
 use nalgebra::{Matrix3, Matrix4, SymmetricEigen, Vector4};
 use serde::{Deserialize, Serialize};
@@ -8,12 +9,12 @@ use crate::geometry::{Point, Vector, bounds};
 use super::error::SurfaceError;
 use super::normals::tangents;
 
-/// Projection of scattered points for the triangulation.
+/// Projection of scattered points to a plane, in which they are triangulated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum PlaneProjection {
-    /// The first of the other projections, in their order, that is one-to-one.
+    /// The first of these projections that is one-to-one: the xy plane, the best-fit plane, the sphere.
     #[default]
     Auto,
     /// The xy plane of the model frame.
@@ -34,7 +35,8 @@ pub(crate) enum Projector {
     Sphere { centre: Point, radius_mm: f64, axes: [Vector; 3] },
 }
 
-/// Largest accepted share of bins that hold two sheets; above it the projection is not one-to-one.
+/// Maximum share of the bins of the plane that contain two sheets of the surface. With a larger share the projection is
+/// not one-to-one.
 const MAX_FOLDED_SHARE: f64 = 0.05;
 
 impl PlaneProjection {
@@ -100,7 +102,8 @@ impl Projector {
         }
     }
 
-    /// Returns the share of small neighbourhoods in the plane whose heights do not lie on one sheet.
+    /// Returns the share, from 0 to 1, of small neighbourhoods in the plane whose heights do not lie on one sheet of
+    /// the surface.
     ///
     /// In a neighbourhood of size s a smooth sheet deviates from its tangent plane by a small part of s, even where it
     /// is steep. Two sheets deviate from any plane by half their distance.
@@ -138,7 +141,7 @@ impl Sheet {
         self.count += 1;
     }
 
-    /// Returns the rms residual about the plane, or `None` if there are too few points.
+    /// Returns the rms residual about the plane; `None` if there are too few points.
     fn residual(&self) -> Option<f64> {
         if self.count < 6 {
             return None;
@@ -173,7 +176,8 @@ pub(crate) fn centroid(points: &[Point]) -> Point {
     Point::from(points.iter().map(|p| p.coords).sum::<Vector>() / points.len() as f64)
 }
 
-/// Fits the algebraic least-squares sphere: |p|^2 = 2 c.p + (r^2 - |c|^2), linear in its four unknowns.
+/// Fits the algebraic least-squares sphere, |p|^2 = 2 c.p + (r^2 - |c|^2), which is linear in its four unknowns.
+/// Returns `None` if the points do not determine it.
 fn best_fit_sphere(points: &[Point]) -> Option<Projector> {
     let middle = centroid(points);
     let (mut gram, mut right) = (Matrix4::zeros(), Vector4::zeros());
@@ -193,7 +197,7 @@ fn best_fit_sphere(points: &[Point]) -> Option<Projector> {
     radius_mm.is_finite().then(|| Projector::Sphere { centre: middle + offset, radius_mm, axes: [tu, tv, pole] })
 }
 
-/// Returns true if the points lie on one line to rounding.
+/// Returns true if the points lie on one line, except for rounding.
 pub(crate) fn is_line(points: &[Point]) -> bool {
     const FEW: usize = 4096;
     // If a sample does not lie on a line, all points do not either.

@@ -1,7 +1,8 @@
-//! Prefetching: finds the approximate feet of many points and fits the normals there, before any foot is requested.
+//! Prefetching: finds the approximate projections of many points and fits the normals there, before any projection is
+//! requested.
 //!
-//! A scattered surface fits a normal when it is first touched. One by one, as the search for each foot meets them,
-//! these fits are the most expensive part of a registration. All together they run four at a time on all cores.
+//! A scattered surface fits a normal when it is first needed. One by one, in the search for each projection, these fits
+//! are the most expensive part of a registration. All together they run four at a time on all cores.
 
 use rayon::prelude::*;
 
@@ -14,17 +15,18 @@ use super::patch::Topology;
 /// Number of points per task.
 const CHUNK: usize = 512;
 
-/// Distance in steps of the sampling up to which a walk from the last point is shorter than a search in the tree.
+/// Maximum distance, in steps of the sampling, at which a walk from the last point is shorter than a search in the
+/// tree.
 const NEAR_STEPS: f64 = 24.0;
 
 impl OffsetSurface<'_> {
-    /// Returns true if normals are fitted where the surface is touched, so that it is best to touch little of it.
+    /// Returns true if a normal is fitted only when it is first needed, so that few normals should be used.
     pub(crate) fn has_lazy_normals(&self) -> bool {
         self.nominal().patches().iter().any(|patch| patch.has_scattered_normals())
     }
 
-    /// Fits the normals that the feet of some points in the model frame will need, all together. Returns a start place
-    /// for each point. Returns an empty list if the normals are ready already, or if there are several patches.
+    /// Fits the normals that the projections of some points in the model frame need, all together. Returns a start
+    /// facet for each point. Returns an empty list if the normals are already known, or if there are several patches.
     pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<FacetIndex> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
         let Topology::Mesh(mesh) = &patch.topology else { return Vec::new() };

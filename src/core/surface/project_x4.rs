@@ -1,9 +1,10 @@
 //! Point location and distance for four points at a time.
 //!
-//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next. On a grid, a
-//! point that leaves its facet is one or two jumps away. The arithmetic of the [facet](super::facet) is then the same
-//! straight line of products and sums for all points, which the compiler turns into vector instructions over four
-//! lanes. Points that leave the surface, or have a longer way, use the single search. The two agree to rounding.
+//! When a registration has nearly converged, almost every point stays on its facet from one iteration to the next. On a
+//! grid, a point that leaves its facet is one or two jumps away. The arithmetic of the [facet](super::facet) is then
+//! the same for all points, without branches, and the compiler turns it into vector instructions over four lanes.
+//! Points beyond the edge of the surface, and points farther away, use the single search. The results agree except for
+//! rounding.
 
 use super::facet::{Corner, Facet, Facets, offset_corner, vertices_x4};
 use super::offset::{DistanceModel, FacetIndex, Lookup, MIN_INSIDE_WEIGHT, OffsetSurface};
@@ -13,7 +14,7 @@ use super::simd::{F64x4, LANES, Real, Vector3x4};
 /// Maximum number of jumps of four points together over a grid; after that the single search is used.
 const JUMPS: usize = 4;
 
-/// Feet of four points: their projections onto the offset surface.
+/// Projections of four points onto the offset surface.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ProjectionX4 {
     pub(crate) distance_mm: F64x4,
@@ -21,17 +22,18 @@ pub(crate) struct ProjectionX4 {
 }
 
 impl OffsetSurface<'_> {
-    /// Returns true if [`OffsetSurface::project_x4`] supports this surface: one patch, and the curved distance at the
-    /// foot.
+    /// Returns true if [`OffsetSurface::project_x4`] supports this surface. It requires one patch, the curved distance,
+    /// and the lookup of the containing facet.
     pub(crate) fn supports_project_x4(&self) -> bool {
         self.nominal().patches().len() == 1
             && self.distance_model() == DistanceModel::Curved
             && self.lookup() == Lookup::ContainingFacet
     }
 
-    /// Finds the feet of four points near the given places, and replaces the places by those of the feet.
+    /// Finds the projections of four points near the facets `places`, and replaces these by the facets of the
+    /// projections.
     ///
-    /// Returns `None` if one of the points lies beyond the edge or too far away; the places are then invalid. On a mesh
+    /// Returns `None` if one of the points lies beyond the edge or too far away; `places` are then invalid. On a mesh
     /// it returns `None` as soon as a point is not on its facet, because a walk over a mesh would fit normals on the
     /// way.
     #[inline(always)]
@@ -43,8 +45,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the expected places of the next four points: they follow the last ones as those followed the ones
-    /// before. Returns `None` if there is no prediction: on a mesh, or if a last place is unknown.
+    /// Returns the expected facets of the next four points. The step from `last` to them is the step from `before` to
+    /// `last`. Returns `None` if there is no prediction: on a mesh, or if a facet of `last` is unknown.
     pub(crate) fn extrapolate_x4(
         &self,
         before: &[FacetIndex; LANES],
@@ -112,8 +114,8 @@ impl OffsetSurface<'_> {
     }
 }
 
-/// Moves the points that do not stay to the facets that their weights point at. Returns false if one of them has no
-/// next facet.
+/// Moves each point that does not stay to the facet to which its weights point. Returns false if one of these points
+/// has no next facet.
 #[inline(never)]
 fn jump_to_facets<F: Facets>(
     facets: &F,

@@ -6,7 +6,7 @@ use std::ops::{Add, Div, Mul, Sub};
 /// Number of lanes.
 pub(crate) const LANES: usize = 4;
 
-/// Number to compute with: one, or four in parallel lanes.
+/// Number for computations: a single number, or four numbers in parallel lanes.
 pub(crate) trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
 {
@@ -28,7 +28,7 @@ pub(crate) trait Real:
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct F64x4(pub(crate) [f64; LANES]);
 
-/// Vector for each of four points: x, y, z.
+/// Vectors of four points: x, y and z of all four.
 pub(crate) type Vector3x4 = [F64x4; 3];
 
 macro_rules! lanewise {

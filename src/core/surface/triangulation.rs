@@ -31,7 +31,7 @@ pub(crate) struct SortedSites<'a> {
     pub(crate) keys: &'a [u64],
 }
 
-/// Directed edge of a subdivision of the plane. The number of its opposite direction differs in the last bit.
+/// Directed edge of a subdivision of the plane. The numbers of an edge and of its reverse differ only in the last bit.
 type Edge = [u32; 3];
 
 const ORIGIN: usize = 0;
@@ -40,23 +40,24 @@ const AFTER: usize = 1;
 /// Index of the next edge clockwise around the origin.
 const BEFORE: usize = 2;
 
-/// Origin of an edge that is deleted or was never made.
+/// Origin of an edge that is deleted or was never created.
 const DELETED: u32 = u32::MAX;
 
-/// Directed edges per vertex: a planar graph of n vertices has fewer than 3 n edges, each in two directions.
+/// Maximum number of directed edges per vertex: a planar graph of n vertices has fewer than 3 n edges, each in two
+/// directions.
 const PER_VERTEX: usize = 6;
 
 /// Maximum number of points that one thread triangulates alone.
 const MAX_POINTS_PER_THREAD: usize = 8192;
 
-/// Axis of the plane across which a cut separates: the points before the cut have the smaller coordinate.
+/// Axis of the plane across which a cut separates the points: those before the cut have the smaller coordinate.
 #[derive(Clone, Copy, PartialEq)]
 enum CutAxis {
     U,
     V,
 }
 
-/// Finished part: one vertex, or a hull edge that has the whole part on its left.
+/// Finished part of a triangulation: one vertex, or a hull edge that has the whole part on its left.
 #[derive(Clone, Copy)]
 enum PartialTriangulation {
     Vertex(u32),
@@ -171,7 +172,7 @@ impl SortedSites<'_> {
     }
 }
 
-/// Unused edge numbers: those of deleted edges, and those not assigned yet.
+/// Unused edge numbers: numbers of deleted edges, and numbers that were not yet assigned.
 struct FreeEdges {
     freed: Vec<u32>,
     fresh: Vec<Range<u32>>,
@@ -274,8 +275,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Deletes the edges on one side that are not Delaunay: the next vertex lies in the circle through the base and the
-    /// end of the edge. Returns the first edge that remains.
+    /// Deletes the edges on one side that are not Delaunay: the circle through the base and the end of the edge
+    /// contains the next vertex. Returns the first edge that remains.
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
@@ -287,8 +288,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Makes the lowest edge between two parts, seen with the separating line upright. It runs from the upper part to
-    /// the lower.
+    /// Adds the lowest edge between two parts, seen with the separating line upright, and returns it. It runs from the
+    /// upper part to the lower.
     fn tangent(&mut self, lower: PartialTriangulation, upper: PartialTriangulation, axis: CutAxis) -> u32 {
         // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
@@ -328,7 +329,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Walks along a hull to its farthest vertex, and returns the hull edge that leaves it.
+    /// Walks along a hull to its farthest vertex, and returns the hull edge that starts there. `beyond(a, b)` is true
+    /// if vertex b is farther than vertex a.
     fn farthest(&self, mut e: u32, beyond: impl Fn(u32, u32) -> bool) -> u32 {
         let next = |e: u32| self.edge(e ^ 1)[AFTER];
         let previous = |e: u32| self.edge(e)[BEFORE] ^ 1;
@@ -377,7 +379,7 @@ impl Subdivision<'_> {
         self.edge(e ^ 1)[BEFORE]
     }
 
-    /// Makes an edge that is connected to no other.
+    /// Adds an edge that is not connected to any other, and returns its number.
     fn make(&mut self, from: u32, to: u32) -> u32 {
         let e = self.free_edges.allocate();
         *self.edge_mut(e) = [from, e, e];
@@ -395,7 +397,8 @@ impl Subdivision<'_> {
         (edge[BEFORE], edge[AFTER]) = (other, next);
     }
 
-    /// Makes an edge from the end of `a` to the origin of `b`, across the face on the left of both.
+    /// Adds an edge from the end of `a` to the origin of `b`, across the face on the left of both, and returns its
+    /// number.
     fn connect(&mut self, a: u32, b: u32) -> u32 {
         let e = self.make(self.destination(a), self.origin(b));
         self.insert_after(e, self.left_next(a));
@@ -424,7 +427,8 @@ impl Subdivision<'_> {
     }
 }
 
-/// Returns a positive value if three points turn counter-clockwise and 0 if they lie on a line; the sign is exact.
+/// Returns a positive value if three points are counter-clockwise, a negative one if they are clockwise, and 0 if they
+/// lie on a line; the sign is exact.
 #[inline(always)]
 fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
     // The first filter of Shewchuk's predicate is repeated here so that it is inlined. Its epsilon is half the distance
@@ -440,7 +444,7 @@ fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
 
 const HALF_EPSILON: f64 = 0.5 * f64::EPSILON;
 
-/// Returns true if the fourth point lies inside the circle through the others, which turn counter-clockwise; exact.
+/// Returns true if the fourth point lies inside the circle through the other three, which are counter-clockwise; exact.
 #[inline(always)]
 fn in_circle([a, b, c, d]: [[f64; 2]; 4]) -> bool {
     const BOUND: f64 = (10.0 + 96.0 * HALF_EPSILON) * HALF_EPSILON;

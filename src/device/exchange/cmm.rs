@@ -34,10 +34,10 @@ pub struct CmmExchange {
     pub inbox: PathBuf,
     /// Time without a change after which a file is complete.
     pub stable_for: Duration,
-    /// Time for which a look waits until the found files are read. A longer read is reported by a later look; meanwhile
-    /// the job can be held.
+    /// Maximum time for which a poll of the folder waits for the reading of the found files. If the reading takes
+    /// longer, a later poll returns its result; the job can be held in the meantime.
     pub read_timeout: Duration,
-    /// Known properties of the result files.
+    /// Properties of the result files, as the cell file states them.
     pub content: Content,
     /// Pattern for the names of result files, with `{part}`, `{job}`, `{cycle}` and `*`.
     pub result: Pattern,
@@ -86,8 +86,8 @@ impl CmmExchange {
 #[derive(Clone, Debug)]
 pub struct Stations {
     /// File names of the points and of the reference points of each station. If both names have one `*`, they represent
-    /// as many stations as there are pairs of files with the same star. This measurement is complete when its files no
-    /// longer change and have at least `least_points` points.
+    /// as many stations as there are pairs of files with the same characters in place of the `*`. The measurement is
+    /// then complete when its files no longer change and have at least `min_points` points.
     pub files: Vec<StationFiles>,
     /// File of the reference points in the frame of the CMM.
     pub nominal: PathBuf,
@@ -111,25 +111,25 @@ pub struct StationFiles {
 pub struct CmmFolders {
     judge: Arc<Judge>,
     watch: Watch,
-    /// Judgement that still runs.
+    /// Check of the inbox that still runs.
     running_judgement: Option<RunningJudgement>,
     /// Plan that this program handed over last.
     published: Option<(Job, Arc<Plan>)>,
-    /// Expected result, once the plan was handed over or found again.
+    /// Result that is expected. It exists after the plan was handed over, or after the hand-over was read from the
+    /// folder following a restart.
     expected: Option<Expected>,
-    /// Content of the folder at the last judgement, and the result of that judgement.
+    /// Content of the folder at the last check, and the result of that check.
     last_judgement: Option<(Vec<WatchedFile>, PollResult<Measurement>)>,
 }
 
-/// Judge that reads the files of the inbox and compares them with the expected result.
+/// Checker that reads the files of the inbox and compares them with the expected result.
 #[derive(Debug)]
 struct Judge {
     settings: CmmExchange,
     outbox: Outbox,
 }
 
-/// Judgement of the inbox on a thread of its own, so that a file that takes long to read does not prevent a hold or an
-/// abort.
+/// Check of the inbox on a thread of its own, so that a file that takes long to read does not delay a hold or an abort.
 #[derive(Debug)]
 struct RunningJudgement {
     job: Job,
@@ -137,12 +137,12 @@ struct RunningJudgement {
     receiver: mpsc::Receiver<(Judgement, Vec<String>)>,
 }
 
-/// Default time for which a look waits until the found files are read.
+/// Default of [`CmmExchange::read_timeout`].
 const DEFAULT_READ_TIMEOUT: Duration = Duration::from_millis(40);
 /// Maximum size in bytes of a file that is read although its name does not match the pattern.
 const MAX_UNMATCHED_BYTES: u64 = 16 << 20;
 
-/// Expected result.
+/// Result that is expected for a hand-over.
 #[derive(Clone, Debug)]
 struct Expected {
     stored: StoredHandover,
@@ -161,17 +161,17 @@ struct Accepted {
     notes: Vec<String>,
 }
 
-/// Result of a judgement of the folder: an accepted measurement, or none.
+/// Result of a check of the inbox: an accepted measurement, or `None` if there is none yet.
 type Judgement = Result<Option<Accepted>, ExchangeError>;
 
-/// Judgement, with its notes and the files as they were.
+/// Finished check, with its notes and with the state of the files when it began.
 struct FinishedJudgement {
     judgement: Judgement,
     notes: Vec<String>,
     files: Vec<WatchedFile>,
 }
 
-/// Files of a station: its points, and the reference points as it sees them.
+/// Two files of a station: its points, and the reference points in the frame of the station.
 type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
 impl CmmFolders {
@@ -183,7 +183,7 @@ impl CmmFolders {
         Self { judge, watch, running_judgement: None, published: None, expected: None, last_judgement: None }
     }
 
-    /// Returns the expected result of a job. Finds the hand-over again if it was made before a restart.
+    /// Returns the expected result of a job. After a restart, reads the hand-over from the outbox.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
         if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.header.job() == job) {
             return Ok(expected.clone());
@@ -210,8 +210,8 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Returns the judgement of some files, with the files as they were, if it is complete. Starts a judgement, unless
-    /// one still runs.
+    /// Starts a check of the files `found`, unless a check still runs. Returns the finished check. Returns `None` if
+    /// the check takes longer than `read_timeout`, was of another job, or accepted a file that has changed since then.
     fn finished_judgement(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<FinishedJudgement> {
         let job = expected.stored.header.job();
         if self.running_judgement.is_none() {
@@ -257,7 +257,8 @@ impl Judge {
         Ok(accepted)
     }
 
-    /// Returns true if a file may be read; otherwise adds the reason to the notes.
+    /// Returns true if a file may be read. A file that was in the inbox before the hand-over may be read only if the
+    /// settings accept such files; otherwise a note is added.
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
@@ -328,7 +329,7 @@ impl Judge {
             match says_so || pattern.fits(&file.name) {
                 true => None,
                 false => Some(format!(
-                    "does not state that it belongs here, and its name does not match {}",
+                    "does not state that it is of this job, and its name does not match {}",
                     pattern.as_str()
                 )),
             }
@@ -362,7 +363,8 @@ impl Judge {
         }
     }
 
-    /// Rejects bytes that were the answer to another hand-over.
+    /// Returns an error if a file with the same SHA-256 was accepted as the answer to another hand-over. Exception: the
+    /// other hand-over is of another run, and the cell file accepts earlier files.
     fn check_not_accepted_before(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
         let own = (expected.stored.header.job, expected.stored.header.cycle);
         let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.accepted);
@@ -416,7 +418,7 @@ impl Judge {
         Ok(Some(accepted))
     }
 
-    /// Returns the files of the stations that are there, points and references, and the names of the missing ones.
+    /// Returns the two files of each complete station, and the names of the missing files.
     fn paired<'f>(
         &self,
         ticket: &HandOverHeader,
@@ -436,7 +438,8 @@ impl Judge {
         Ok((pairs, waiting))
     }
 
-    /// Returns the one file whose name matches once it has settled, or a description of what is missing.
+    /// Returns the file whose name matches `pattern`, if it no longer changes. Otherwise returns a text that describes
+    /// what is missing. Several matching files are an error.
     fn settled<'f>(
         &self,
         pattern: &Pattern,

@@ -71,7 +71,7 @@ pub enum ExchangeError {
     /// The same job and cycle was handed over before.
     #[error("job {job} cycle {cycle} was already handed over, see {folder}; it is never handed over twice")]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
-    /// Nobody waits for the hand-over any more; it was not made.
+    /// The client had stopped waiting for the hand-over, so it was not published.
     #[error("job {job} cycle {cycle} was not handed over: it took too long, and the request had ended")]
     Withdrawn { job: u32, cycle: u16 },
     /// The confirmation names another map than the one that was handed over.
@@ -88,7 +88,7 @@ pub enum ExchangeError {
     /// The thread that read the files has failed.
     #[error("{folder}: this program failed to read a file there; remove files that do not belong there, and report it")]
     ReaderFailed { folder: PathBuf },
-    /// The file belongs to something else, by its statements or its points.
+    /// The header of the file, or its points, show that it is not the requested measurement.
     #[error("{path}: {reason}; export the requested measurement")]
     Foreign { path: PathBuf, reason: String },
     /// The file was already a measurement of this run.

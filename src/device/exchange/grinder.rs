@@ -47,11 +47,11 @@ pub struct GrinderFolders {
     started: Option<Duration>,
 }
 
-/// A person's word that a job has begun or ended.
+/// Content of a confirmation file: a person confirms that a job has begun or ended.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 struct Confirmation {
-    /// The identity of the map, 64 hexadecimal digits; need not be given whole, but at least 8 of them.
+    /// Identity of the map in hexadecimal digits: all 64 of them, or at least the first 8.
     map: String,
     job: Option<u32>,
     cycle: Option<u16>,
@@ -117,8 +117,8 @@ impl GrinderFolders {
         Ok(stored)
     }
 
-    /// Returns the confirmation in a file of this name with the SHA-256 of the file, if the file is there, settled and
-    /// for this hand-over. Otherwise returns `None`, and adds the reason to the notes if there is a file.
+    /// Returns the confirmation in the file `name`, with the SHA-256 of the file. Returns `None` if the file does not
+    /// exist, still changes, or does not belong to this hand-over. If the file exists, the reason is added to `notes`.
     fn confirmation(
         &self,
         name: &str,
@@ -205,7 +205,7 @@ impl Exchange for GrinderFolders {
             return Ok(PollResult { answer: None, start_confirmed: begun, notes });
         };
         if self.started.is_none() {
-            notes.push("the end was confirmed without a start".to_owned());
+            notes.push("the end of the pass was confirmed, but not its start".to_owned());
         }
         let taken = AcceptedFiles { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
         self.outbox.record_accepted(&stored, &taken)?;

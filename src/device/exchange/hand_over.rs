@@ -16,7 +16,7 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// Answer that comes back.
     type Answer: std::fmt::Debug + Clone + Send + 'static;
 
-    /// Checks access to both folders, and returns every hand-over that was ever made there, the oldest first.
+    /// Checks access to both folders. Returns every hand-over in the folder, earlier ones included, the oldest first.
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
     /// Publishes a hand-over as a whole, by one rename. Never publishes a job and cycle twice, and not if the permit
@@ -29,7 +29,7 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
         permit: &Permit,
     ) -> Result<(), ExchangeError>;
 
-    /// Changes the standing of a hand-over.
+    /// Changes the status of a hand-over.
     fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError>;
 
     /// Looks for the answer to an open hand-over. `now` is the time since the driver was created.
@@ -42,9 +42,9 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     }
 }
 
-/// Permit for a hand-over to appear. The client that waits for it withdraws the permit when it gives up. The thread
-/// that publishes it uses the permit up immediately before. So a hand-over for which nobody waits either never appears,
-/// or it is known that it may have appeared.
+/// Permit to publish a hand-over. The client that waits for the hand-over withdraws the permit when it stops waiting.
+/// The publishing thread uses the permit up immediately before the rename. After a withdrawal, the hand-over therefore
+/// either never appears, or `withdraw` has returned that it may have appeared.
 #[derive(Debug, Clone, Default)]
 pub struct Permit(Arc<AtomicU8>);
 
@@ -83,33 +83,33 @@ pub enum ConfirmedStep {
     Done,
 }
 
-/// Hand-over that was made.
+/// Job, start number and status of a hand-over in the folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HandOver {
     /// Job that was handed over.
     pub job: Job,
     /// Start number; it increases from one hand-over to the next.
     pub sequence: u32,
-    /// Standing of the hand-over.
+    /// Status of the hand-over.
     pub status: HandOverStatus,
 }
 
-/// Standing of a hand-over.
+/// Status of a hand-over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum HandOverStatus {
     /// It waits for its answer.
     Open,
-    /// It was taken back temporarily.
+    /// It was withdrawn temporarily, by HOLD.
     Held,
-    /// It was taken back permanently, in order.
+    /// It was withdrawn permanently, by STOP.
     Stopped,
-    /// It was taken back permanently, at once.
+    /// It was withdrawn permanently, by ABORT.
     Aborted,
     /// Its answer was acknowledged.
     Closed,
 }
 
-/// Result of a look at the folders.
+/// Result of a check of the folders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PollResult<A> {
     /// Answer, if it is there, complete and correct.

@@ -31,11 +31,11 @@ struct FolderMachine<M: Exchange> {
     exchange: M,
     connected: bool,
     state: MachineState,
-    /// Request that would be handed over, and its digest.
+    /// Request that START will hand over, and its digest.
     loaded: Option<(M::Request, u32)>,
     /// Job that is prepared, running or finished, and its start number.
     job: Option<(Job, u32)>,
-    /// All hand-overs that were ever made, the oldest first.
+    /// All hand-overs in the folder, earlier ones included, the oldest first.
     hand_overs: Vec<HandOver>,
     outcome: Outcome,
     done: u32,
@@ -43,10 +43,10 @@ struct FolderMachine<M: Exchange> {
     start_confirmed: bool,
     notes: Vec<String>,
     owned: bool,
-    /// True if the machine cannot reach the part at the place where the other machine works.
+    /// True if this machine cannot reach the part while the part is at the other machine.
     apart: bool,
-    /// True if it is clear of the part. A person who confirms the end of a pass confirms this; a file that arrives does
-    /// not.
+    /// True if this machine is clear of the part; `None` if that is unknown. It becomes true when a person confirms the
+    /// end of a pass. The arrival of a file does not make it true.
     clear_of_part: Option<bool>,
 }
 
@@ -76,14 +76,15 @@ impl<M: Exchange> ExchangeMachine<M> {
         Self { name, timeout: answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
     }
 
-    /// Sets if the machine is apart from the other one, so that it is always clear of the part.
+    /// Sets whether this machine cannot reach the part while the part is at the other machine. Such a machine always
+    /// counts as clear of the part.
     #[must_use]
     pub fn apart(self, apart: bool) -> Self {
         self.machine.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
         self
     }
 
-    /// Runs work on the folders on a thread that may block.
+    /// Runs an operation on the folders on a thread that may block. `what` names the operation in errors.
     async fn run_blocking<T: Send + 'static>(
         &self,
         what: &'static str,
@@ -185,8 +186,8 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    /// Reads the hand-overs in the folder. At the first call, an open or held hand-over gives the job and the state of
-    /// this machine.
+    /// Reads all hand-overs in the folder. At the first call, restores job and state of this machine from an open or
+    /// held hand-over.
     fn open(&mut self) -> DeviceResult<()> {
         self.hand_overs = self.exchange.open().map_err(|error| self.failed(MachineCommand::Claim, error))?;
         if !self.connected
@@ -200,7 +201,7 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Looks for the answer, if one is awaited.
+    /// Checks whether the answer is in the inbox, while the state is EXECUTE.
     fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == MachineState::Execute) else { return Ok(()) };
         let look = self.exchange.poll(now, job).map_err(|error| self.failed(MachineCommand::Start, error))?;
@@ -260,8 +261,9 @@ impl<M: Exchange> FolderMachine<M> {
         self.started(armed)
     }
 
-    /// Takes back a hand-over that appeared after it was given up. Its client may have continued without it, so it must
-    /// not stay open. Its ending shows later that it was open for a moment.
+    /// Withdraws a hand-over that appeared after its client had stopped waiting for it. The client may have continued
+    /// without it, so it must not stay open. The ending `.stopped` of its folder remains. Returns the error
+    /// `DeadToken`.
     fn take_back_late(&mut self, armed: &Armed) -> DeviceResult<Started> {
         self.mark(MachineCommand::Start, HandOverStatus::Stopped)?;
         self.notes = self.withdrawal_notes();
@@ -275,7 +277,7 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
-    /// Handles an error while the hand-over was published: reads from the folder if the hand-over is there.
+    /// Handles an error during the publication of a hand-over: checks in the folder whether the hand-over is there.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
         let why = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {

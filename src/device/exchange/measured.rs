@@ -1,4 +1,4 @@
-//! Requirements for a file that is the measurement of a plan, whoever brings it.
+//! Requirements for a file that contains the measurement of a plan, whether a folder or a person provides it.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -26,7 +26,8 @@ impl ResultRequirements<'_> {
     /// Reads the bytes of a file of points and checks them against plan and cell; `path` is its name in messages.
     ///
     /// # Errors
-    /// The file is incomplete, does not say what its coordinates are, or was measured with another probe.
+    /// The file is incomplete, does not state whether its coordinates are probe centres or contact points, or was
+    /// measured with another probe.
     pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<ResultFile, ExchangeError> {
         check_ended(path, bytes)?;
         let file = parse_result(path, bytes, self.content)?;
@@ -83,12 +84,12 @@ impl ResultRequirements<'_> {
     }
 }
 
-/// Checks a complete measurement against its plan, before it is accepted as the answer: a rejected one can still be
-/// replaced.
+/// Checks a complete measurement against its plan before it is accepted as the answer, because a rejected file can
+/// still be replaced. `least_found` is the required fraction of the targets, from 0 to 1.
 ///
 /// # Errors
-/// Too few targets have a point (see `least_found`), the points equal the plan and this is no rehearsal, or points are
-/// not at their targets.
+/// Too few targets have a point: fewer than `least_found` requires or, in a further batch, fewer than half. Or the
+/// points equal the plan and this is no rehearsal, or points are not at their targets.
 pub fn check_measurement(
     path: &Path,
     plan: &Plan,
@@ -134,7 +135,7 @@ pub fn assemble_measurement(
     }
 }
 
-/// Returns the reason why the statements in a file contradict a plan; `None` if there is no contradiction.
+/// Returns a text if the header of a file names another part, cycle or plan; otherwise `None`.
 pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
     if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
         return Some(format!("is of part {other}, not {part}"));

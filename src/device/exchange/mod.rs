@@ -6,14 +6,14 @@
 //!  PREPARE  the payload is checked; nothing is in the folder yet
 //!  START    the hand-over appears, whole, by one rename; at most once for a job and cycle        -> EXECUTE
 //!  EXECUTE  waiting; every status looks at the folder
-//!  HOLD     the hand-over is taken back -> HELD;  RESUME  it is put there again -> EXECUTE
-//!  STOP     it is taken back for good -> COMPLETE, stopped;   ABORT  likewise -> ABORTED
+//!  HOLD     the hand-over is withdrawn -> HELD;  RESUME  it is published again -> EXECUTE
+//!  STOP     it is withdrawn permanently -> COMPLETE, stopped;   ABORT  likewise -> ABORTED
 //!  COMPLETE a result was accepted; ACKNOWLEDGE closes the hand-over                               -> IDLE
 //! ```
 //!
-//! A hand-over stays in the folder under a name that shows its standing. From this memory a restarted client learns if
-//! a start was accepted, and it prevents a second hand-over of the same job and cycle. **Taking a hand-over back stops
-//! no machine**: once a person has begun the job, only that person can stop it, and the notes say so.
+//! A hand-over stays in the folder under a name that shows its status. From this name, a restarted client learns if a
+//! start was accepted, and it prevents a second hand-over of the same job and cycle. **Withdrawing a hand-over stops no
+//! machine**: once a person has begun the job, only that person can stop it, and the notes say so.
 //!
 //! A hand-over is a folder that appears as a whole. A result is accepted when it no longer grows, has an end, and
 //! states, by its name or in its content, that it belongs to this part and this cycle. Any other file is left in place

@@ -1,14 +1,14 @@
-//! Folder of the hand-overs, which also keeps the memory of all hand-overs that were ever made.
+//! Folder of the hand-overs, which also stores all earlier hand-overs.
 //!
 //! A hand-over is a folder of its own. It is written under a hidden name, synced to the disk and then renamed, so that
 //! it is always visible as a whole. Its name contains the part, the job and the cycle. The ending of the name shows its
-//! standing:
+//! status:
 //!
 //! ```text
 //! SN-7_j3_c2           open
-//! SN-7_j3_c2.held      taken back for a while
-//! SN-7_j3_c2.stopped   taken back for good, in order
-//! SN-7_j3_c2.aborted   taken back for good, at once
+//! SN-7_j3_c2.held      withdrawn temporarily, by HOLD
+//! SN-7_j3_c2.stopped   withdrawn permanently, by STOP
+//! SN-7_j3_c2.aborted   withdrawn permanently, by ABORT
 //! SN-7_j3_c2.done      its answer was acknowledged
 //! ```
 
@@ -27,7 +27,7 @@ use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_a
 
 /// File in every folder of a hand-over.
 const HEADER_FILE: &str = "handover.json";
-/// File that is written there when an answer was accepted.
+/// File in the folder of a hand-over. It lists the files that were accepted as the answer.
 const ACCEPTED_FILE: &str = "taken.json";
 /// Maximum size of these files, in bytes.
 const MAX_BYTES: u64 = 16 << 20;
@@ -54,12 +54,12 @@ pub(super) struct HandOverHeader {
     pub identity: String,
     /// Radius of the probe, or of the wheel.
     pub tool_radius_mm: f64,
-    /// Files that lay in the inbox before: name, length, time of change in nanoseconds.
+    /// Files that were in the inbox before the hand-over: name, length in bytes, time of change in ns since 1970.
     pub earlier: Vec<(String, u64, u128)>,
 }
 
 impl HandOverHeader {
-    /// Creates the ticket of a job, with the list of files that are in the inbox now.
+    /// Creates the header of a hand-over, with the list of files that are in the inbox now.
     pub(super) fn new(
         part: &str,
         job: Job,
@@ -106,7 +106,7 @@ pub(super) struct AcceptedFiles {
     pub files: Vec<(String, String)>,
 }
 
-/// Hand-over as it is in the folder.
+/// Hand-over as it was read from the folder.
 #[derive(Clone, Debug)]
 pub(super) struct StoredHandover {
     pub path: PathBuf,
@@ -176,7 +176,8 @@ impl Outbox {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
-    /// Publishes a hand-over in the folder: its ticket, and files by name. Nothing appears if the permit was withdrawn.
+    /// Publishes a hand-over in the folder: `ticket` as its header, and `files` with their names. Publishes nothing if
+    /// the permit was withdrawn.
     pub(super) fn publish(
         &self,
         ticket: &HandOverHeader,
@@ -201,7 +202,7 @@ impl Outbox {
         Ok(())
     }
 
-    /// Renames a hand-over so that its name shows its standing.
+    /// Renames a hand-over so that its name shows its status.
     pub(super) fn mark(&self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         let stored = self.handed_over(job)?;
         let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);

@@ -39,7 +39,7 @@ impl Pattern {
         name.strip_prefix(before)?.strip_suffix(after)
     }
 
-    /// Returns the pattern with a text in place of the star.
+    /// Returns the pattern with `text` in place of its first star.
     pub fn with_star(&self, text: &str) -> Self {
         Self(self.0.replacen('*', text, 1))
     }

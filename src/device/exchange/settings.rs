@@ -177,8 +177,8 @@ impl ExchangeWire {
         ExchangeMachine::new(name, kind, folders, FOLDER_TIMEOUT).apart(self.cannot_reach_part)
     }
 
-    /// Returns the two folders. Both must exist: Regrind does not create them, because nobody would look into a folder
-    /// that it created itself.
+    /// Returns the two folders. Both must exist: Regrind does not create them, because no machine or person would use a
+    /// folder that Regrind created itself.
     fn folders(&self, making: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
         let table = machine.name();
         let folder = |name: &str, path: &String| {

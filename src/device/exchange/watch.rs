@@ -34,7 +34,7 @@ pub struct Watch {
     known: BTreeMap<String, KnownFile>,
 }
 
-/// File as found by the last look.
+/// File as found by the last scan of the folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WatchedFile {
     /// Name in the folder.
@@ -43,12 +43,12 @@ pub struct WatchedFile {
     pub path: PathBuf,
     /// Size and time of change.
     pub stamp: FileStamp,
-    /// True if it has not changed for long enough.
+    /// True if the file has not changed for `stable_for`, so that it counts as complete.
     pub settled: bool,
 }
 
 impl Watch {
-    /// Creates a watch on a folder. A file that has not changed for `stable_for` has settled.
+    /// Creates a watch on a folder. A file that has not changed for `stable_for` counts as complete.
     pub fn new(folder: impl Into<PathBuf>, stable_for: Duration) -> Self {
         Self { folder: folder.into(), stable_for, known: BTreeMap::new() }
     }

@@ -188,7 +188,8 @@ impl LineParser {
         Err(LineError::whole_line(format!("it has {} values instead of {expected}: {why}", fields.len())))
     }
 
-    /// Removes the letter from a value, if the format requires one.
+    /// Returns a value without blanks and without the letter of its axis. Returns an error if the format requires the
+    /// letter and it is missing.
     fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineError> {
         let field = field.trim_matches(' ');
         if !self.format.is_lettered() {
@@ -234,8 +235,8 @@ impl LineParser {
         Ok(angle)
     }
 
-    /// Returns the readings (format, separator, decimal mark, number of decimals) that fit a line: a help for the
-    /// author of a cell file.
+    /// Returns every parser (format, separator, decimal mark, number of decimals) that accepts a line. Helps the author
+    /// of a cell file to find the right settings.
     pub fn fitting(line: &str) -> Vec<Self> {
         let marks = [('.', Separator::Comma), ('.', Separator::Semicolon), ('.', Separator::Tab)];
         let commas = [(',', Separator::Semicolon), (',', Separator::Tab), (',', Separator::Blank)];
@@ -275,8 +276,8 @@ impl fmt::Display for LineParser {
     }
 }
 
-/// Parses a sign, digits, and `least` to `most` digits after the decimal mark. Without a mark, `least` must be 0; with
-/// `most` = 0 no mark is allowed.
+/// Parses a number with an optional sign and `least` to `most` digits after the decimal mark. Without a mark, `least`
+/// must be 0. If `most` is 0, no mark is allowed. Returns `None` for any other text.
 fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
     let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
     let (whole, behind) = match digits.split_once(mark) {

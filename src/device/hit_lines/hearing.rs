@@ -21,7 +21,7 @@ use regrind_formats::JsonlAppender;
 /// Number of refused lines kept for a person: the last ones.
 const MAX_REFUSED_SHOWN: usize = 4;
 
-/// Parameters by which lines are judged.
+/// Parameters of the check of received lines.
 #[derive(Clone, Debug)]
 pub(super) struct LineRules {
     pub(super) parser: LineParser,
@@ -38,11 +38,11 @@ pub(super) struct RequestedMeasurement {
     pub(super) sequence: u32,
     pub(super) plan_identity: [u8; 32],
     pub(super) list: TargetList,
-    /// File that stores each line as it came.
+    /// File that stores each received line.
     pub(super) line_log: Option<JsonlAppender>,
     pub(super) begun: Instant,
     pub(super) last_line: Instant,
-    /// Number of lines since it began.
+    /// Number of lines since the measurement began.
     lines: u32,
     duplicate_lines: u32,
     refused_lines: VecDeque<String>,
@@ -59,13 +59,13 @@ pub(super) struct MeasurementSession {
     /// unknown.
     pub(super) clear_of_part: Option<bool>,
     pub(super) duration: Duration,
-    /// Reason why the line is lost.
+    /// Error that ended the connection.
     pub(super) link_error: Option<DeviceError>,
     /// Number of lines that came without a request, and the last of them.
     unrequested_lines: (u32, String),
 }
 
-/// Line as it is stored.
+/// Record of a received line in its file.
 #[derive(Serialize)]
 struct LoggedLine<'a> {
     /// Seconds since the measurement began.
@@ -137,7 +137,7 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes what came over the line.
+    /// Processes a received line, or the beginning of data without a line end.
     pub(super) fn process(&mut self, gathered: ReceivedLine) {
         match gathered {
             ReceivedLine::Line(line) => self.line(&line),
@@ -147,7 +147,7 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a line that has begun and whose rest does not come.
+    /// Rejects a line whose end did not arrive in time.
     pub(super) fn cut_short(&mut self, text: &str) {
         self.reject_line(text, "it is incomplete: its end did not arrive; touch that point again");
     }
@@ -194,7 +194,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a line that is not a valid touch; without a request it is only noted.
+    /// Processes a line that is not a valid touch. During a measurement, refuses the line; without a measurement, only
+    /// counts it.
     fn reject_line(&mut self, line: &str, why: &str) {
         match (&mut self.measurement, self.state) {
             (Some(asked), state) if state.is_moving() => {
@@ -204,8 +205,7 @@ impl MeasurementSession {
             }
             (Some(asked), MachineState::Held) => {
                 asked.lines += 1;
-                let held =
-                    "it arrived after the confirmation that the machine stands; resume, then touch that point again";
+                let held = "it arrived after the confirmation `still`: resume, then touch that point again";
                 asked.refuse(line, held);
             }
             _ => self.unrequested_lines = (self.unrequested_lines.0 + 1, line.chars().take(80).collect()),
@@ -221,7 +221,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Records that the line is lost: later touches are not received.
+    /// Records that the connection was lost: later touches are not received. `begun` is the incomplete last line, if
+    /// there is one.
     pub(super) fn link_lost(&mut self, error: DeviceError, begun: Option<String>) {
         if let Some(text) = begun {
             self.cut_short(&text);

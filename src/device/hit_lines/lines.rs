@@ -3,16 +3,16 @@
 /// Maximum length of a line, in bytes.
 const MAX_LINE_LENGTH: usize = 200;
 
-/// Result of the received bytes.
+/// Line or overlong data found in the received bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ReceivedLine {
     /// Line without its line end.
     Line(String),
-    /// Beginning of data that are longer than any line.
+    /// Beginning of data that exceed the maximum length of a line.
     Endless(String),
 }
 
-/// Bytes of incomplete lines.
+/// Splitter of received bytes into lines. Stores the bytes of an incomplete line.
 #[derive(Clone, Debug, Default)]
 pub struct LineSplitter {
     partial: Vec<u8>,
@@ -50,7 +50,7 @@ impl LineSplitter {
         !self.partial.is_empty()
     }
 
-    /// Discards an incomplete line and returns its text so far.
+    /// Discards an incomplete line and returns its text so far. Returns `None` if there is none, or only blanks.
     pub fn give_up(&mut self) -> Option<String> {
         self.overlong = false;
         let line = std::mem::take(&mut self.partial);

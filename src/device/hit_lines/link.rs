@@ -48,20 +48,21 @@ impl<S: AsyncRead + Send + Unpin> Source for S {}
 pub(super) struct LinkTimeouts {
     /// Timeout of the connection.
     pub(super) connect: Duration,
-    /// Duration of silence that ends the discarding of data sent before the connection was used.
+    /// Duration of silence after which reception begins. Data received before were sent before the connection was used,
+    /// and are discarded.
     pub(super) silence: Duration,
     /// Timeout of the rest of a line.
     pub(super) rest: Duration,
 }
 
-/// Handle of a thread that listens until this is dropped or the line is lost.
+/// Handle of a listening thread. The thread ends when the handle is dropped or the connection is lost.
 #[derive(Debug)]
 pub(super) struct Listener {
     _until: oneshot::Sender<()>,
 }
 
 impl Listener {
-    /// Opens the line, discards the data that have gathered, and then listens.
+    /// Opens the line, discards the data received so far, and then listens.
     pub(super) async fn open(
         machine: &Arc<str>,
         line: HitSource,

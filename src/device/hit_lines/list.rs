@@ -19,12 +19,12 @@ pub enum Repeated {
     Replace,
 }
 
-/// Rules that distinguish touches.
+/// Parameters of the assignment of touches to targets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct TouchRules {
     /// Maximum distance of a point from its target, in mm; a point farther from every target belongs to none.
     pub(super) limit_mm: f64,
-    /// Time within which an identical line is the same touch.
+    /// Time within which an identical line counts as a repetition of the same touch.
     pub(super) double_within: Duration,
     pub(super) repeated: Repeated,
 }
@@ -54,7 +54,7 @@ pub(super) enum TouchAssignment {
 }
 
 impl TargetList {
-    /// Creates a list of the targets of a plan; without targets if any points are accepted.
+    /// Creates the list for a plan. With `is_free`, the list has no targets and accepts any points.
     pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: TouchRules) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };

@@ -79,7 +79,7 @@ impl HitLinesCmm {
         Ok(status_of(&hearing))
     }
 
-    /// Returns what to do now, and what to type then.
+    /// Returns instructions for the operator: what to do at the machine now, and which command to type after that.
     fn prompt(&self, hearing: &MeasurementSession) -> Vec<String> {
         let Some(asked) = &hearing.measurement else { return Vec::new() };
         let folder = &self.settings.run_folder;
@@ -121,12 +121,13 @@ impl HitLinesCmm {
             MachineState::Holding => stop("HOLD"),
             MachineState::Stopping => stop("STOP"),
             MachineState::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
-            MachineState::Aborting => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
+            MachineState::Aborting => vec!["ABORT: stop it at its own panel NOW; Regrind cannot".to_owned()],
             _ => Vec::new(),
         }
     }
 
-    /// Ends the measurement on a person's confirmation. Returns the files that are kept.
+    /// Ends the measurement after a person has confirmed its end. Returns the paths of the stored files, or an error
+    /// text.
     fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
         let Some(asked) = &hearing.measurement else { return Err("no measurement is requested".to_owned()) };
         let (there, _) = asked.list.progress();
@@ -210,7 +211,8 @@ fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<Json
     JsonlAppender::open(&settings.run_folder.join(hits_file(job)))
 }
 
-/// Writes the list where the machine's part program reads it.
+/// Writes the list as `plan.csv` into the folder from which the machine's part program reads it. Does nothing if the
+/// cell file names no folder.
 fn show_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<(), FormatError> {
     let Some(folder) = &settings.plan_folder else { return Ok(()) };
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
@@ -399,7 +401,7 @@ impl Machine for HitLinesCmm {
     }
 }
 
-/// Returns an empty plan: of the measurement of an interrupted run only the number is known.
+/// Returns an empty plan, for the measurement of an interrupted run, of which only the job is known.
 fn no_plan() -> Plan {
     Plan {
         targets: Vec::new(),

@@ -204,7 +204,8 @@ pub struct HitLinesSettings {
     pub min_free_points: Option<usize>,
     /// Timeout of the connection.
     pub connect_timeout: Duration,
-    /// Duration of silence that ends the discarding of data sent before the connection was used.
+    /// Duration of silence after which reception begins. Data received before were sent before the connection was used,
+    /// and are discarded.
     pub silence: Duration,
     /// True if the cell is a simulation.
     pub simulated: bool,
@@ -306,7 +307,8 @@ impl HitLinesWire {
         }
     }
 
-    /// Returns true if the name of the other end is only known once it is simulated in this process.
+    /// Returns true if the address of the machine is assigned only when the simulated machine starts: device "auto" or
+    /// port 0.
     pub fn has_dynamic_address(&self) -> bool {
         match self.source() {
             HitSource::Serial { device, .. } => device == AUTO,

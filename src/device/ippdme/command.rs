@@ -23,8 +23,8 @@ impl DmeCommand {
         Self { name: name.to_owned(), arguments }
     }
 
-    /// Returns true if the server carries it out while other commands run: the name of an event command ends in a
-    /// capital E.
+    /// Returns true for an event command: its name ends in a capital E, and the server executes it while other commands
+    /// run.
     pub fn is_event(&self) -> bool {
         self.name.ends_with('E')
     }

@@ -12,7 +12,7 @@ const PARAMETERS: &[&str] = &["Accel", "Speed", "Approach", "Search", "Retract"]
 /// Shape of the arguments of a command.
 enum Shape {
     Nothing,
-    /// Numbers: the allowed counts, and which of the numbers must be positive or also whole.
+    /// Numbers: the allowed counts of arguments, and the conditions on single arguments.
     Numbers(&'static [usize], &'static [NumberCondition]),
     /// String.
     Text,
@@ -34,7 +34,8 @@ enum Shape {
     Axes,
     /// Point to touch.
     Touch,
-    /// Properties of tools: enumerate the parts of one, read several, set several.
+    /// Properties of tools: `Enumerated` lists the parts of one property, `ReadProperties` reads several properties,
+    /// `Set` sets several.
     Enumerated,
     ReadProperties,
     Set,
@@ -196,7 +197,8 @@ fn transformation(items: &[Item]) -> Result<(), SyntaxError> {
     }
 }
 
-/// Checks that every property is of the right kind and occurs once.
+/// Checks that there is at least one argument, that `fits` accepts each of them as a property, and that no property
+/// occurs twice.
 fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), SyntaxError> {
     if items.is_empty() {
         return Err(arguments("it has at least one argument"));

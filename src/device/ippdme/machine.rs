@@ -176,7 +176,8 @@ impl IppdmeCmm {
         }
     }
 
-    /// Returns the status known so far, or the error of the connection if there is none.
+    /// Returns the last known status. Without a session, returns the error that ended the session or
+    /// [`DeviceError::NotConnected`].
     fn current_status(&self) -> DeviceResult<Status> {
         let shared = locked(&self.shared);
         if let Some(error) = &shared.session_error {
@@ -448,7 +449,7 @@ impl Machine for IppdmeCmm {
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
-        let why = "the server stores no job, and this program has none with that number".to_owned();
+        let why = "the server stores no job, and this program knows no job with this START number".to_owned();
         Ok(Reconciled::Unknown { reason: why })
     }
 }

@@ -1,5 +1,5 @@
-//! Answers of a server, parsed leniently by their meaning: servers differ in everything that the standard shows by
-//! example only.
+//! Answers of a server. The parser accepts variants of their form, because servers differ wherever the standard only
+//! gives an example.
 
 use std::fmt;
 
@@ -42,7 +42,7 @@ pub struct ServerError {
 }
 
 impl ServerError {
-    /// Returns true if the severity is below 2: it stops nothing.
+    /// Returns true for severity 0 (information) or 1 (warning), which does not interrupt the work.
     pub fn is_warning(&self) -> bool {
         self.severity < 2
     }

@@ -1,5 +1,5 @@
-//! Route over the targets. The probe travels from touch to touch in a plane above all targets, in an order that makes
-//! the way short. Every position is checked against the machine's volume before the first motion.
+//! Route over the targets. The probe travels from touch to touch in a plane above all targets, in an order that
+//! shortens the travel. Every position is checked against the machine's volume before the first motion.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -36,13 +36,14 @@ pub(super) struct Route {
     pub(super) legs: Vec<Leg>,
     /// Height at which the probe's centre travels, in mm.
     pub(super) clearance_mm: f64,
-    /// Length of the horizontal way in this order and in the plan's order, in m.
+    /// Length of the horizontal travel, in m: `travel_m` in the order of this route, `plan_order_m` in the order of the
+    /// plan.
     pub(super) travel_m: f64,
     pub(super) plan_order_m: f64,
 }
 
 impl Route {
-    /// Finds the route. With `scan`, rows of targets no farther apart than its step are scanned.
+    /// Finds the route. If `scan` is given, rows of targets whose spacing is at most `scan.step_mm` are scanned.
     ///
     /// # Errors
     /// Returns an error for a target that is not reachable from above, or for a position outside of the volume.
@@ -68,7 +69,7 @@ impl Route {
 }
 
 impl Leg {
-    /// Returns the range of targets that this part measures.
+    /// Returns the range of plan indices of the targets that this leg measures.
     pub(super) fn targets(&self) -> Range<usize> {
         match self {
             Self::Touch(k) => *k..k + 1,
@@ -77,8 +78,8 @@ impl Leg {
     }
 }
 
-/// Splits a plan, in its own order, into rows that are scanned and targets that are touched. Touched are the slow first
-/// targets of a careful plan, the reference sphere, and targets in no row.
+/// Splits a plan, in its own order, into rows that are scanned and targets that are touched one by one. The slow first
+/// targets of a careful plan, the reference sphere and targets outside of all rows are touched.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
@@ -95,7 +96,7 @@ fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     legs
 }
 
-/// Returns the end of the row that begins at `from`, exclusive.
+/// Returns the index after the last target of the row that begins at index `from`.
 fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     let targets = &plan.targets[from..plan.targets.len().min(from + MAX_SCAN_TARGETS)];
     let step = |k: usize| -> [f64; 3] {
@@ -114,7 +115,8 @@ fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     from + 1 + (1..targets.len()).take_while(|k| goes_on(k)).count()
 }
 
-/// Returns the position of the probe's centre at which it turns into the normal of the target.
+/// Returns the approach point of a target: the position of the probe's centre from which the probe moves along the
+/// normal.
 pub(super) fn approach(target: &PlanTarget, plan: &Plan) -> [f64; 3] {
     point_on_normal(target, plan.approach_mm + plan.probe_radius_mm)
 }
@@ -162,8 +164,8 @@ fn check(
     Ok(())
 }
 
-/// Returns the order of the touches. The slow first targets of a careful plan stay first, and the reference sphere is
-/// not mixed with the part.
+/// Returns the order of the touches, as indices into the plan. The slow first targets of a careful plan stay first.
+/// Targets on the reference sphere stay separate from targets on the part.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
     if plan.targets.len() > MAX_ORDERED {
@@ -180,8 +182,8 @@ fn order(plan: &Plan) -> Vec<usize> {
     order
 }
 
-/// Orders a stretch of the way by nearest neighbour, then improves it by 2-opt and Or-opt. The plan's own order,
-/// improved or not, is kept if it gives the shorter way.
+/// Reorders the range `stretch` of `order` to shorten the travel. Compares three orders: the plan's own order, the
+/// plan's order after [`improve`], and nearest neighbour followed by [`improve`]. Keeps the shortest.
 fn shorten(plan: &Plan, order: &mut [usize], stretch: Range<usize>) {
     let begin = stretch.start.checked_sub(1).map(|k| place(plan, order[k]));
     let targets = &mut order[stretch];
@@ -216,7 +218,8 @@ fn nearest(places: &[[f64; 2]], begin: Option<[f64; 2]>) -> Vec<usize> {
     order
 }
 
-/// Improves an order by 2-opt and Or-opt over the nearest neighbours of each stop, until neither shortens the way.
+/// Improves an order by 2-opt and Or-opt over the nearest neighbours of each stop, until neither shortens the travel or
+/// for at most 30 passes.
 fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     const PASSES: usize = 30;
     if order.len() < 4 {
@@ -234,11 +237,12 @@ fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     }
 }
 
-/// Way that is being shortened. Its first stop stays first, because the way to it is not known here.
+/// Tour that is being shortened. Its first stop stays first, because the tour does not include the travel to its first
+/// stop.
 struct Tour<'a> {
     places: &'a [[f64; 2]],
     order: &'a mut [usize],
-    /// Position of each stop in the order.
+    /// Index in `order` of each stop.
     at: Vec<usize>,
     /// Nearest other stops of each stop, nearest first.
     near: Vec<Vec<usize>>,
@@ -262,7 +266,7 @@ impl<'a> Tour<'a> {
         apart(self.places[a], self.places[b])
     }
 
-    /// Returns the distance between two stops; 0 without a second stop.
+    /// Returns the distance from stop `a` to stop `b`; 0 if `b` is `None`.
     fn to(&self, a: usize, b: Option<&usize>) -> f64 {
         b.map_or(0.0, |b| self.apart(a, *b))
     }
@@ -272,7 +276,8 @@ impl<'a> Tour<'a> {
         self.note(stretch);
     }
 
-    /// Reverses a stretch after a stop so that one of its neighbours comes next, if that shortens the way.
+    /// Reverses the section after `stop` so that one of its nearest neighbours becomes its successor, if that shortens
+    /// the tour. Returns true if it did.
     fn reverse_after(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         let Some(&next) = self.order.get(i + 1) else { return false };
@@ -292,8 +297,8 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Reverses a stretch before a stop so that one of its neighbours comes directly before it, if that shortens the
-    /// way.
+    /// Reverses a section before `stop` so that one of its nearest neighbours becomes its predecessor, if that shortens
+    /// the tour. Returns true if it did.
     fn reverse_before(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         if i < 2 {
@@ -318,8 +323,8 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Moves a stretch of one to three stops that begins with this stop to directly after one of its neighbours, if
-    /// that shortens the way (Or-opt).
+    /// Moves a section of one to three stops that begins with `stop` to the position after one of its nearest
+    /// neighbours, if that shortens the tour (Or-opt). Returns true if it did.
     fn move_segment(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         for size in 1..=3 {
@@ -354,7 +359,7 @@ impl<'a> Tour<'a> {
     }
 }
 
-/// Returns the nearest other places, nearest first.
+/// Returns the indices of the 10 positions nearest to position `of`, nearest first.
 fn neighbours(places: &[[f64; 2]], of: usize) -> Vec<usize> {
     const NEAR: usize = 10;
     let mut others: Vec<usize> = (0..places.len()).filter(|k| *k != of).collect();

@@ -74,7 +74,8 @@ impl Worker {
         Ok(is_there)
     }
 
-    /// Returns the numbers of a scan as measured points, one for each target, if they are plausible.
+    /// Converts the numbers that a scan returned to measured points, one for each target. Returns an error if their
+    /// count does not match the targets or a point is not at its target.
     fn decode_scan(
         &self,
         work: &RoutedPlan,
@@ -134,8 +135,8 @@ fn is_missed(error: &ServerError) -> bool {
     MISS_ERRORS.contains(&error.number)
 }
 
-/// Returns the arguments for a scan of the curve through these targets: open, with the normal of each target, all on
-/// the surface.
+/// Returns the arguments that scan the open curve through these targets. Each target has its point, its normal and the
+/// number 1, which marks a point on the surface.
 fn curve(targets: &[PlanTarget]) -> Vec<Item> {
     let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
     let mut format = ["X", "Y", "Z", "IJK"].map(Item::property_query).to_vec();
@@ -145,7 +146,8 @@ fn curve(targets: &[PlanTarget]) -> Vec<Item> {
     vec![Item::property("Closed", 0.0), call("Format", format), call("Data", data)]
 }
 
-/// Returns the distance of a place from the normal of a target, in mm.
+/// Returns the distance of `at_mm`, a position of the probe's centre, from the line along the normal of a target, in
+/// mm.
 fn lateral_distance_mm(target: &PlanTarget, plan: &Plan, at_mm: [f64; 3]) -> f64 {
     let centre = point_on_normal(target, plan.probe_radius_mm);
     let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);

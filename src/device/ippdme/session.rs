@@ -66,7 +66,7 @@ pub(super) struct Session {
     limits: Limits,
     last: u32,
     last_event: u16,
-    /// Number of aborts ordered, and (`aborted`) number of aborts sent.
+    /// Number of aborts ordered so far. `sent_aborts` is the number of those that were sent to the server.
     ordered_aborts: watch::Receiver<u64>,
     sent_aborts: u64,
     notes: VecDeque<String>,
@@ -82,7 +82,8 @@ pub(super) struct CommandReply {
 }
 
 impl CommandReply {
-    /// Returns the number of a property in the only line of data.
+    /// Returns the number of the property `name`. Returns `None` if the answer does not have exactly one line of data
+    /// that contains the property once.
     pub(super) fn value(&self, name: &str) -> Option<f64> {
         value(self.line()?, name)
     }
@@ -95,7 +96,7 @@ impl CommandReply {
     }
 }
 
-/// Progress of a command.
+/// Command that was sent and is not over yet, with its answer so far.
 struct Pending<'a> {
     tag: Tag,
     command: &'a DmeCommand,
@@ -119,7 +120,8 @@ impl Session {
         Ok(Self::from_stream(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
-    /// Creates a session after `aborted` aborts; an abort ordered since then is sent first.
+    /// Creates a session. `aborted` is the number of aborts that earlier sessions have sent; an abort ordered later is
+    /// sent first.
     fn from_stream(
         aborted: u64,
         machine: Arc<str>,
@@ -241,7 +243,7 @@ impl Session {
         }
     }
 
-    /// Processes a line of the command itself. Returns the answer if the command is over.
+    /// Processes a line with the tag of the command. Returns the answer when the command is over, otherwise `None`.
     fn process_own_line(
         &mut self,
         pending: &mut Pending<'_>,
@@ -267,7 +269,7 @@ impl Session {
         Ok(None)
     }
 
-    /// Processes a line of another tag: a message of the server itself, or a late line of a finished command.
+    /// Processes a line with another tag: an unsolicited message of the server, or a late line of a finished command.
     fn process_other_line(&mut self, response: DmeResponse) -> Result<(), Failure> {
         match (response.tag, response.content) {
             (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
@@ -323,7 +325,7 @@ impl Session {
         *self.ordered_aborts.borrow() > self.sent_aborts
     }
 
-    /// Waits until an abort is ordered; waits forever if nobody is left to order one.
+    /// Waits until an abort is ordered. Waits forever if the sender of abort orders no longer exists.
     pub(super) fn abort_ordered(&self) -> impl Future<Output = ()> + Send + use<> {
         let (mut aborts, aborted) = (self.ordered_aborts.clone(), self.sent_aborts);
         async move {
@@ -417,8 +419,8 @@ impl Session {
     }
 }
 
-/// Returns true if an error stops nothing. Servers may change the severity of an error, so errors that stop a machine
-/// are recognised by their numbers.
+/// Returns true if an error does not stop the machine. Servers may send another severity than the standard, so errors
+/// that stop a machine are recognised by their numbers.
 fn is_harmless(error: &ServerError) -> bool {
     error.is_warning() && !matches!(error.number, 6 | 500 | 503 | 1000..=1009 | 1500..=1503 | 2500..=2506)
 }

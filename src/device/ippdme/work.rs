@@ -1,5 +1,5 @@
-//! Execution of a job. Other machines execute a job in their controller; here this program does. One task owns the
-//! session. It checks for hold, stop and abort between two commands, and for abort also within a command.
+//! Execution of a measuring job by this program, because an I++ DME server stores no job. One task owns the session. It
+//! checks for hold, stop and abort between two commands, and for abort also within a command.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -19,11 +19,11 @@ use crate::words::{Fault, Job, MachineState, Outcome};
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.
 pub(super) const MISS_ERRORS: [u16; 3] = [1001, 1003, 1006];
-/// Number of targets not reached at which the job fails: the part lies elsewhere.
+/// Number of unreachable targets at which the job fails, because the part is not at its planned position.
 const MAX_UNREACHED: u32 = 3;
 /// Error numbers of a server that lacks a method or a property.
 const UNSUPPORTED_ERRORS: [u16; 6] = [501, 502, 505, 506, 509, 510];
-/// Time limits of a tool change and of homing, for their motion.
+/// Maximum durations of the motion of a tool change and of homing.
 const TOOL_CHANGE_TIMEOUT: Duration = Duration::from_secs(180);
 const HOMING_TIMEOUT: Duration = Duration::from_secs(300);
 
@@ -34,7 +34,7 @@ pub(super) struct RoutedPlan {
     pub(super) route: Route,
 }
 
-/// Request to the task, which it obeys at the next safe place.
+/// Request to the task that executes the job. The task carries it out at the next safe position of the probe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum JobRequest {
     Continue,
@@ -89,8 +89,8 @@ impl SharedState {
         }
     }
 
-    /// Changes to the resting state that follows the current one: the server has finished its command, so nothing
-    /// moves.
+    /// Changes a transitional state to the state at rest that follows it: ABORTING to ABORTED, STOPPING to COMPLETE,
+    /// EXECUTE and HOLDING to HELD. Call it after the server has finished its command, so that nothing moves.
     pub(super) fn come_to_rest(&mut self) {
         (self.state, self.outcome) = match self.state {
             MachineState::Aborting => (MachineState::Aborted, Outcome::Aborted),
@@ -265,13 +265,14 @@ impl Worker {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = MachineState::Holding;
-            shared.stop_reason = Some("no status request arrived for too long, and it holds by itself".to_owned());
+            shared.stop_reason = Some("no status request arrived for too long, so the machine holds".to_owned());
             return JobRequest::Hold;
         }
         *self.job_request.borrow()
     }
 
-    /// Puts the machine into the state that the plan needs, independent of what other clients did before.
+    /// Homes the machine if necessary. Sets the frame, the tool, its parameters and the content of a point report, as
+    /// the plan requires. Assumes nothing about settings that other clients left.
     async fn set_up(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let homed = self.session.ask("IsHomed", Vec::new()).await?;
         if homed.value("IsHomed") != Some(1.0) {
@@ -324,7 +325,8 @@ impl Worker {
         }
     }
 
-    /// Compares the radius of the tool with the radius of the plan.
+    /// Compares the tool radius that the server reports with the probe radius of the plan. Returns an error if they
+    /// differ by more than `probe_tolerance_mm`. If the server reports no tool radius, only adds a note.
     async fn check_tool_radius(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
@@ -380,7 +382,8 @@ impl Worker {
         Ok(in_force)
     }
 
-    /// Sets the travel and touch speeds for target `k` if they change: the first targets of a careful plan are slow.
+    /// Sets the travel and touch speeds for target `k`, if they differ from the speeds in force. The first targets of a
+    /// careful plan have a lower speed.
     pub(super) async fn set_speeds(&mut self, work: &RoutedPlan, k: usize) -> Result<(), Failure> {
         let careful = work.plan.careful_start.filter(|careful| k < careful.target_count as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
@@ -424,7 +427,8 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, position_mm: [0.0; 3] })
     }
 
-    /// Returns the measured point in the answer to a touch, if it is plausible for this target.
+    /// Returns the measured point in the answer to a touch. Returns an error if a coordinate is missing or the point is
+    /// not plausible for this target.
     fn point(
         &mut self,
         work: &RoutedPlan,
@@ -463,7 +467,8 @@ impl Worker {
         Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }
 
-    /// Travels at the clearance height to above a target, then down to the point where the probe turns into the normal.
+    /// Moves the probe at the clearance height to a position above a target, then down to the approach point, from
+    /// which the probe moves along the normal.
     pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
@@ -491,8 +496,8 @@ impl Worker {
         Ok(())
     }
 
-    /// Returns the maximum duration of a way, from the speed in force with index `speed`. A speed not set yet is the
-    /// machine's own, which may be slow: 1 mm/s is assumed.
+    /// Returns the maximum duration of a motion over `way_mm`, from the speed in force with index `speed`. If this
+    /// speed is not set yet, the machine uses its own speed, which can be low: 1 mm/s is assumed.
     pub(super) fn motion_time(&self, way_mm: f64, speed: usize) -> Duration {
         const MIN_SPEED_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
@@ -542,7 +547,8 @@ pub(super) async fn request_if_supported(
     }
 }
 
-/// Returns the error number of a miss that the server reported only as a warning, without data.
+/// Returns the error number of a missed touch that the server reported only as a warning, without data. Returns `None`
+/// if the answer has data or no such warning.
 fn missed_by(answer: &CommandReply) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
     numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())

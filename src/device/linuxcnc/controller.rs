@@ -212,7 +212,8 @@ impl Controller {
         }
     }
 
-    /// Returns the reason why an order was refused; without control every order is refused.
+    /// Returns the error for a refused order: another client has control, or else the state of the controller does not
+    /// allow the order.
     async fn denied(&mut self, command: MachineCommand) -> DeviceResult<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
             return Ok(self.control_taken());
@@ -276,7 +277,8 @@ impl Controller {
         }
     }
 
-    /// Reads the state until a condition holds.
+    /// Reads the state until `holds` returns true for it, and returns it. Returns an error if that takes longer than
+    /// `settle_timeout`; `what` names the awaited state in that error.
     pub(super) async fn wait_until(
         &mut self,
         what: &'static str,

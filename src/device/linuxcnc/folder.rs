@@ -23,12 +23,13 @@ pub(super) struct Folders {
     pub(super) local: PathBuf,
     /// Folder of programs, as the controller sees it.
     pub(super) remote: String,
-    /// True if work in the folders runs in turn with everything else, not on a thread of its own.
+    /// True if file operations run on the caller's thread; false if they run on a thread for blocking work.
     pub(super) single_threaded: bool,
 }
 
 impl Folders {
-    /// Returns the newest program of the run in its frame.
+    /// Returns the newest program of the run as a [`FramedProgram`]. `map` is the identity of the required map,
+    /// `rounds` the number of times that the pass is run.
     ///
     /// # Errors
     /// Returns a text if there is no program, or if the newest is not of this map or must not be run.
@@ -78,7 +79,8 @@ impl Folders {
         }
     }
 
-    /// Returns the program of this run whose record has this token: one prepared before this process started.
+    /// Returns the program of this run whose record has this token. Such a program was prepared before this process
+    /// started. Returns `None` if there is none.
     pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<FramedProgram>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);

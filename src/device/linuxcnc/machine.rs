@@ -1,5 +1,5 @@
-//! The grinder, as the cell sees it. `beginning`: preparation and start. `looking`: current state. `reconciling`: fate
-//! of a job after an interruption.
+//! The grinder, as the cell sees it. `beginning`: preparation and start. `looking`: current state. `reconciling`:
+//! outcome of a job after an interruption.
 //!
 //! ```text
 //!  LOAD     the pass in its frame is written into the folder under its own name; the controller opens it
@@ -41,7 +41,7 @@ use reconciling::unknown;
 
 /// Interval between two status queries while waiting for a start or a record.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
-/// Minimum time over which a start must be seen not to have happened.
+/// Minimum time of observation before a start is reported as not begun.
 const NOT_STARTED_CONFIRMATION: Duration = Duration::from_millis(1050);
 /// Timeout of work in a folder, which can be on another computer.
 const FOLDER_TIMEOUT: Duration = Duration::from_secs(30);
@@ -57,14 +57,14 @@ pub struct LinuxcncGrinder {
     /// Loaded program, and the digest of its payload.
     loaded: Option<(Arc<FramedProgram>, u32)>,
     job: Option<ActiveJob>,
-    /// True if aborted when no job had begun: CLEAR is needed all the same.
+    /// True after an abort without a job. The machine then requires CLEAR, as after the abort of a job.
     aborted: bool,
     /// Time since which the controller has been seen idle.
     idle_since: Option<Instant>,
     began: Option<Instant>,
     duration_s: Option<f64>,
     fault: Fault,
-    /// Position, clear of the part, at which a finished program left the machine.
+    /// Position, as the controller reports it, at which a finished program left the wheel clear of the part.
     clear_at: Option<String>,
     /// Line and position seen last, and since when.
     last_motion: Option<(u32, String, Instant)>,
@@ -306,7 +306,7 @@ impl Machine for LinuxcncGrinder {
             }
         }
         if self.job.as_ref().is_none_or(|work| work.program.is_none()) {
-            return Ok(unknown("the record of its preparation is not in the folder of programs"));
+            return Ok(unknown("the folder of programs has no program whose .log file is of this job"));
         }
         match self.start_outcome().await? {
             Some(verdict) => Ok(verdict),
@@ -321,14 +321,16 @@ impl Machine for LinuxcncGrinder {
         let not_taken = |why: &str| DeviceError::NotAccepted { machine: self.machine(), reason: why.to_owned() };
         let program = self.job.as_ref().and_then(|work| work.program.clone());
         let ended = match word {
-            OperatorConfirmation::Started { .. } => return Err(not_taken("it has stopped; confirm done, or still")),
+            OperatorConfirmation::Started { .. } => {
+                return Err(not_taken("it has stopped: confirm done if the pass is complete, otherwise still"));
+            }
             OperatorConfirmation::Done { file: Some(_), .. } => {
                 return Err(not_taken("a pass has no file: remove --file"));
             }
             OperatorConfirmation::Done { map_identity: Some(map), .. }
                 if program.is_none_or(|program| program.map != map) =>
             {
-                return Err(not_taken("that map is not the one of its program"));
+                return Err(not_taken("the confirmation names another map than that of its program"));
             }
             OperatorConfirmation::Done { .. } => Stage::Ended(MachineState::Complete, Outcome::Complete),
             OperatorConfirmation::Still => Stage::Ended(MachineState::Complete, Outcome::Stopped),

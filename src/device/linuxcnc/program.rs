@@ -136,8 +136,8 @@ fn plain(c: char) -> char {
 /// Returns the program without its final M2.
 ///
 /// # Errors
-/// Returns a text if the program is not of this map, does not set its path tolerance, or does not end with its only end
-/// word.
+/// Returns a text if the program is not of this map, does not set its path tolerance, does not end with M2, or contains
+/// M2, M30 or % before that.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
     let of_map = format!("{MAP_COMMENT}{})", hex(map));

@@ -1,7 +1,7 @@
 //! State of a job, from the observed state of the controller and the record of its program. Pure: no I/O.
 //!
-//! The controller reports what runs. It does not report if a program ran to its end, and an idle controller is no
-//! proof. The record of the program is.
+//! The controller reports what runs. It does not report if a program ran to its end: only the record of the program
+//! proves that, not an idle controller.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,7 +16,7 @@ pub(super) struct ActiveJob {
     pub(super) job: Job,
     /// Start sequence number.
     pub(super) sequence: u32,
-    /// Token with which its record was opened.
+    /// Token of the preparation, which the record of the program must contain.
     pub(super) token: u32,
     /// Program of the job; `None` if a program prepared earlier is not found any more.
     pub(super) program: Option<Arc<FramedProgram>>,
@@ -38,7 +38,7 @@ pub(super) enum Stage {
     Prepared,
     /// START was sent, or possibly sent.
     Begun,
-    /// The job is over.
+    /// The job is over, with this state and this outcome.
     Ended(MachineState, Outcome),
 }
 
@@ -47,7 +47,7 @@ pub(super) enum Stage {
 pub(super) enum Verdict {
     /// The job is in this state and can continue.
     InState(MachineState),
-    /// The job is over.
+    /// The job is over, with this state, outcome and fault.
     Ended(MachineState, Outcome, Fault),
     /// The controller runs a program that is not ours.
     Foreign(MachineState),
@@ -56,7 +56,7 @@ pub(super) enum Verdict {
 }
 
 impl ActiveJob {
-    /// Returns the record if its token is that of this preparation.
+    /// Returns the record if it has the token of this job; otherwise `None`.
     pub(super) fn own_record(&self, record: Option<ProgramRecord>) -> Option<ProgramRecord> {
         record.filter(|record| record.token == Some(self.token))
     }
@@ -100,8 +100,8 @@ impl ActiveJob {
         }
     }
 
-    /// Updates the round from the line seen. Returns the progress in thousandths of a round, done and total over all
-    /// rounds.
+    /// Updates the current round from `line`, the line number that the controller reports. Returns the progress `(done,
+    /// total)` over all rounds, in thousandths of a round; `None` without a program.
     pub(super) fn progress(&mut self, line: u32) -> Option<(u32, u32)> {
         let program = self.program.as_ref()?;
         let (round, before) = self.round;
@@ -111,7 +111,7 @@ impl ActiveJob {
         Some((1000 * self.round.0 + program.thousandths(line), 1000 * program.rounds))
     }
 
-    /// Returns the fault that the errors mean, as far as their words are known.
+    /// Returns the fault that the error texts indicate by known words; `Fault::Other(0)` if they contain no known word.
     pub(super) fn fault(&self) -> Fault {
         let words = self.errors.join("\n").to_lowercase();
         match () {

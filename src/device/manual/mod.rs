@@ -42,7 +42,7 @@ pub struct ManualSettings {
     pub content: Content,
     /// Minimum number of points, if any points are accepted.
     pub min_free_points: Option<usize>,
-    /// Minimum share of the targets of which a measurement must have a point.
+    /// Minimum fraction of the targets that need a point in a measurement, from 0 to 1.
     pub min_coverage: f64,
     /// True if the plan itself is accepted as the measurement.
     pub rehearsal: bool,
@@ -69,9 +69,10 @@ pub struct ManualMachine {
     task: Option<(ManualTask, u32)>,
     /// Requested job, and its start sequence number.
     job: Option<(Job, u32)>,
-    /// Unresolved job of an interrupted run: nobody has said what became of it.
+    /// Unresolved job of an interrupted run, with its start sequence number. A person has not confirmed its outcome
+    /// yet.
     unresolved: Option<(Job, u32)>,
-    /// Jobs and cycles that were ever requested: none is requested twice.
+    /// Job and cycle of every request so far, because the same job and cycle is never requested twice.
     requested_jobs: Vec<(u32, u16)>,
     outcome: Outcome,
     /// Time at which the start was confirmed.
@@ -80,7 +81,7 @@ pub struct ManualMachine {
     /// True if it is clear of the part, as a person confirmed; `None` if unknown.
     clear_of_part: Option<bool>,
     measurement: Option<Measurement>,
-    /// SHA-256 of every accepted file: no two measurements have the same bytes.
+    /// SHA-256 of every accepted file, because the same bytes are never accepted twice.
     accepted_files: Vec<[u8; 32]>,
 }
 
@@ -142,7 +143,8 @@ impl ManualMachine {
 
     // ---- what a person is asked ---------------------------------------------------------------------------------------------------
 
-    /// Returns what to do and what to check now, and what to type then.
+    /// Returns instructions for the operator: what to do and check at the machine now, and which command to type after
+    /// that.
     fn prompt(&self) -> Vec<String> {
         let Some((job, _)) = self.job else { return Vec::new() };
         let name = self.kind.name();
@@ -158,7 +160,7 @@ impl ManualMachine {
             }
             (MachineState::Holding, _) => still("HOLD"),
             (MachineState::Stopping, _) => still("STOP"),
-            (MachineState::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
+            (MachineState::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; Regrind cannot".to_owned()],
             _ => Vec::new(),
         }
     }
@@ -253,7 +255,7 @@ impl ManualMachine {
         }
     }
 
-    /// Returns true if a confirmation names another map than the requested one.
+    /// Returns true if a confirmation names a map that is not the requested map.
     fn names_other_map(&self, named: Option<[u8; 32]>) -> bool {
         match &self.task {
             Some((ManualTask::Grind(_, map), _)) => named.is_some_and(|named| named != *map),

@@ -1,10 +1,10 @@
 //! Read-ahead: full pages of a result, read while its job still runs.
 //!
-//! A machine that supports this says so by a flag of its identity. Between two reads of the status at most one step is
-//! taken: first the header, then one page at a time. So a heartbeat or an order waits for at most the request under
-//! way. The pages are stored with the line, the boot of the machine and the START to which they belong. The result is
-//! proved at its end as always, by its CRC over all pages; the stored pages only need not be read again. If the proof
-//! fails, they are discarded and all pages are read again.
+//! A machine that supports this has a flag in its identity. Between two reads of the status at most one step is taken:
+//! first the header, then one page at a time. So a heartbeat or an order waits for at most one request. The pages are
+//! stored with the line, the boot of the machine and the START to which they belong. When the job has ended, the CRC
+//! over all pages verifies the result; pages that are already stored are not read again. If the CRC is wrong, the
+//! stored pages are discarded and all pages are read again.
 
 use std::time::Duration;
 
@@ -18,9 +18,9 @@ use crate::{DeviceError, Interrupt, Job, MachineState, MeasuredPoint, Preliminar
 const MAX_PAGE_TIME: Duration = Duration::from_millis(75);
 /// Number of bytes of a page read on a serial line, with its answer.
 const PAGE_BYTES: u32 = 8 + 237;
-/// Number of reads after which a page that is not shown is selected again.
+/// Number of reads after which a page is selected again, if the machine still shows another page.
 const MAX_READS: u32 = 10;
-/// Number of failures after which the rest of a job is read at its end.
+/// Number of failures after which reading ahead stops for the job. Its other pages are read when it has ended.
 const MAX_FAILURES: u32 = 3;
 
 /// Pages that were read ahead, with the connection, boot and job to which they belong.
@@ -35,7 +35,7 @@ pub(super) struct ReadAhead {
     words: Vec<u16>,
     /// Number of reads of the next page since it was selected; `None` if it was not selected.
     reads_since_select: Option<u32>,
-    /// Progress at which the next page was not full yet.
+    /// Progress, as a number of points, at which the next page was read and was not full yet.
     not_full_at: Option<u32>,
 }
 
@@ -47,7 +47,7 @@ pub(super) struct ReadAheadFailures {
 }
 
 impl ReadAhead {
-    /// Returns the number of complete points.
+    /// Returns the number of complete points in the stored pages.
     fn point_count(&self) -> usize {
         self.words.len() / self.header.registers
     }
@@ -90,7 +90,8 @@ impl ModbusMachine {
         self.read_ahead_failures.start == start && self.read_ahead_failures.count >= MAX_FAILURES
     }
 
-    /// Counts a failure. A machine that refuses is not asked again in this job. A busy machine is no failure.
+    /// Counts a failure of the connection. If the machine refuses a request, reading ahead stops for this job. A busy
+    /// machine is not a failure.
     fn count_failure_ahead(&mut self, start: u32, error: &DeviceError) {
         if self.read_ahead_failures.start != start {
             self.read_ahead_failures = ReadAheadFailures { start, count: 0 };
@@ -137,7 +138,8 @@ impl ModbusMachine {
             && (ahead.job, ahead.start) == (job, start)
     }
 
-    /// Reads the header of the result so far. It names the job and the plan, and its number of the finished job is 0.
+    /// Reads the header of the partial result. It must name this job and its plan, and its `done` number must be 0,
+    /// because the job still runs.
     async fn begin_ahead(&mut self, job: Job, block: &StatusBlock) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
         let words = self.unit.request_once("outbox header", address, LinkRequest::Read { address, count: 56 }).await?;
@@ -204,7 +206,7 @@ impl ModbusMachine {
         Ok((!told.points.is_empty()).then_some(told))
     }
 
-    /// Decodes the points from the first one that was not reported yet.
+    /// Decodes the points with index `told` and above, which were not reported yet.
     fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.point_count() * registers];

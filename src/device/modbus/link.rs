@@ -7,9 +7,9 @@
 //! A line is trusted until the first error: a timeout, a short answer, a wrong echo, bytes without a request. Then the
 //! connection is dropped with all data that may still arrive on it. The line is not used for as long as the slowest
 //! machine may need for an answer. A serial line is read until it is silent. Only then is the line opened again, under
-//! a new *generation* number. A machine that was proved on the old generation must be proved again: a request names the
-//! generation that it trusts and is rejected as stale if that generation is gone. So the answer to an older request can
-//! never be mistaken for the answer to a newer one.
+//! a new *generation* number. The identity of a machine that was verified on the old generation must be verified again:
+//! a request names the generation that it trusts, and is rejected as stale if that generation is gone. So the answer to
+//! an older request can never be mistaken for the answer to a newer one.
 //!
 //! The library checks lengths and echoes only in debug builds, by panicking. So this module requests the plain
 //! responses and checks them itself.
@@ -93,7 +93,7 @@ pub(super) enum LinkFault {
     Corrupt { what: &'static str, expected: u64, found: u64 },
     /// The machine answered with a Modbus exception.
     Exception(u8),
-    /// The generation that the request trusts is gone; nothing was sent.
+    /// The line was reopened since the generation that the request names; nothing was sent.
     Stale,
 }
 
@@ -108,7 +108,7 @@ pub(super) enum LinkRequest {
         address: u16,
         words: Arc<[u16]>,
     },
-    /// Drops the connection: a check that the line cannot make has found its data invalid.
+    /// Drops the connection, because the caller has found its data invalid.
     DropConnection,
 }
 
@@ -130,7 +130,7 @@ pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
     fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
 }
 
-/// Method to open a line. An own implementation is for lines that use no socket and no port of this computer.
+/// Method to open a line. Implement it for a line that is neither a socket nor a serial port of this computer.
 pub trait Connector: Debug + Send + Sync {
     /// Opens the line.
     fn connect<'a>(&'a mut self, line: &'a LineAddress) -> ConnectFuture<'a>;

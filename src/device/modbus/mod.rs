@@ -53,7 +53,7 @@ const FROZEN_AFTER: Duration = Duration::from_millis(1500);
 const ACKNOWLEDGE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Time for a machine to process a payload, or to reach the announced state.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time over which a start must be seen as not accepted.
+/// Minimum time for which the status must show that a start was not accepted, before this is reported.
 const NOT_STARTED_CONFIRMATION: Duration = Duration::from_millis(1050);
 /// Temperature in the status of a machine without a thermometer.
 const NO_THERMOMETER: i16 = i16::MIN;
@@ -85,8 +85,8 @@ pub struct ModbusMachine {
     owned: bool,
     /// True if this client has connected to the machine before.
     has_connected: bool,
-    /// Sequence number of the START that was given last, or that was reconciled last. Only a job that it has begun
-    /// belongs to this client.
+    /// Sequence number of the START that was sent or reconciled last. Only a job begun by this START belongs to this
+    /// client.
     last_start: Option<u32>,
     heartbeat: u16,
     last_heartbeat: Option<Instant>,
@@ -275,8 +275,8 @@ impl ModbusMachine {
         Ok(status)
     }
 
-    /// Returns an error if another client has taken the machine: its further actions are not ours to report. An abort
-    /// is allowed for every client.
+    /// Returns an error if another client has become the owner of the machine, because its commands are not reported
+    /// here. The states ABORTING and ABORTED are accepted, because every client may abort.
     fn check_owner(&self, status: &StatusBlock) -> Result<(), DeviceError> {
         let aborts = matches!(status.state, MachineState::Aborting | MachineState::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
@@ -285,8 +285,8 @@ impl ModbusMachine {
         Err(DeviceError::OwnedByOther { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
-    /// Reads a signal. A signal that the machine does not have, or that is not a finite number, has no value but a
-    /// cause.
+    /// Reads signal number `k`. If the machine does not have the signal, or its value is not a finite number, the value
+    /// is `None` and a cause is given.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
         let ask = LinkRequest::Read { address: signal.address, count: signal.kind.registers() };
@@ -414,7 +414,8 @@ impl ModbusMachine {
         self.compare(fields)
     }
 
-    /// Returns an error for the first field in which the machine differs from what was sent or intended.
+    /// Returns an error for the first field whose two values differ. A field is its name, the value that was sent, and
+    /// the value at the machine.
     fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
             Some((field, sent, held)) => {
@@ -482,9 +483,9 @@ impl ModbusMachine {
         self.run_command(MachineCommand::Release).await
     }
 
-    /// Ends the job at once, whatever the state of the connection and whatever sequence number another client has
-    /// reached. It connects by itself without the pause that other commands observe, and uses a number above the one
-    /// that the machine has now.
+    /// Ends the job at once. Does not depend on the state of the connection, or on the sequence numbers that another
+    /// client has used: it connects without the pause that other commands observe, and uses a number above the last one
+    /// that the machine has acknowledged.
     async fn abort(&mut self) -> Result<StatusBlock, DeviceError> {
         self.unit.link.skip_pause();
         if self.unit.identity().is_none() {
@@ -652,7 +653,8 @@ impl ModbusMachine {
         }
     }
 
-    /// Returns an error unless the machine would use the payload that was loaded.
+    /// Compares the payload in force at the machine with the payload of this kind that was loaded. Returns an error if
+    /// they differ. Does nothing if no payload of this kind was loaded.
     async fn compare_slot(&mut self, kind: u16) -> Result<(), DeviceError> {
         let Some(slot) = self.loaded.get(&kind).copied() else { return Ok(()) };
         let address = self.unit.map.in_force + 24 * (kind - 1);
@@ -854,7 +856,7 @@ impl ModbusMachine {
     }
 }
 
-/// Status block of docs/modbus.md, as far as it is used, all of one moment.
+/// Values of the status block of docs/modbus.md that this program uses, all of one moment.
 #[derive(Debug, Clone, PartialEq)]
 struct StatusBlock {
     state: MachineState,
@@ -870,7 +872,7 @@ struct StatusBlock {
     job: Option<Job>,
     /// Token of the prepared job; 0 if there is none.
     token: u32,
-    /// Sequence number of the START whose job ended last, 0 if there is none; `outcome` says how.
+    /// Sequence number of the START whose job ended last, 0 if there is none; `outcome` is the outcome of that job.
     done: u32,
     outcome: Outcome,
     progress: (u32, u32),
@@ -932,8 +934,8 @@ struct Header {
     identity: [u8; 32],
 }
 
-/// Returns the outcome of a start according to a status. Returns `None` if the start appears not to be accepted, which
-/// must be seen twice.
+/// Returns the outcome of a start according to a status. Returns `None` if the status shows no accepted start; this
+/// counts only if a second status shows it too.
 fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
     let unknown = |why: String| Some(Reconciled::Unknown { reason: why });

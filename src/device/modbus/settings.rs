@@ -40,7 +40,7 @@ impl WordOrder {
         }
     }
 
-    /// Returns the order with the other word first.
+    /// Returns the order with the two words of a value exchanged.
     pub fn with_words_swapped(self) -> Self {
         match self {
             Self::Big => Self::Little,
@@ -50,7 +50,7 @@ impl WordOrder {
         }
     }
 
-    /// Returns the order with the other byte of each register first.
+    /// Returns the order with the two bytes of each register exchanged.
     pub fn with_bytes_swapped(self) -> Self {
         match self {
             Self::Big => Self::Badc,
@@ -235,7 +235,8 @@ impl RtuWire {
         }
     }
 
-    /// Returns in words that the port is not on this computer, and which ports are. Returns `None` if it is there.
+    /// Returns a message that the port does not exist on this computer, with the names of the existing ports. Returns
+    /// `None` if the port exists.
     pub(super) fn missing(&self) -> Option<String> {
         port::missing(&self.device)
     }
@@ -495,7 +496,7 @@ pub struct ModbusSettings {
     pub request_timeout: Duration,
     /// Number of retries of a request.
     pub retries: u32,
-    /// Time without an answer after which a request is given up, whatever the number of retries.
+    /// Time without an answer after which a request fails, independent of the number of retries.
     pub lost_after: Duration,
     /// Worst-case answer time of the machine. After an error the line is not used for this time.
     pub quarantine: Duration,
@@ -515,7 +516,7 @@ pub struct ModbusSettings {
 }
 
 impl ModbusSettings {
-    /// Returns settings for a machine on a quiet network, to be adapted field by field.
+    /// Returns default settings for a machine on an undisturbed network. Change single fields as required.
     pub fn new(line: LineAddress) -> Self {
         Self {
             line,

@@ -18,8 +18,9 @@ impl Signal {
         kept * self.scale
     }
 
-    /// Returns the cause if registers give no finite number or are out of range. The cause is the other word order, if
-    /// that one gives a good value.
+    /// Returns the probable cause of a bad value. It is the word order, if the value would be good in the other word
+    /// order. Otherwise, for a value that is not finite, it is the entry of the signal in the cell file. Returns `None`
+    /// for a good value, and for a finite value without such a cause.
     pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
         let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
         let value = self.value(words, self.word_order);

@@ -1,5 +1,5 @@
-//! One machine on a line. It is proved before its data are used, proved again each time the line was reopened, and
-//! asked again if an answer is missing.
+//! One machine on a line. Its identity is verified before its data are used, and again each time the line was reopened.
+//! A request without an answer is retried.
 //!
 //! Every request through a unit is idempotent: reads, and writes of values. There are no pulses.
 
@@ -28,7 +28,7 @@ const BUSY_PAUSE: Duration = Duration::from_millis(50);
 /// Time for which a busy machine is retried at connection. It is shorter than the time that the cell waits for the
 /// machine, so that the answer of the machine is reported.
 const CONNECT_BUSY_TIMEOUT: Duration = Duration::from_secs(15);
-/// Sentinels that prove the word order.
+/// Sentinel values of an identity block, which show the word order.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
 
@@ -42,7 +42,7 @@ pub(super) struct ModbusUnit {
     kind: MachineKind,
     retries: u32,
     lost_after: Duration,
-    /// Generation of the line on which the machine was proved.
+    /// Generation of the line on which the identity was verified; `None` if the identity must be verified.
     verified_generation: Option<u64>,
     identity: Option<Identity>,
     /// Flags of its identity.
@@ -64,7 +64,7 @@ impl ModbusUnit {
         Self { name, link, map, unit, kind, retries, lost_after, verified_generation: None, identity: None, flags: 0 }
     }
 
-    /// Returns the proved identity of the machine.
+    /// Returns the verified identity of the machine; `None` before the first verification.
     pub(super) fn identity(&self) -> Option<&Identity> {
         self.identity.as_ref()
     }
@@ -74,8 +74,8 @@ impl ModbusUnit {
         self.identity.is_some() && self.flags & OFFERS_READ_AHEAD != 0
     }
 
-    /// Returns the generation of the line on which the machine was proved, as long as that line is valid as far as
-    /// known here.
+    /// Returns the generation of the line on which the identity was verified; `None` if it must be verified again. The
+    /// line may have been lost since then without any effect here.
     pub(super) fn generation(&self) -> Option<u64> {
         self.verified_generation
     }
@@ -88,12 +88,12 @@ impl ModbusUnit {
         Writer::new(self.map.word_order)
     }
 
-    /// Discards the known identity and proves the machine again.
+    /// Discards the known identity, verifies the identity of the machine again and returns it.
     pub(super) async fn connect(&mut self) -> Result<Identity, DeviceError> {
         self.connect_within(CONNECT_BUSY_TIMEOUT).await
     }
 
-    /// Does the same as [`Self::meet`], with a limit of `busy` for a machine whose program is still starting.
+    /// Does the same as [`Self::connect`], but retries a machine whose program is still starting for the time `busy`.
     pub(super) async fn connect_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
         self.verified_generation = None;
@@ -110,18 +110,20 @@ impl ModbusUnit {
         self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), operation: "identity" })
     }
 
-    /// Reads registers, on a proved connection only.
+    /// Reads registers, after the identity of the machine was verified on this line. `what` names the operation in
+    /// errors.
     pub(super) async fn read(&mut self, what: &'static str, address: u16, count: u16) -> Result<Vec<u16>, DeviceError> {
         self.exchange(what, address, LinkRequest::Read { address, count }).await
     }
 
-    /// Writes registers, on a proved connection only. The write may be carried out more than once.
+    /// Writes registers, after the identity of the machine was verified on this line. A retry can write them more than
+    /// once.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
         self.exchange(what, address, LinkRequest::Write { address, words: words.into() }).await.map(drop)
     }
 
-    /// Sends a request once, on the proved connection that exists. For requests that may fail and that are not
-    /// essential.
+    /// Sends a request once, without a retry, for a request that may fail without consequences. Returns
+    /// [`DeviceError::NotConnected`] if the identity of the machine is not verified on the line.
     pub(super) async fn request_once(
         &mut self,
         what: &'static str,
@@ -135,8 +137,8 @@ impl ModbusUnit {
         answer.map(|(_, words)| words).map_err(|fault| self.device_error(what, address, fault))
     }
 
-    /// Sends one request. The bytes of each register have the order of the contract here, and the order of the machine
-    /// on the line.
+    /// Sends one request. Converts the bytes of each register between the order of docs/modbus.md and the order of the
+    /// machine. Returns the generation of the line and the received registers.
     async fn send(&self, generation: Option<u64>, ask: LinkRequest) -> Result<(u64, Vec<u16>), LinkFault> {
         let order = self.map.word_order;
         let ask = match ask {
@@ -149,7 +151,8 @@ impl ModbusUnit {
         Ok((generation, order.bytes_in_order(words)))
     }
 
-    /// Gives the connection up because data that came over it are invalid. Returns the error that describes them.
+    /// Drops the connection because data received over it are invalid. Returns the error for these data: `what` is
+    /// their name, `expected` and `found` are their values.
     pub(super) async fn reject_data(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
         if let Some(generation) = self.verified_generation.take() {
             // A stale generation is equally good: then another machine has given the connection up already.
@@ -158,8 +161,8 @@ impl ModbusUnit {
         DeviceError::Corrupt { machine: self.name.clone(), data: what, expected, found }
     }
 
-    /// Returns true if a request is not retried. A machine that answers that it is busy has the whole time; one that
-    /// does not answer has a few retries.
+    /// Returns true if a request must not be retried after this error. A machine that answers that it is busy is
+    /// retried until `lost_after` has passed; a machine that does not answer, at most `retries` times.
     fn is_final(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
@@ -179,8 +182,8 @@ impl ModbusUnit {
         self.request_with_retries(what, address, ask, false).await
     }
 
-    /// Sends a request with a limited number of retries, also if the machine answers that it is busy. For requests
-    /// between two reads of the status.
+    /// Sends a request with at most `retries` retries, even if the machine answers that it is busy. Used between two
+    /// reads of the status, which must not be delayed long.
     pub(super) async fn request_with_limit(
         &mut self,
         what: &'static str,
@@ -245,9 +248,9 @@ impl ModbusUnit {
         }
     }
 
-    /// Proves the identity of the machine at the far end of the present connection and returns the generation of the
-    /// line. First the identity block, which is only read. Then two random words that the machine has to invert, so
-    /// that the answer cannot be older than this moment. Then the identity block once more.
+    /// Verifies the identity of the machine and returns the generation of the line. Reads the identity block, then
+    /// writes two random words and reads back their complements, which only the machine can provide after this moment.
+    /// Then reads the identity block again; both readings must be equal.
     async fn verify_identity(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
         let read = LinkRequest::Read { address: first, count: IDENTITY_REGISTERS };
@@ -349,8 +352,8 @@ impl ModbusUnit {
     }
 }
 
-/// Returns true if the machine answers that it cannot reply now. The same answer of a gateway that finds no machine
-/// does not count.
+/// Returns true for the Modbus exceptions 5 and 6, with which a machine answers that it cannot reply now. The
+/// exceptions of a gateway that finds no machine do not count.
 fn is_starting(error: &DeviceError) -> bool {
     matches!(error, DeviceError::Exception { code: 5 | 6, .. })
 }

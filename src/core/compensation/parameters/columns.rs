@@ -4,7 +4,8 @@
 use super::{ParameterKind, SurfacePoint, WheelTerm};
 use crate::geometry::bounds;
 
-/// Minimum share of a column that remains without those before it; a column with less is a combination of them.
+/// Minimum share of a column that is orthogonal to the columns before it. A column with a smaller share counts as a
+/// combination of them and is left out.
 const MIN_INDEPENDENT_SHARE: f64 = 1e-7;
 
 /// Effect of one unit of a parameter, motion or slide at every point.
@@ -22,10 +23,10 @@ pub(super) const MOTIONS: [&str; 6] = [
     "a turn of the part about z",
 ];
 const SLIDES: [&str; 4] = [
-    "a slide that is bent along x",
-    "a slide that is bent to and fro along x",
-    "a slide that is bent along y",
-    "a slide that is bent to and fro along y",
+    "a simple bend of a slide along x",
+    "an S-shaped bend of a slide along x",
+    "a simple bend of a slide along y",
+    "an S-shaped bend of a slide along y",
 ];
 
 /// Extent of the part in x and y: its middle and half its size.
@@ -54,8 +55,8 @@ impl Extent {
     }
 }
 
-/// Returns the effect of a unit of a motion of the part: a shift along x, y, z, or a turn about x, y, z through the
-/// origin of the model frame.
+/// Returns the change of the deviation at a contact by one unit of a motion of the part. `motion` is 0 to 2 for a shift
+/// along x, y, z, and 3 to 5 for a rotation about x, y, z through the origin of the model frame.
 pub(super) fn motion_effect(contact: &SurfacePoint, motion: usize) -> f64 {
     match motion {
         0..3 => contact.normal[motion],
@@ -68,8 +69,8 @@ pub(super) fn motions(contacts: &[SurfacePoint], free: [bool; 6]) -> Vec<Column<
     (0..6).filter(|&k| free[k]).map(of).collect()
 }
 
-/// Returns the effects of slides that are not straight, guided in z: the second and the third Legendre polynomial
-/// along either axis.
+/// Returns the effects of slides, guided in z, that are not straight: the second and the third Legendre polynomial
+/// along x and along y.
 pub(super) fn slides(contacts: &[SurfacePoint], extent: &Extent) -> Vec<Column<&'static str>> {
     let of =
         |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
@@ -82,8 +83,8 @@ pub(super) fn slide_effect(contact: &SurfacePoint, extent: &Extent, k: usize) ->
 }
 
 impl ParameterKind {
-    /// Returns the effect of a unit of the parameter on the deviation at a contact; 0 for wear, which is no function
-    /// of the place.
+    /// Returns the effect of one unit of the parameter on the deviation at a contact; 0 for wear, which depends on the
+    /// progress along the path and not on the place.
     pub(super) fn effect(self, contact: &SurfacePoint, term: WheelTerm) -> f64 {
         let n = contact.normal;
         match self {

@@ -106,8 +106,8 @@ pub struct ParameterCorrections {
     /// Displacement of the surface along its normal by these corrections, at every node of the correction, in
     /// millimetres.
     pub displaced_mm: Vec<f64>,
-    /// Part of `displaced_mm` by setting and tilt: a grinder has an input for its wheel radius, but applies these
-    /// only by its map.
+    /// Part of `displaced_mm` that setting and tilt cause. A grinder has an input for its wheel radius, but can apply
+    /// setting and tilt only through its map.
     pub setting_mm: Vec<f64>,
     /// Part of `displaced_mm` that remains after registration: a map without these corrections would have to contain
     /// it.

@@ -1,8 +1,7 @@
 //! Parameters of the machine estimated from the deviations: wheel radius, setting of the wheel, tilt of the part,
 //! wear along the path.
 //!
-//! ```text
-//!  contacts --columns--> motions | slides | parameters --GLS--> value +- U --tolerance--> taken --> next Set
+//!  contacts --columns--> motions | slides | parameters --GLS--> value +- U --tolerance--> compensated --> next pass
 //!                           (nuisance)     (with a field)                     \-- beyond it: a person decides
 //! ```
 //!
@@ -46,13 +45,13 @@ pub use corrections::{ExplainedDeviation, ParameterCorrections, explained_by_par
 
 /// Minimum number of points; fewer carry no information on a dozen unknowns.
 const MIN_POINTS: usize = 30;
-/// Minimum z of a normal: the wheel comes from above.
+/// Minimum z component of a normal: the wheel comes from above.
 const MIN_NZ: f64 = 0.05;
 /// Minimum share of a column that is independent of the others; a column with less is not separable from them.
 const MIN_OWN_SHARE: f64 = 0.02;
-/// Expanded over standard uncertainty.
+/// Coverage factor: ratio of the expanded to the standard uncertainty.
 const COVERAGE_FACTOR: f64 = 2.0;
-/// Mean square effect below which a column is rounding.
+/// Mean square of the effect of a column, in mm², below which the column contains only rounding errors.
 const MIN_EFFECT_MM2: f64 = 1e-18;
 /// Number of trial strengths of the prior of values without a tolerance, from the rms of the deviations down to
 /// [`MIN_STRENGTH_SHARE`] of it.
@@ -175,7 +174,7 @@ pub struct EstimatedParameter {
     pub kind: ParameterKind,
     /// Value in millimetres or radians; 0 if it is not separable.
     pub value: f64,
-    /// Standard uncertainty of the value in the same unit; 0 if it is not separable.
+    /// Standard uncertainty of the value, in the same unit; 0 if it is not separable.
     pub sigma: f64,
     /// Share of its effect that nothing else in the fit explains, from 0 to 1.
     pub own_share: f64,
@@ -185,7 +184,7 @@ pub struct EstimatedParameter {
     pub is_offered: bool,
     /// Value to compensate; 0 if it is not offered, or has no tolerance.
     pub compensated: f64,
-    /// True if `taken` exceeds the tolerance, so that a person must decide.
+    /// True if `compensated` exceeds the tolerance, so that a person must decide.
     pub exceeds_tolerance: bool,
     /// Reduction of the root mean square by its correction, together with the others that are offered, in
     /// millimetres; 0 if it is not offered.
@@ -201,7 +200,7 @@ pub struct ParameterEstimation {
     pub estimates: Vec<EstimatedParameter>,
     /// Root mean square of the deviations without the part that the free motions explain, in millimetres.
     pub rms_mm: f64,
-    /// Root mean square of `rest_mm`, in millimetres: as `rms_mm`, but also without the offered parameters.
+    /// Root mean square of `residuals_mm`, in millimetres: as `rms_mm`, but also without the offered parameters.
     pub residual_rms_mm: f64,
     /// Residual at every point after correction of the offered parameters and a new registration, in millimetres:
     /// form and noise.
@@ -210,12 +209,12 @@ pub struct ParameterEstimation {
     pub explained: ExplainedDeviation,
 }
 
-/// Error that prevents the separation of parameters.
+/// Reason why the parameters cannot be estimated.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ParameterError {
-    #[error("{points} points do not separate parameters from form; measure at least {MIN_POINTS}")]
+    #[error("{points} points are too few to separate parameters from form; measure at least {MIN_POINTS}")]
     TooFew { points: usize },
     #[error(
         "point {} has a coordinate, normal or deviation that is not finite; do not use this measurement",
@@ -337,12 +336,12 @@ struct Columns {
     candidates: Vec<Column<ParameterKind>>,
 }
 
-/// Fitted values of the columns that are no combinations of others.
+/// Fitted values of slides and candidates.
 struct ColumnFit {
     /// Value of each slide and, after them, of each candidate; 0 if it was not fitted.
     values: DVector<f64>,
     covariance: DMatrix<f64>,
-    /// Root mean square of the effect of a unit of each.
+    /// Root mean square over the points of the effect of one unit of each column, in the order of `values`.
     sizes: Vec<f64>,
     rms_mm: f64,
     slides: usize,
@@ -353,8 +352,8 @@ impl Columns {
         self.motions.iter().chain(&self.slides).map(|c| &c.values)
     }
 
-    /// Returns which candidates are separable from motions, slides and each other (of two with the same effect, the
-    /// first is), and the share of each that is independent of motions, slides and the other separable candidates.
+    /// Returns for each candidate whether it is separable from motions, slides and the other separable candidates, and
+    /// the share of it that is independent of these. Of two candidates with the same effect, the first is separable.
     fn separability(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
@@ -373,7 +372,7 @@ impl Columns {
         (told.iter().zip(&shares).map(|(told, share)| *told && *share > MIN_OWN_SHARE).collect(), shares)
     }
 
-    /// Fits slides and candidates together with the motions and a field.
+    /// Fits slides and candidates together with the motions and a field. `told[k]` is true if candidate k is separable.
     fn fitted(
         &self,
         contacts: &[SurfacePoint],
@@ -416,7 +415,8 @@ impl Columns {
         Ok(ColumnFit { values, covariance, sizes, rms_mm, slides })
     }
 
-    /// Returns the estimates for motions and for the chosen columns, in units of these.
+    /// Returns the estimates for the motions in `unseen`, an orthonormal basis, and for the chosen columns, in units of
+    /// these columns.
     fn effects(
         &self,
         contacts: &[SurfacePoint],
@@ -460,7 +460,7 @@ impl Columns {
 }
 
 impl ColumnFit {
-    /// Returns the estimate of each parameter, without its message and `removes_rms_mm`.
+    /// Returns the estimate of each parameter, without its message and `rms_reduction_mm`.
     fn parameters(
         &self,
         alike: Vec<Vec<String>>,
@@ -497,7 +497,8 @@ impl ColumnFit {
         found
     }
 
-    /// Returns the expectation of the chosen parameters, given the stated variance of each: T (T + S)^-1 b.
+    /// Returns the expectation of the chosen parameters: T (T + S)^-1 b, with their fitted values b, the covariance S
+    /// of b, and the diagonal matrix T of the prior variances. `chosen` holds the index and the prior variance of each.
     fn expected(&self, chosen: &[(usize, f64)]) -> DVector<f64> {
         let at = |k: usize| self.slides + chosen[k].0;
         let n = chosen.len();
@@ -507,11 +508,12 @@ impl ColumnFit {
         solved.map_or_else(|| DVector::zeros(n), |solved| DVector::from_fn(n, |k, _| chosen[k].1 * solved[k]))
     }
 
-    /// Returns the expectation of all slides and parameters together. The prior of a parameter with a tolerance is
-    /// this tolerance. The others share one prior strength, which their values determine.
+    /// Returns the expectation of all slides and parameters together. The prior of a parameter with a tolerance is this
+    /// tolerance. The others share one prior strength, which their values determine.
     ///
-    /// Equation: T (T + S)^-1 b, as the mean over strengths from a small share up to all of the rms, each weighted by
-    /// its likelihood of b (empirical Bayes, Morris 1983).
+    /// Equation: T (T + S)^-1 b, with the fitted values b, their covariance S and the diagonal matrix T of the prior
+    /// variances. The result is the mean over prior strengths from a small share of the rms up to the whole rms, each
+    /// weighted by its likelihood given b (empirical Bayes, Morris 1983).
     fn joint_expectation(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);

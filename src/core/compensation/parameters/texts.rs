@@ -5,7 +5,8 @@ use nalgebra::{DMatrix, DVector};
 use super::columns::dot;
 use super::{COVERAGE_FACTOR, EstimatedParameter, MIN_EFFECT_MM2, ParameterKind, ParameterOptions};
 
-/// Minimum share, relative to the largest, with which another column is named as a cause of an inseparable one.
+/// Minimum share of another column in an inseparable column, relative to the largest share, at which a message names
+/// it.
 const MIN_NAMED_SHARE: f64 = 0.2;
 pub(super) const UNSTATED_LOCKED_SIGMA: &str =
     "the uncertainty of the datum, which is not stated (registration.lock_uncertainty_um)";
@@ -34,7 +35,7 @@ impl ParameterKind {
         if self.is_angle() { "urad" } else { "um" }
     }
 
-    /// Returns the number of these units in one unit of the parameter's value (radian or millimetre).
+    /// Returns the factor from the parameter's value, in radians or millimetres, to the unit of messages.
     pub fn display_units_per_unit(self) -> f64 {
         if self.is_angle() { 1e6 } else { 1e3 }
     }
@@ -53,7 +54,7 @@ impl ParameterKind {
     }
 }
 
-/// Returns the names of the columns that make up most of a column.
+/// Returns the names of at most three of the `others` that contribute most to the column `target`.
 pub(super) fn inseparable_names(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
     let size = dot(target, target).sqrt();
     if size * size <= MIN_EFFECT_MM2 * target.len() as f64 {

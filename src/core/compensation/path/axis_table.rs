@@ -15,8 +15,8 @@ const STEPS: usize = 40;
 
 /// Returns the offset of Z at every node of a grid over the axes X and Y, in millimetres; positive leaves material.
 ///
-/// At some nodes the wheel would touch the extrapolated surface far from the part, and it need not fit there. If the
-/// wheel cannot touch at a node, the node takes the offset of the nearest node with a solution.
+/// The grid can extend beyond the part, where the surface is extrapolated and the wheel may not fit. A node at which
+/// the wheel cannot touch takes the offset of the nearest node with a solution.
 ///
 /// # Errors
 /// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.

@@ -44,8 +44,8 @@ pub enum PathError {
     )]
     Body { x_mm: f64, y_mm: f64, at_x_mm: f64, at_y_mm: f64, depth_mm: f64, limit_mm: f64 },
     #[error(
-        "{refused}; tilted by {angle_deg}°, right-handed about the axis that {letter} turns about, this wheel \
-         reaches everywhere: write [grinding.tilt] with angle_deg = {angle_deg:?}"
+        "{refused}; with a tilt of {angle_deg}° (right-handed about the axis of {letter}) this wheel can grind the \
+         whole part: write [grinding.tilt] with angle_deg = {angle_deg:?}"
     )]
     NeedsTilt { refused: Box<PathError>, letter: char, angle_deg: f64 },
     #[error(
@@ -58,7 +58,7 @@ pub enum PathError {
          ground from above"
     )]
     TiltBelow,
-    #[error("a table of Z over X and Y cannot describe a tilted wheel; grind by the program")]
+    #[error("a table of Z over X and Y cannot describe a tilted wheel; send the program instead of the table")]
     TableOfTilted,
     #[error(
         "the wheel would be tilted to {letter} {found_deg:.3}° at x {x_mm:.3}, y {y_mm:.3} mm, outside the \
@@ -102,8 +102,8 @@ pub enum PathError {
 }
 
 impl PathError {
-    /// Returns true if only our own path planning fails. A controller that makes its own path from the correction map
-    /// may still be able to grind the part.
+    /// Returns true if only the path planning of this program fails. A controller that plans its own path from the
+    /// correction map may still be able to grind the part.
     pub fn is_planning_failure(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }

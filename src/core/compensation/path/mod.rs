@@ -1,10 +1,9 @@
 //! Tool path of the wheel over the target surface: tracks over the part, positions of the wheel's centre along the
 //! tracks, and the checks that a path must pass before a program is written from it.
 //!
-//! ```text
-//!  Nominal --height_of--> Field --+
-//!                                 +-- Wanted (points, normals of target) --ToolPath--> Moves --> program
-//!  Correction --spline--> Field --+      Wheel (position of its centre) --/      \--> Summary, checked against limits
+//!  Nominal --nominal_height_field--> HeightField --+
+//!                                                  +-- TargetSurface --ToolPath--> Moves --> program
+//!  Correction --correction_spline--> HeightField --+       Wheel -------/     \--> PathSummary, checked against limits
 //! ```
 //!
 //! The module is pure: no I/O and no clock. Frame: everything is in the model frame {M}, with z away from the part.

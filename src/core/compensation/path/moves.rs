@@ -33,7 +33,7 @@ pub enum Move {
     RapidTilted {
         /// End place in x and y.
         to_mm: [f64; 2],
-        /// How far the head is turned there, right-handed.
+        /// Tilt of the head at the end, right-handed, in rad.
         tilt_rad: f64,
     },
     /// Straight move at a feed while the head rotates in proportion.
@@ -41,7 +41,7 @@ pub enum Move {
         /// End point, in millimetres: of the wheel's centre if the control compensates the pivot, otherwise of the
         /// slides.
         to: Point,
-        /// How far the head is turned there, right-handed.
+        /// Tilt of the head at the end, right-handed, in rad.
         tilt_rad: f64,
         /// Feed of the wheel's centre.
         feed_mm_min: f64,
@@ -90,12 +90,12 @@ struct SpanWalk {
 }
 
 impl ToolPath {
-    /// Returns the moves of the wheel's centre, from the first rapid move to the last.
+    /// Returns all moves of the path, from the first rapid move to the last.
     pub fn moves(&self) -> Moves<'_> {
         Moves::new(self, 0, self.track_count())
     }
 
-    /// Returns the same moves track by track. Each track ends at the safe height.
+    /// Returns all moves of the path, track by track. Each track ends at the safe height.
     pub fn moves_by_track(&self) -> Vec<Moves<'_>> {
         (0..self.track_count()).map(|k| Moves::new(self, k, k + 1)).collect()
     }
@@ -115,7 +115,7 @@ impl<'a> Moves<'a> {
         SpanWalk { span, to, t: from, step, at: self.path.wheel_position(&span, from) }
     }
 
-    /// Converts a move as seen from the wheel's side into the model frame.
+    /// Converts a move from the frame of the wheel's side, mirrored for a wheel from below, into the model frame.
     #[inline]
     fn to_model_frame(&self, given: Move) -> Move {
         let upright = |z| self.path.flipped_height_mm(z);
@@ -185,7 +185,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the rapid move to the place above the first point of a track.
+    /// Returns the rapid move, at the safe height, to the place above the first point of a track.
     fn over(&self, walk: &SpanWalk) -> Move {
         let to_mm = [walk.at.programmed_point.x, walk.at.programmed_point.y];
         match self.path.options().tilt {

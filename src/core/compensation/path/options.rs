@@ -56,8 +56,8 @@ pub struct PathOptions {
     pub rotary: Option<RotaryAxis>,
     /// Tilt of the wheel about this axis. With `None` the axis does not move, and programs do not contain it.
     pub tilt: Option<TiltMode>,
-    /// True if the wheel comes from -z. The surface and the wheel (spindle, heights) are then given as seen from
-    /// there, mirrored in z. The moves of the path are in the model frame.
+    /// True if the wheel comes from -z. The surface and the wheel (spindle, heights) are then given mirrored in z, as
+    /// seen from that side. The moves of the path are in the model frame.
     pub from_below: bool,
     /// Pattern of the tracks.
     pub pattern: TrackPattern,
@@ -143,8 +143,8 @@ impl PathOptions {
         self.check_tilt()
     }
 
-    /// Rejects a tilt that is not possible: no rotary axis, a wheel from below, an angle that is not finite, or a
-    /// following tilt that keeps the pole of a ball on the surface.
+    /// Rejects a tilt that is not possible: without a rotary axis, for a wheel from below, at an angle that is not
+    /// finite, or with a lead at which a ball touches the surface with its pole.
     fn check_tilt(&self) -> Result<(), PathError> {
         let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {

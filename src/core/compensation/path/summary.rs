@@ -35,7 +35,7 @@ impl MachineLimits {
         }
     }
 
-    /// Returns the feed whose run-up takes this distance, in mm/min.
+    /// Returns the highest feed that is reached from standstill within this distance, in mm/min.
     fn feed_for_run_up(&self, way_mm: f64) -> f64 {
         let (mut low, mut high) = (0.0, 1.0);
         while self.run_up_mm(high) < way_mm && high < 1e9 {

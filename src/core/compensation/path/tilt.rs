@@ -226,8 +226,8 @@ impl PathOptions {
         StepDeviation { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
     }
 
-    /// Returns how far the slides must be above the highest place of the wheel's centre, for any angle of the head, in
-    /// mm.
+    /// Returns the largest rise of the slides above the wheel's centre for any angle of the head, in mm; 0 for a wheel
+    /// without tilt.
     pub(super) fn lift_mm(&self) -> f64 {
         self.tilting_axis().map_or(0.0, RotaryAxis::max_lift_mm)
     }

@@ -35,15 +35,15 @@ pub(super) fn track_mm(wanted: &TargetSurface, outline: &Aperture, options: &Pat
     }
 }
 
-/// Returns true if the wheel fits at a few places. This quick test finds most wheels that do not fit.
+/// Returns true if the wheel fits at a few places of the part. This quick test finds most wheels that do not fit.
 pub(super) fn may_fit(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> bool {
     const FEW: usize = 21;
     places(outline, FEW).iter().all(|place| fit_at(&wanted.curvature_at(*place), *place, outline, options).is_ok())
 }
 
-/// Returns the smaller distance or, if the wheel is rejected, the more useful error. The narrowest hollow comes first,
-/// because it gives the wheel that fits everywhere. Otherwise it is the first error, so that the same path always
-/// gives the same message.
+/// Combines the results at two places. Returns the smaller distance, or an error if there is one. Of two hollows the
+/// narrower one is returned, because it gives the wheel that fits everywhere. Of other errors the first one is
+/// returned, so that the same path always gives the same message.
 fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
     let room = |e: &PathError| match e {
         PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
@@ -105,14 +105,15 @@ fn fit_at(
     Ok((8.0 * height / groove.curvature_per_mm).sqrt() / groove.stretch)
 }
 
-/// Returns the wheel's curvature in the directions of a bend, in 1/mm: along, mixed, across.
+/// Returns the wheel's curvature in the tangent directions of `bend`, in 1/mm: along the first, mixed, along the
+/// second.
 pub(super) fn wheel_curvatures(bend: &SurfaceCurvature, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
     let [c, s] = [0, 1].map(|k| direction.dot(&bend.tangents[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
 }
 
-/// Returns the error for the direction in which the wheel fits least.
+/// Returns the error for the direction in which the wheel has the least room in the hollow.
 fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
     let in_direction = |q: &[f64; 3], angle: f64| {
         let (s, c) = angle.sin_cos();

@@ -117,7 +117,7 @@ fn student_quantiles_match_tables() {
 fn sessions_refuse_mismatch() {
     let points = || Observations::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
     let odd = Sessions::new(points(), vec![1]).err().unwrap().to_string();
-    assert_eq!(odd, "2 points and 1 numbers of their sessions do not match");
+    assert_eq!(odd, "2 points and 1 session numbers do not match; give one session number for each point");
     let one =
         Sessions::new(points(), vec![4, 4]).unwrap().between_session_variance(&Prior::for_size(10.0)).err().unwrap();
     assert!(one.to_string().contains("1 session; at least 2 are required"), "{one}");

@@ -13,21 +13,22 @@ use super::error::{self, DefinitionError};
 /// Largest power of an asphere.
 const MAX_POWER: u32 = 60;
 
-/// A conic of revolution about z, its vertex at the origin; a sphere has the conic constant 0, a plane no curvature.
+/// Conic of revolution about z with its vertex at the origin. A sphere has the conic constant 0, and a plane the
+/// curvature 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Conic {
     curvature_per_mm: f64,
     conic: f64,
 }
 
-/// A conic as written.
+/// Definition of a conic in a file.
 ///
 /// Units: millimetres; the conic constant has none.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ConicDefinition {
-    /// Radius of curvature at the vertex, positive with the centre at +z; `inf` for none.
+    /// Radius of curvature at the vertex, positive if the centre is at +z; `inf` for a flat surface.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant k: 0 sphere, -1 paraboloid, less than -1 hyperboloid.
@@ -39,7 +40,7 @@ impl Conic {
     /// The plane z = 0.
     pub const PLANE: Self = Self { curvature_per_mm: 0.0, conic: 0.0 };
 
-    /// Makes a conic from its radius, which may be infinite, and its conic constant.
+    /// Creates a conic from its radius of curvature in millimetres, which may be infinite, and its conic constant.
     ///
     /// # Errors
     /// A radius that is NaN or less than 1e-6 mm in magnitude, or a conic constant that is not finite.
@@ -53,7 +54,7 @@ impl Conic {
         self.curvature_per_mm
     }
 
-    /// Returns the sag and its derivative, both with respect to q = h^2; none at the conic's edge and beyond.
+    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the conic and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -76,27 +77,27 @@ impl TryFrom<&ConicDefinition> for Conic {
     }
 }
 
-/// Checks the conic that polynomials are added to; none is the plane.
+/// Returns the checked conic that polynomials are added to; the plane if no conic is given.
 pub(super) fn base_conic(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
     written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.in_table("base")))
 }
 
-/// A conic and a sum of powers of the distance from the axis, ISO 10110-12.
+/// Asphere: a conic plus a sum of powers of the distance from the axis, ISO 10110-12.
 ///
-/// Powers from 2 up are allowed, odd ones too; power 1 would make a point on the axis.
+/// Even and odd powers from 2 up are allowed. Power 1 would make a peak on the axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Asphere {
     base: Conic,
-    /// Power and coefficient, in mm^(1 - power).
+    /// Power and coefficient of each term; the unit of the coefficient is mm^(1 - power).
     terms: Vec<(u32, f64)>,
 }
 
-/// An asphere as written.
+/// Definition of an asphere in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct AsphereDefinition {
-    /// Radius of curvature at the vertex in millimetres, positive with the centre at +z; `inf` for none.
+    /// Radius of curvature at the vertex in millimetres, positive if the centre is at +z; `inf` for a flat surface.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant.
@@ -108,7 +109,7 @@ pub struct AsphereDefinition {
 }
 
 impl Asphere {
-    /// Makes an asphere from its conic and its (power, coefficient) terms.
+    /// Creates an asphere from its conic and its (power, coefficient) terms.
     ///
     /// # Errors
     /// A power below 2 or above 60 or given twice, or a coefficient that is not finite.
@@ -128,7 +129,7 @@ impl Asphere {
         Ok(Self { base, terms: sorted })
     }
 
-    /// Returns the sag and its derivative, both with respect to q = h^2; none at the conic's edge and beyond.
+    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the conic and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -142,7 +143,7 @@ impl Asphere {
         Some((sag, slope))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }
@@ -158,7 +159,8 @@ impl TryFrom<&AsphereDefinition> for Asphere {
     }
 }
 
-/// Reads a table of coefficients whose keys are numbers, with or without a letter before them.
+/// Reads coefficients whose keys are numbers, each with or without `letter` before it. `table` is the name of their
+/// table, and `expected` describes a key for error messages.
 pub(super) fn parse_coefficients(
     table: &str,
     letter: char,

@@ -1,4 +1,4 @@
-//! A nominal surface as written in TOML, and checked.
+//! Nominal surface given by a formula: its definition in TOML, and the checks of this definition.
 //!
 //! ```toml
 //! [surface]
@@ -32,23 +32,23 @@ use super::toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 use super::zernike::{Zernike, ZernikeDefinition};
 use crate::geometry::Aperture;
 
-/// How exact a sampling is when nothing is said about it, in nanometres.
+/// Maximum error of a sampling if the definition does not state it, in nanometres.
 const DEFAULT_ACCURACY_NM: f64 = 0.1;
 
-/// A nominal surface as written.
+/// Definition of a nominal surface in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SurfaceDefinition {
     /// The formula.
     pub surface: Formula,
-    /// The outline, in the surface's own frame.
+    /// The outline of the part, in the frame of the surface.
     pub aperture: Aperture,
     /// Sampling of the surface. Default: an accuracy of 0.1 nm.
     pub sampling: Option<SamplingDefinition>,
 }
 
-/// A formula as written; `kind` selects its form.
+/// Formula of a surface in a file; `kind` selects its form.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case")]
@@ -59,9 +59,9 @@ pub enum Formula {
     Sphere(SphereDefinition),
     /// A conic of revolution.
     Conic(ConicDefinition),
-    /// A conic and powers of the distance from the axis.
+    /// A conic plus powers of the distance from the axis.
     Asphere(AsphereDefinition),
-    /// A section of one of the others, away from its axis.
+    /// A section of a surface of another kind, away from its axis.
     OffAxis(OffAxisDefinition),
     /// A curve rotated about a line.
     Toroid(ToroidDefinition),
@@ -77,7 +77,7 @@ pub enum Formula {
     Qbfs(QbfsDefinition),
 }
 
-/// The kinds of [`Formula`] that a section may be cut from, for the schema alone: all but the section itself.
+/// Kinds of [`Formula`] from which a section can be cut: all except the section itself. Used only for the schema.
 #[cfg(feature = "schema")]
 #[derive(schemars::JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
@@ -95,8 +95,8 @@ pub(super) enum WholeFormula {
     Qbfs(QbfsDefinition),
 }
 
-/// [`Formula`] with its kind as the key of an inner table. A reader that must look for `kind` first buffers the other keys,
-/// and so loses their places in the text; this one keeps them, for messages with line and column.
+/// [`Formula`] whose kind is the key of an inner table. A reader that must find `kind` first would buffer the other
+/// keys and lose their places in the text. This form keeps the places, for messages with line and column.
 #[derive(Deserialize)]
 #[serde(remote = "Formula", rename_all = "kebab-case")]
 enum FormulaByKind {
@@ -113,7 +113,7 @@ enum FormulaByKind {
     Qbfs(QbfsDefinition),
 }
 
-/// [`Aperture`] with its kind as the key of an inner table.
+/// [`Aperture`] whose kind is the key of an inner table, see [`FormulaByKind`].
 #[derive(Deserialize)]
 #[serde(remote = "Aperture", rename_all = "kebab-case", deny_unknown_fields)]
 enum ApertureByKind {
@@ -144,23 +144,23 @@ enum ApertureByKind {
     },
 }
 
-/// A plane as written: it has no numbers.
+/// Definition of a plane in a file: it has no keys.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PlaneDefinition {}
 
-/// A sphere as written.
+/// Definition of a sphere in a file.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SphereDefinition {
-    /// Radius in millimetres, positive with the centre at +z.
+    /// Radius in millimetres, positive if the centre is at +z.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
 }
 
-/// Sampling of a surface, as written: one of the two keys.
+/// Sampling of a surface in a file: one of the two keys.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -171,22 +171,22 @@ pub struct SamplingDefinition {
     pub accuracy_nm: Option<f64>,
 }
 
-/// How finely a surface is sampled.
+/// Rule for the node spacing of a sampling.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Sampling {
-    /// With nodes at this distance along x and y.
+    /// Nodes with this spacing along x and y.
     Spacing {
-        /// The distance in millimetres.
+        /// Distance between nodes in millimetres.
         spacing_mm: f64,
     },
-    /// With nodes so near that the surface between them is this exact.
+    /// Nodes so dense that the surface between them has at most this error.
     Accuracy {
-        /// The largest error in millimetres.
+        /// Maximum error in millimetres.
         accuracy_mm: f64,
     },
 }
 
-/// A nominal surface, checked: the formula has a value everywhere in the aperture.
+/// Nominal surface given by a formula, checked: the formula has a value everywhere in the aperture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DefinedSurface {
     formula: AnalyticSurface,
@@ -195,10 +195,10 @@ pub struct DefinedSurface {
 }
 
 impl SurfaceDefinition {
-    /// Reads a definition as written.
+    /// Reads a definition from TOML text.
     ///
     /// # Errors
-    /// Text that is no TOML, or a key that is missing, unknown or of the wrong type, with line and column.
+    /// An error with line and column if the text is not TOML, or if a key is missing, unknown or of the wrong type.
     pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         let in_text = |error: toml::de::Error| toml_error(text, error.span(), error.message());
         let mut tables = DeTable::parse(text).map_err(in_text)?.into_inner();
@@ -221,10 +221,10 @@ impl SurfaceDefinition {
         })
     }
 
-    /// Checks the definition.
+    /// Checks the definition, and returns the surface.
     ///
     /// # Errors
-    /// Whatever is wrong with a value, by key, with the limit and a remedy.
+    /// The first value that is not valid, with its key, the limit and a remedy.
     pub fn resolve(&self) -> Result<DefinedSurface, DefinitionError> {
         let formula = self.surface.resolve().map_err(|error| error.in_table("surface"))?;
         let sampling = match &self.sampling {
@@ -236,10 +236,10 @@ impl SurfaceDefinition {
 }
 
 impl Formula {
-    /// Checks the numbers of the formula.
+    /// Checks the numbers of the formula, and returns the surface.
     ///
     /// # Errors
-    /// Whatever is wrong with a value, its key relative to the formula's table.
+    /// The first value that is not valid; its key is relative to the table of the formula.
     pub fn resolve(&self) -> Result<AnalyticSurface, DefinitionError> {
         Ok(match self {
             Self::Plane(PlaneDefinition {}) => AnalyticSurface::Conic(Conic::PLANE),
@@ -258,7 +258,7 @@ impl Formula {
 }
 
 impl SamplingDefinition {
-    /// Checks the numbers.
+    /// Checks the numbers, and returns the rule for the node spacing.
     fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
             (Some(spacing), None) => {
@@ -281,8 +281,8 @@ impl DefinedSurface {
     /// Joins a formula with its aperture, both in the surface's own frame.
     ///
     /// # Errors
-    /// An aperture that is no outline, that reaches beyond the normalisation radius or where the formula has no value, or
-    /// that misses an off-axis section.
+    /// An aperture that is not a valid outline, that reaches beyond the normalisation radius or to places where the
+    /// formula has no value, or that does not contain the centre of an off-axis section.
     pub fn new(formula: AnalyticSurface, aperture: Aperture, sampling: Sampling) -> Result<Self, DefinitionError> {
         aperture.validate()?;
         if let AnalyticSurface::OffAxis(section) = &formula {
@@ -305,10 +305,10 @@ impl DefinedSurface {
         Ok(Self { formula, aperture, sampling })
     }
 
-    /// Reads and checks a definition.
+    /// Reads and checks a definition in TOML text.
     ///
     /// # Errors
-    /// Whatever is wrong with the text or with a value, with line and column.
+    /// The first error in the text or in a value, with line and column.
     pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| with_location(text, error))
     }
@@ -323,20 +323,21 @@ impl DefinedSurface {
         &self.aperture
     }
 
-    /// Returns how finely the surface is to be sampled.
+    /// Returns the rule for the node spacing.
     pub fn sampling(&self) -> Sampling {
         self.sampling
     }
 }
 
-/// Adds line and column to an error of value, where its key stands in the text; else the error stays as it is.
+/// Adds line and column to an error about a value if the text contains its key; otherwise returns the error unchanged.
 fn with_location(text: &str, error: DefinitionError) -> DefinitionError {
     let Some(span) = error.key().and_then(|key| key_span(text, &key)) else { return error };
     let (line, column) = line_and_column(text, span.start);
     DefinitionError::Located { line, column, source: Box::new(error) }
 }
 
-/// Returns where the value of a key stands; for one that is not in the text, its innermost table that is.
+/// Returns the place in the text of the value of a key. If the text does not contain the key, returns the place of the
+/// innermost table on its path; `None` if there is no such table.
 fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     let root = DeTable::parse(text).ok()?;
     let mut table = root.get_ref();
@@ -352,7 +353,7 @@ fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     found
 }
 
-/// Turns `{ kind = "a", b = 1 }` into `{ a = { b = 1 } }`, every part at its place in the text.
+/// Converts `{ kind = "a", b = 1 }` to `{ a = { b = 1 } }`. Every part keeps its place in the text.
 fn deserialize_by_kind<'t>(
     text: &str,
     name: &str,
@@ -374,13 +375,13 @@ fn deserialize_by_kind<'t>(
     Ok(ValueDeserializer::from(Spanned::new(span, DeValue::Table(outer))))
 }
 
-/// Makes an error of the text.
+/// Returns an error at a place of the text; at its start if `span` is `None`.
 fn toml_error(text: &str, span: Option<Range<usize>>, message: &str) -> DefinitionError {
     let (line, column) = line_and_column(text, span.map_or(0, |span| span.start));
     DefinitionError::Toml { line, column, message: message.to_owned() }
 }
 
-/// Returns line and column of a byte, both from 1, the column in characters.
+/// Returns line and column of a byte, both counted from 1. Columns are counted in characters.
 fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
@@ -509,7 +510,7 @@ mod tests {
             ("spacing_mm = 0.5", "spacing_mm = -0.5", (10, 14), ["sampling.spacing_mm", "-0.5"]),
             ("spacing_mm = 0.5", "accuracy_nm = inf", (10, 15), ["sampling.accuracy_nm", "inf"]),
             ("spacing_mm = 0.5", "", (9, 2), ["spacing_mm", "accuracy_nm"]),
-            ("spacing_mm = 0.5", "spacing_mm = 0.5\naccuracy_nm = 1", (9, 2), ["has 2", "keep one"]),
+            ("spacing_mm = 0.5", "spacing_mm = 0.5\naccuracy_nm = 1", (9, 2), ["has 2", "exactly one"]),
             ("radius_mm = 20", "radius_mm = 100", (5, 2), ["not defined", "aperture"]),
         ] {
             let error = changed(from, to).unwrap_err();

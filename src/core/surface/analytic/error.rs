@@ -1,27 +1,27 @@
-//! Why a surface could not be defined or sampled.
+//! Errors of the definition and the sampling of a surface.
 
 use thiserror::Error;
 
 use crate::geometry::ApertureError;
 
-/// Why a nominal surface given by a formula could not be defined or sampled.
+/// Reason why a nominal surface given by a formula cannot be defined or sampled.
 ///
 /// A key is written as the path in the definition, such as `surface.radius_mm`; lines and columns count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum DefinitionError {
-    /// The text is no TOML, or a key is missing, unknown or of the wrong type.
+    /// The text is not TOML, or a key is missing, unknown or of the wrong type.
     #[error("line {line}, column {column}: {message}")]
     Toml { line: usize, column: usize, message: String },
-    /// An error of value, with the place where the value stands.
+    /// Error about a value, with the place of the value in the text.
     #[error("line {line}, column {column}: {source}")]
     Located { line: usize, column: usize, source: Box<DefinitionError> },
-    /// A number lies outside what the formula can take; value and limit are in the unit that the key ends with.
+    /// A number is outside its range. The value and the limit are in the unit at the end of the key.
     #[error("`{key}` is {value}; it must be {limit}; {remedy}")]
     OutOfRange { key: String, value: f64, limit: &'static str, remedy: &'static str },
-    /// A coefficient's key is no power or index of this formula.
-    #[error("`{key}` names no term; {expected}")]
+    /// The key of a coefficient is not a power or index of this formula.
+    #[error("`{key}` is not a term of this formula; {expected}")]
     Term { key: String, expected: &'static str },
     /// Two coefficients are given for one term.
     #[error("`{key}` is given twice; add the two coefficients, or remove one")]
@@ -37,17 +37,17 @@ pub enum DefinitionError {
          less than the parent's radial extent"
     )]
     SectionOffParent { x_mm: f64, y_mm: f64 },
-    /// In the parent's frame, the aperture misses the section.
+    /// The aperture does not contain the centre of the section, in the parent's frame.
     #[error(
         "the aperture does not contain the section's centre ({x_mm} mm, {y_mm} mm); with `frame = \"parent\"` the \
          aperture is in the parent's frame: write `centre_mm = [{x_mm}, {y_mm}]`, or choose the frame \"shifted\" or \
          \"tilted\""
     )]
     SectionOutsideAperture { x_mm: f64, y_mm: f64 },
-    /// The outline is none.
+    /// The outline of the aperture is not valid.
     #[error("in [aperture]: {0}")]
     Aperture(#[from] ApertureError),
-    /// The aperture reaches beyond the disc on which the polynomials are meant.
+    /// The aperture extends beyond the disc on which the polynomials are defined.
     #[error(
         "the aperture reaches {reach_mm} mm from the axis, beyond `surface.normalisation_radius_mm`, which is \
          {limit_mm} mm; the polynomials are not valid there: make the aperture smaller, or fit the coefficients to a \
@@ -60,10 +60,10 @@ pub enum DefinitionError {
          smaller, or check the radii and conic constants"
     )]
     NotDefined { x_mm: f64, y_mm: f64 },
-    /// Both ways of choosing the spacing are given, or none.
-    #[error("[sampling] requires either `spacing_mm` or `accuracy_nm`, and has {count} of them; keep one")]
+    /// Both keys that choose the spacing are given, or neither.
+    #[error("[sampling] has {count} of the keys `spacing_mm` and `accuracy_nm`; give exactly one of them")]
     Sampling { count: usize },
-    /// The sampling would be too large.
+    /// The sampling would have too many nodes.
     #[error(
         "a spacing of {spacing_mm} mm makes {nodes:.3e} nodes; at most {limit:.0e} are allowed: choose a coarser spacing, or \
          a less strict `accuracy_nm`"
@@ -71,11 +71,12 @@ pub enum DefinitionError {
     TooManyNodes { spacing_mm: f64, nodes: f64, limit: f64 },
     /// The sampling would take too long.
     #[error(
-        "{nodes:.3e} nodes of a formula and an outline of {terms} terms are {work:.1e} steps; at most {limit:.0e} are \
+        "{nodes:.3e} nodes with {terms} terms of formula and outline need {work:.1e} steps; at most {limit:.0e} are \
          allowed: choose a coarser spacing, fewer terms or fewer corners"
     )]
     TooMuchWork { nodes: f64, terms: usize, work: f64, limit: f64 },
-    /// No spacing is fine enough; reached is twice the largest error found at the finest spacing tried.
+    /// No spacing gives the accuracy. `reached_nm` is twice the largest error found at the smallest spacing that was
+    /// tried.
     #[error(
         "the accuracy of {accuracy_nm} nm cannot be reached: at a spacing of {spacing_mm} mm the error is still \
          {reached_nm} nm; raise `accuracy_nm`, or keep the aperture away from places where the surface becomes \
@@ -85,7 +86,7 @@ pub enum DefinitionError {
 }
 
 impl DefinitionError {
-    /// A number outside its limits.
+    /// Returns the error for a number outside its limits.
     pub(super) fn out_of_range(key: &str, value: f64, limit: &'static str, remedy: &'static str) -> Self {
         Self::OutOfRange { key: key.to_owned(), value, limit, remedy }
     }
@@ -102,7 +103,8 @@ impl DefinitionError {
         self
     }
 
-    /// Returns the path of the key the error is about, such as `surface.radius_mm`; none for text that is no TOML.
+    /// Returns the path of the key that the error is about, such as `surface.radius_mm`; `None` if the text is not
+    /// TOML.
     pub fn key(&self) -> Option<String> {
         match self {
             Self::OutOfRange { key, .. }
@@ -123,7 +125,7 @@ impl DefinitionError {
     }
 }
 
-/// Checks a number that must be finite.
+/// Returns a number if it is finite, otherwise an error with its key.
 pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
     if value.is_finite() {
         return Ok(value);
@@ -131,7 +133,7 @@ pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError
     Err(DefinitionError::out_of_range(key, value, "a finite number", "write a number, or remove the key"))
 }
 
-/// Checks a radius of curvature, which may be infinite, and returns its curvature.
+/// Returns the curvature for a radius of curvature, which may be infinite; an error if the radius is too small.
 pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionError> {
     if radius_mm.abs() >= 1e-6 {
         return Ok(1.0 / radius_mm);
@@ -140,7 +142,7 @@ pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, Defini
     Err(DefinitionError::out_of_range(key, radius_mm, limit, "for no curvature write inf"))
 }
 
-/// Checks a length that must be positive.
+/// Returns a length if it is positive and at most 1e6 mm, otherwise an error with its key.
 pub(super) fn check_positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError> {
     if length_mm > 0.0 && length_mm <= 1e6 {
         return Ok(length_mm);

@@ -1,4 +1,4 @@
-//! Forbes' aspheres: Qcon, strong, and Qbfs, mild.
+//! Forbes' aspheres: Qcon for strong and Qbfs for mild aspheres.
 //!
 //! G. W. Forbes, Shape specification for axially symmetric optical surfaces, Opt. Express 15, 5218 (2007), and Robust,
 //! efficient computational methods for axially symmetric optical aspheres, Opt. Express 18, 19700 (2010). With u = h / Rn
@@ -13,10 +13,10 @@ use super::conic::Conic;
 use super::error::{self, DefinitionError};
 use super::{MAX_EXTRAPOLATION, jacobi};
 
-/// Most coefficients of one surface.
+/// Maximum number of coefficients of one surface.
 const MAX_COEFFICIENTS: usize = 200;
 
-/// A conic and a sum of Qcon polynomials.
+/// Qcon asphere: a conic plus a sum of Qcon polynomials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Qcon {
     base: Conic,
@@ -24,26 +24,26 @@ pub struct Qcon {
     coefficients_mm: Vec<[f64; 1]>,
 }
 
-/// A Qcon asphere as written.
+/// Definition of a Qcon asphere in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct QconDefinition {
-    /// Radius of curvature at the vertex in millimetres, positive with the centre at +z; `inf` for none.
+    /// Radius of curvature at the vertex in millimetres, positive if the centre is at +z; `inf` for a flat surface.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant.
     #[serde(default)]
     pub conic: f64,
-    /// Radius at which u is 1, in millimetres.
+    /// Normalisation radius Rn, at which u = h / Rn is 1, in millimetres.
     pub normalisation_radius_mm: f64,
     /// The coefficients a_0, a_1, ... in millimetres.
     pub coefficients_mm: Vec<f64>,
 }
 
 impl Qcon {
-    /// Returns the sag and its derivative, both with respect to q = h^2; none at the conic's edge and far beyond the
-    /// normalisation radius.
+    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the conic and beyond, and farther than 1.5
+    /// normalisation radii from the axis.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -53,7 +53,7 @@ impl Qcon {
         Some((sag + v * v * sum, slope + 2.0 * v * (sum + v * sum_slope) * per_mm2))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.coefficients_mm.len()
     }
@@ -71,7 +71,7 @@ impl TryFrom<&QconDefinition> for Qcon {
     }
 }
 
-/// A best-fit sphere and a sum of Qbfs polynomials.
+/// Qbfs asphere: a best-fit sphere plus a sum of Qbfs polynomials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Qbfs {
     sphere: Conic,
@@ -80,23 +80,23 @@ pub struct Qbfs {
     p_coefficients_mm: Vec<f64>,
 }
 
-/// A Qbfs asphere as written.
+/// Definition of a Qbfs asphere in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct QbfsDefinition {
-    /// Radius of the best-fit sphere in millimetres, positive with the centre at +z; `inf` for a plane.
+    /// Radius of the best-fit sphere in millimetres, positive if the centre is at +z; `inf` for a plane.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
-    /// Radius at which u is 1, in millimetres.
+    /// Normalisation radius Rn, at which u = h / Rn is 1, in millimetres.
     pub normalisation_radius_mm: f64,
     /// The coefficients a_0, a_1, ... in millimetres.
     pub coefficients_mm: Vec<f64>,
 }
 
 impl Qbfs {
-    /// Returns the sag and its derivative, both with respect to q = h^2; none at the sphere's edge and far beyond the
-    /// normalisation radius.
+    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the sphere and beyond, and farther than 1.5
+    /// normalisation radii from the axis.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -111,7 +111,7 @@ impl Qbfs {
         Some((sag + bump / cosine, slope + (bump_slope + steeper) / cosine))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.p_coefficients_mm.len()
     }
@@ -129,14 +129,14 @@ impl TryFrom<&QbfsDefinition> for Qbfs {
     }
 }
 
-/// Returns u^2 and its derivative with respect to h^2.
+/// Returns u^2 and its derivative by q = h^2; `None` farther than 1.5 normalisation radii from the axis.
 fn square(q: f64, normalisation_radius_mm: f64) -> Option<[f64; 2]> {
     let per_mm2 = 1.0 / (normalisation_radius_mm * normalisation_radius_mm);
     let v = q * per_mm2;
     (v <= MAX_EXTRAPOLATION * MAX_EXTRAPOLATION).then_some([v, per_mm2])
 }
 
-/// Checks a list of coefficients.
+/// Returns the coefficients if they are finite and at most 200, otherwise an error.
 fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError> {
     let expected = "at most 200 coefficients are summed";
     if coefficients_mm.len() > MAX_COEFFICIENTS {
@@ -148,7 +148,7 @@ fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError
     Ok(coefficients_mm)
 }
 
-/// Turns coefficients of Qbfs_m into those of the polynomials P_m, Forbes 2010, eq. (A.13) to (A.16) and (3.8).
+/// Converts the coefficients of Qbfs_m to those of the polynomials P_m, Forbes 2010, eq. (A.13) to (A.16) and (3.8).
 ///
 /// P_m = f_m Qbfs_m + g_(m-1) Qbfs_(m-1) + h_(m-2) Qbfs_(m-2), so that P's coefficients follow from the last one down.
 fn p_coefficients(a: &[f64]) -> Vec<f64> {
@@ -169,7 +169,7 @@ fn p_coefficients(a: &[f64]) -> Vec<f64> {
     b
 }
 
-/// Returns sum b_m P_m(v) and its derivative by Clenshaw's recurrence, Forbes 2010, eq. (3.9) and (3.10).
+/// Returns sum b_m P_m(v) and its derivative by v by Clenshaw's recurrence, Forbes 2010, eq. (3.9) and (3.10).
 ///
 /// P_0 = 2, P_1 = 6 - 8v, P_(m+1) = (2 - 4v) P_m - P_(m-1).
 fn p_series(b: &[f64], v: f64) -> (f64, f64) {

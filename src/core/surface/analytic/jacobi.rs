@@ -19,7 +19,7 @@ pub(super) fn series<const N: usize>(coefficients: &[[f64; N]], b: u32, t: f64) 
     sums
 }
 
-/// Writes P_0^(0, b)(t), P_1^(0, b)(t) and so on, as many as there is room for.
+/// Fills `out` with P_0^(0, b)(t), P_1^(0, b)(t) and so on.
 pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
     let [mut below, mut here] = [(0.0, 0.0), (1.0, 0.0)];
     for (k, value) in out.iter_mut().enumerate() {
@@ -28,7 +28,7 @@ pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
     }
 }
 
-/// One step of the recurrence, from the polynomials of degree n - 1 and n - 2 to that of degree n.
+/// Returns the polynomial of degree n and its derivative at t, from those of degree n - 1 (`here`) and n - 2 (`below`).
 fn step(n: f64, b: f64, t: f64, here: (f64, f64), below: (f64, f64)) -> (f64, f64) {
     if n == 1.0 {
         // The general step divides 0 by 0 here when b is 0.

@@ -35,20 +35,20 @@ pub use zernike::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbe
 
 use crate::geometry::{Aperture, Vector};
 
-/// How far beyond the normalisation radius polynomials on a disc are still evaluated, as a multiple of it: a sampling takes one
-/// ring of nodes beyond the aperture.
+/// Maximum distance from the axis, in normalisation radii, at which polynomials on a disc are evaluated. It is more
+/// than 1 because a sampling has one ring of nodes beyond the aperture.
 const MAX_EXTRAPOLATION: f64 = 1.5;
 
-/// A surface given by a formula, checked.
+/// Surface given by a formula, with checked numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub enum AnalyticSurface {
     /// A conic of revolution; a sphere and a plane are conics too.
     Conic(Conic),
-    /// A conic and powers of the distance from the axis, ISO 10110-12.
+    /// A conic plus powers of the distance from the axis, ISO 10110-12.
     Asphere(Asphere),
-    /// A section of one of the others, away from its axis.
+    /// A section of a surface of another kind, away from its axis.
     OffAxis(OffAxis),
-    /// A curve turned about a line, or moved along one.
+    /// A curve rotated about a line, or shifted along one.
     Toroid(Toroid),
     /// Two conics, one in x and one in y.
     Biconic(Biconic),
@@ -63,7 +63,7 @@ pub enum AnalyticSurface {
 }
 
 impl AnalyticSurface {
-    /// Returns the sag and its gradient at a place; none where the formula has no value or no finite slope.
+    /// Returns the sag and its gradient at a place; `None` if the formula has no value or no finite slope there.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -83,17 +83,18 @@ impl AnalyticSurface {
         found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
     }
 
-    /// Returns the sag at a place in millimetres; none where the formula has no value.
+    /// Returns the sag at a place in millimetres; `None` if the formula has no value or no finite slope there.
     pub fn sag(&self, x: f64, y: f64) -> Option<f64> {
         self.sag_and_gradient(x, y).map(|(z, _)| z)
     }
 
-    /// Returns the unit normal on the +z side at a place; none where the formula has no value.
+    /// Returns the unit normal on the +z side at a place; `None` if the formula has no value or no finite slope there.
     pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
         self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
     }
 
-    /// The radius of the disc on which the polynomials are meant, if they are meant on a disc.
+    /// Returns the radius of the disc on which the polynomials are defined; `None` if the formula is not limited to a
+    /// disc.
     fn normalisation_radius_mm(&self) -> Option<f64> {
         match self {
             Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
@@ -104,14 +105,14 @@ impl AnalyticSurface {
         }
     }
 
-    /// The distance from the axis of the formula to the farthest point of an aperture, in millimetres.
+    /// Returns the distance from the axis of the formula to the farthest point of an aperture, in millimetres.
     fn reach_mm(&self, aperture: &Aperture) -> f64 {
         let Self::OffAxis(section) = self else { return aperture.reach_mm() };
         let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
         places.map(|[x, y]| x.hypot(y)).fold(0.0, f64::max)
     }
 
-    /// How many terms an evaluation sums, as a measure of its time.
+    /// Returns the number of terms that one evaluation sums, as a measure of its time.
     fn term_count(&self) -> usize {
         match self {
             Self::Conic(_) | Self::Biconic(_) => 1,
@@ -126,7 +127,7 @@ impl AnalyticSurface {
     }
 }
 
-/// Returns the unit normal on the +z side of a surface with a gradient.
+/// Returns the unit normal on the +z side of a surface z = f(x, y) from the gradient of f.
 fn normal_from_gradient([gx, gy]: [f64; 2]) -> Vector {
     Vector::new(-gx, -gy, 1.0).normalize()
 }

@@ -1,4 +1,4 @@
-//! A section of a larger surface, away from its axis.
+//! Section of a larger surface, away from its axis.
 
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
@@ -7,10 +7,10 @@ use super::error::{self, DefinitionError};
 use super::{AnalyticSurface, Formula};
 use crate::geometry::{Point, Vector};
 
-/// Steps of the way from the section's centre, where Newton's method does not come straight to a place.
+/// Number of steps from the section's centre to a place, if Newton's method does not converge at this place directly.
 const CONTINUATION_STEPS: u32 = 64;
 
-/// The frame in which a section and its aperture are described.
+/// Frame in which a section and its aperture are described.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -24,26 +24,26 @@ pub enum SectionFrame {
     Tilted,
 }
 
-/// A section of a parent surface about a centre away from its axis.
+/// Section of a parent surface about a centre away from the parent's axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OffAxis {
     parent: Box<AnalyticSurface>,
     frame: SectionFrame,
     /// The section's centre in the parent's frame.
     centre: Point,
-    /// Takes directions of the tilted frame to the parent's; its columns are the tilted axes.
+    /// Rotation from the tilted frame to the parent's frame; its columns are the axes of the tilted frame.
     parent_from_tilted: Matrix3<f64>,
 }
 
-/// An off-axis section as written.
+/// Definition of an off-axis section in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct OffAxisDefinition {
-    /// The whole surface, of any other kind.
+    /// The whole surface, of any kind except an off-axis section.
     #[cfg_attr(feature = "schema", schemars(with = "super::definition::WholeFormula"))]
     pub parent: Box<Formula>,
-    /// Distance from the parent's axis to the section's centre, measured across the axis, in millimetres.
+    /// Distance of the section's centre from the parent's axis, perpendicular to the axis, in millimetres.
     pub distance_mm: f64,
     /// Azimuth of the section's centre in the parent's frame, from x towards y, in degrees.
     #[serde(default)]
@@ -53,7 +53,7 @@ pub struct OffAxisDefinition {
 }
 
 impl OffAxis {
-    /// Cuts a section from a parent.
+    /// Creates a section of a parent surface.
     ///
     /// Units: millimetres and radians.
     ///
@@ -66,7 +66,7 @@ impl OffAxis {
         frame: SectionFrame,
     ) -> Result<Self, DefinitionError> {
         if !(0.0..=1e6).contains(&distance_mm) {
-            let remedy = "for the other side turn `azimuth_deg` by 180°";
+            let remedy = "for the other side of the axis add 180 to `azimuth_deg`";
             return Err(DefinitionError::out_of_range("distance_mm", distance_mm, "from 0 to 1e6 mm", remedy));
         }
         let (sine, cosine) = error::check_finite("azimuth_deg", azimuth_rad)?.sin_cos();
@@ -93,8 +93,8 @@ impl OffAxis {
         &self.parent
     }
 
-    /// Returns the sag and its gradient in the section's frame; none where the parent has none, and where the surface turns
-    /// away from the tilted z axis.
+    /// Returns the sag and its gradient in the section's frame. Returns `None` if the parent has no value or finite
+    /// slope there, or if, in the tilted frame, the surface does not face +z there.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -108,7 +108,8 @@ impl OffAxis {
         }
     }
 
-    /// Returns the place in the parent's plane that lies under a place of the section.
+    /// Returns the place in the parent's xy plane that belongs to a place of the section; `None` if the section has no
+    /// value there.
     ///
     /// Units: millimetres.
     pub(super) fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
@@ -123,7 +124,8 @@ impl OffAxis {
         }
     }
 
-    /// Solves p_z = f(p_x, p_y), with p = centre + R (x, y, z), for z by Newton's method.
+    /// Solves p_z = f(p_x, p_y), with p = centre + R (x, y, z), for z by Newton's method, and returns z and its
+    /// gradient. `start` is the first estimate of z. Returns `None` without convergence.
     ///
     /// The gradient follows from the implicit function theorem: with m = R^T (-f_x, -f_y, 1), a normal in the tilted frame,
     /// it is (-m_x / m_z, -m_y / m_z).
@@ -148,7 +150,8 @@ impl OffAxis {
         None
     }
 
-    /// Follows the surface from the section's centre to a place, where the tangent plane there misses the parent.
+    /// Returns the sag and its gradient at a place by following the surface in small steps from the section's centre.
+    /// It is used if Newton's method does not converge directly.
     fn continue_from_centre(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
         let step = 1.0 / f64::from(CONTINUATION_STEPS);
         let (mut z, mut gradient) = self.newton(0.0, 0.0, 0.0)?;
@@ -160,7 +163,7 @@ impl OffAxis {
         Some((z, gradient))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         // Newton's method takes some five steps.
         self.parent.term_count() * if self.frame == SectionFrame::Tilted { 5 } else { 1 }
@@ -179,7 +182,7 @@ impl TryFrom<&OffAxisDefinition> for OffAxis {
     }
 }
 
-/// Returns the rotation about an axis across z that takes z to a unit vector on the +z side.
+/// Returns the smallest rotation that maps z to a unit vector on the +z side.
 fn min_rotation(n: &Vector) -> Matrix3<f64> {
     let s = 1.0 / (1.0 + n.z);
     Matrix3::new(

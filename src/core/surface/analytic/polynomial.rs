@@ -1,35 +1,36 @@
-//! The XY polynomial.
+//! XY polynomial.
 
 use serde::{Deserialize, Serialize};
 
 use super::conic::{Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 
-/// Largest power of x or y.
+/// Maximum power of x or y.
 const MAX_POWER: u32 = 60;
 
-/// A conic and a sum of products of powers: `z = conic + sum a_ij (x / Rn)^i (y / Rn)^j`, Rn being the normalisation radius.
+/// XY polynomial: a conic plus a sum of products of powers, `z = conic + sum a_ij (x / Rn)^i (y / Rn)^j` with the
+/// normalisation radius Rn.
 ///
-/// The normalisation radius is a mere scale: the polynomial is meant everywhere.
+/// The normalisation radius is only a unit of length: the polynomial is valid for all x and y.
 #[derive(Clone, Debug, PartialEq)]
 pub struct XyPolynomial {
     base: Conic,
     normalisation_radius_mm: f64,
-    /// Power of x, power of y, coefficient in millimetres.
+    /// Power of x, power of y, and coefficient in millimetres, for each term.
     terms: Vec<(u32, u32, f64)>,
 }
 
-/// An XY polynomial as written.
+/// Definition of an XY polynomial in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct XyPolynomialDefinition {
-    /// Divisor of x and y, in millimetres; 1 for coefficients in mm^(1 - i - j).
+    /// Normalisation radius by which x and y are divided, in millimetres; 1 for coefficients in mm^(1 - i - j).
     pub normalisation_radius_mm: f64,
     /// Terms [i, j, coefficient in millimetres].
     #[cfg_attr(feature = "schema", schemars(schema_with = "terms_schema"))]
     pub terms: Vec<(u32, u32, f64)>,
-    /// The conic the polynomial is added to; none for a plane.
+    /// Conic to which the polynomial is added; a plane if it is not given.
     pub base: Option<ConicDefinition>,
 }
 
@@ -45,7 +46,7 @@ fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
 }
 
 impl XyPolynomial {
-    /// Returns the sag and its gradient; none at the edge of the base conic and beyond.
+    /// Returns the sag and its gradient; `None` at the edge of the base conic and beyond.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -66,7 +67,7 @@ impl XyPolynomial {
         Some((z, [gx, gy]))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }

@@ -1,4 +1,4 @@
-//! A nominal surface sampled on a grid, and how fine the grid must be.
+//! Sampling of a nominal surface on a grid, and the choice of the node spacing.
 
 use rayon::prelude::*;
 
@@ -7,44 +7,45 @@ use super::error::{self, DefinitionError};
 use super::normal_from_gradient;
 use crate::geometry::{Aperture, Point, Vector};
 
-/// Most nodes of a sampling.
+/// Maximum number of nodes of a sampling.
 const MAX_NODES: f64 = 2e7;
 
-/// Most terms and corners evaluated in a sampling; about a minute on one core.
+/// Maximum number of terms and corners that a sampling evaluates; they take about a minute on one core.
 const MAX_WORK: f64 = 2e10;
 
-/// Nodes farther outside the aperture than this many spacings are left out. A cell that touches the aperture has its corners
-/// within a diagonal, 1.42 spacings.
+/// Distance outside the aperture, in spacings, beyond which nodes are omitted. The corners of a cell that touches the
+/// aperture are within the diagonal of a cell, 1.42 spacings.
 const MARGIN: f64 = 1.5;
 
-/// The coarsest spacing that is tried for an accuracy, as a part of the aperture's smaller side.
+/// Largest spacing that is tried for an accuracy, as a share of the shorter side of the aperture's bounding box.
 const MAX_SPACING_SHARE: f64 = 1.0 / 8.0;
 
-/// How often the spacing is halved before an accuracy is out of reach.
+/// Number of times that the spacing is halved before the accuracy counts as out of reach.
 const HALVINGS: u32 = 14;
 
-/// A surface sampled on a grid, row by row, x fastest.
+/// Surface sampled on a grid, row by row with x fastest.
 #[derive(Clone, Debug)]
 pub struct SampledSurface {
     /// Number of nodes along x.
     pub columns: usize,
     /// Number of nodes along y.
     pub rows: usize,
-    /// Place of the first node.
+    /// Place of the first node in x and y.
     pub origin_mm: [f64; 2],
     /// Distance of the nodes along x and along y.
     pub spacing_mm: [f64; 2],
-    /// The nodes in the surface's frame, in millimetres; all NaN where there is none.
+    /// Nodes in the surface's frame, in millimetres; NaN for omitted nodes.
     pub points: Vec<Point>,
-    /// The unit normals on the +z side; all NaN where there is no node.
+    /// Unit normals on the +z side; NaN for omitted nodes.
     pub normals: Vec<Vector>,
 }
 
 impl DefinedSurface {
     /// Samples the surface on a grid that covers the bounds of the aperture and one ring of nodes around them.
     ///
-    /// Units: millimetres. The spacing is made a little smaller, along x and along y, so that it divides the bounds. Nodes
-    /// are NaN farther than 1.5 spacings outside the aperture and where the formula has no value.
+    /// Units: millimetres. Along x and along y the spacing is reduced a little, so that it divides the bounds. Nodes
+    /// farther than 1.5 spacings outside the aperture, and nodes at which the formula has no value, are omitted: they
+    /// are NaN.
     ///
     /// # Errors
     /// A spacing that is not positive, more than 2e7 nodes, or a computation of more than about a minute.
@@ -70,7 +71,8 @@ impl DefinedSurface {
         })
     }
 
-    /// Returns the spacing the definition asks for, in millimetres.
+    /// Returns the node spacing of the definition in millimetres. If the definition gives an accuracy, the spacing is
+    /// estimated from it.
     ///
     /// # Errors
     /// An accuracy that is not positive, or one that no spacing reaches.
@@ -81,11 +83,11 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns a spacing at which the distance to the curved triangles between the nodes is as exact as asked for.
+    /// Returns a node spacing at which the distances to the curved triangles between the nodes have at most this error.
     ///
-    /// Units: millimetres. The error is measured: in cells about fixed places all over the aperture and along its outline, the
-    /// formula is compared with the cubic triangles, along the normal, and the spacing is halved and bisected until
-    /// twice the largest error is within the accuracy.
+    /// Units: millimetres. In cells about fixed places all over the aperture and along its outline, the cubic triangles
+    /// are compared with the formula, along the normal. The spacing is halved and then bisected until twice the largest
+    /// difference is within `accuracy_mm`.
     ///
     /// # Errors
     /// An accuracy that is not positive, or one that no spacing reaches.
@@ -118,7 +120,7 @@ impl DefinedSurface {
         Ok(fine)
     }
 
-    /// Refuses a sampling that would be too large or take too long.
+    /// Returns an error if a sampling would have too many nodes or take too long.
     fn check_size(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
         if nodes > MAX_NODES {
             return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MAX_NODES });
@@ -132,7 +134,8 @@ impl DefinedSurface {
         Ok(())
     }
 
-    /// Returns the node at a place and its normal.
+    /// Returns the node at x and y and its normal, in the surface's frame. Both are NaN if the place is farther than
+    /// `margin` outside the aperture, or if the formula has no value there.
     fn node(&self, x: f64, y: f64, margin: f64) -> (Point, Vector) {
         let near = self.aperture().distance_mm(x, y) <= margin;
         match self.formula().sag_and_gradient(x, y).filter(|_| near) {
@@ -141,10 +144,10 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns the largest error found in the cell of size h about a place, in millimetres.
+    /// Returns the largest error found in the cell of size `h` about a place, in millimetres.
     ///
-    /// It is infinite where a cell of a sampling that holds the place may have a corner without a value: the place would then
-    /// have no surface at all.
+    /// The error is infinite if a cell of this size that contains the place can have a corner without a value. The
+    /// sampled surface could then have a gap at the place.
     fn cell_error(&self, [x, y]: [f64; 2], h: f64) -> f64 {
         let corner = |i: f64, j: f64| {
             let place = [x + (i - 0.5) * h, y + (j - 0.5) * h];
@@ -169,7 +172,8 @@ impl DefinedSurface {
     }
 }
 
-/// Where in a triangle the error is looked for: the middles of the edges, the centroid, and three places between.
+/// Barycentric weights of the places of a triangle at which the error is evaluated: the middles of the edges, the
+/// centroid, and three places between them.
 const TEST_WEIGHTS: [[f64; 3]; 7] = [
     [0.5, 0.5, 0.0],
     [0.0, 0.5, 0.5],

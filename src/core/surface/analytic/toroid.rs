@@ -1,4 +1,4 @@
-//! Surfaces with two radii: the toroid and the biconic.
+//! Surfaces with two radii of curvature: the toroid and the biconic.
 
 use std::collections::BTreeMap;
 
@@ -7,38 +7,39 @@ use serde::{Deserialize, Serialize};
 use super::conic::{Asphere, AsphereDefinition};
 use super::error::{self, DefinitionError};
 
-/// A curve in the (y, z) plane turned about a line parallel to y.
+/// Toroid: a curve in the (y, z) plane, rotated about a line parallel to y.
 ///
-/// The curve g(y) is that of an asphere with |y| for h. The line of rotation meets the z axis at z = R, R being the radius of
-/// rotation; without one (`inf`) the curve is moved along x, which makes a cylinder. With C = 1/R and w = 1 - C g(y)
-/// `z = g + C x^2 / (w + sqrt(w^2 - C^2 x^2))`, which is the near root of (z - R)^2 + x^2 = (R - g)^2.
+/// The curve g(y) is that of an asphere with |y| in place of h. The line of rotation meets the z axis at z = R, with
+/// the radius of rotation R. If R is infinite (`inf`), the curve is shifted along x, which makes a cylinder. With C =
+/// 1/R and w = 1 - C g(y), `z = g + C x^2 / (w + sqrt(w^2 - C^2 x^2))`. This is the root of (z - R)^2 + x^2 = (R - g)^2
+/// near the vertex.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Toroid {
     rotation_per_mm: f64,
     curve: Asphere,
 }
 
-/// A toroid as written.
+/// Definition of a toroid in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ToroidDefinition {
-    /// Radius of rotation in millimetres, which is the radius of the section y = 0; `inf` for a cylinder.
+    /// Radius of rotation in millimetres: the radius of the section at y = 0; `inf` for a cylinder.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_x_mm: f64,
-    /// Radius of the curve in the (y, z) plane at its vertex, in millimetres; `inf` for none.
+    /// Radius of the curve in the (y, z) plane at its vertex, in millimetres; `inf` for a curve without curvature.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_y_mm: f64,
-    /// Conic constant of that curve.
+    /// Conic constant of the curve in the (y, z) plane.
     #[serde(default)]
     pub conic_y: f64,
-    /// Coefficients of that curve by power of |y|, as for an asphere, in mm^(1 - power).
+    /// Coefficients of the curve in the (y, z) plane by power of |y|, as for an asphere, in mm^(1 - power).
     #[serde(default)]
     pub coefficients: BTreeMap<String, f64>,
 }
 
 impl Toroid {
-    /// Makes a toroid from its radius of rotation, which may be infinite, and its curve.
+    /// Creates a toroid from its radius of rotation, which may be infinite, and its curve in the (y, z) plane.
     ///
     /// # Errors
     /// A radius that is NaN or less than 1e-6 mm in magnitude.
@@ -46,7 +47,8 @@ impl Toroid {
         Ok(Self { rotation_per_mm: error::checked_curvature("radius_x_mm", radius_x_mm)?, curve })
     }
 
-    /// Returns the sag and its gradient; none where the line of rotation is too near.
+    /// Returns the sag and its gradient; `None` if the circle of rotation does not reach x, or if the curve has no
+    /// value at y.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -61,7 +63,7 @@ impl Toroid {
         Some((g + c * x * x / (w + root), [c * x / root, w * 2.0 * y * slope / root]))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.curve.term_count()
     }
@@ -82,7 +84,7 @@ impl TryFrom<&ToroidDefinition> for Toroid {
     }
 }
 
-/// A conic in x and another in y, joined:
+/// Biconic: a conic in x joined with a conic in y,
 /// `z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2))`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Biconic {
@@ -90,27 +92,27 @@ pub struct Biconic {
     conics: [f64; 2],
 }
 
-/// A biconic as written.
+/// Definition of a biconic in a file.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct BiconicDefinition {
-    /// Radius of the section y = 0 at the vertex in millimetres; `inf` for none.
+    /// Radius of the section at y = 0 at the vertex, in millimetres; `inf` for a straight section.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_x_mm: f64,
-    /// Radius of the section x = 0 at the vertex in millimetres; `inf` for none.
+    /// Radius of the section at x = 0 at the vertex, in millimetres; `inf` for a straight section.
     #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_y_mm: f64,
-    /// Conic constant of the section y = 0.
+    /// Conic constant of the section at y = 0.
     #[serde(default)]
     pub conic_x: f64,
-    /// Conic constant of the section x = 0.
+    /// Conic constant of the section at x = 0.
     #[serde(default)]
     pub conic_y: f64,
 }
 
 impl Biconic {
-    /// Returns the sag and its gradient; none at the edge and beyond.
+    /// Returns the sag and its gradient; `None` at the edge of the surface and beyond.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {

@@ -1,4 +1,4 @@
-//! Zernike polynomials, in the three numberings in use.
+//! Zernike polynomials, in the three usual numberings.
 //!
 //! With rho = h / Rn and the azimuth theta counted from x towards y, a term of degree n and azimuthal order m is
 //! R_n^|m|(rho) cos(m theta) for m >= 0 and R_n^|m|(rho) sin(|m| theta) for m < 0, where R_n^m(1) = 1. Noll's (1976) and the
@@ -16,10 +16,10 @@ use super::conic::{self, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 use super::{MAX_EXTRAPOLATION, jacobi};
 
-/// Largest degree n.
+/// Maximum degree n.
 const MAX_DEGREE: u32 = 100;
 
-/// Numbering of the terms: the degree and azimuthal order of an index.
+/// Numbering of the terms: which degree and azimuthal order belong to an index.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -33,7 +33,8 @@ pub enum ZernikeNumbering {
 }
 
 impl ZernikeNumbering {
-    /// Returns degree n and azimuthal order m of an index, m negative for sines; none where there is no such term.
+    /// Returns the degree n and the azimuthal order m of an index, with m negative for sines; `None` if there is no
+    /// such term.
     pub fn degree_and_order(self, index: u32) -> Option<(u32, i32)> {
         let (n, m) = match self {
             Self::Noll => noll(index)?,
@@ -43,7 +44,7 @@ impl ZernikeNumbering {
         (n <= MAX_DEGREE).then_some((n, m))
     }
 
-    /// The normalisation that goes with the numbering.
+    /// Returns the default normalisation of the numbering.
     fn normalisation(self) -> ZernikeNormalisation {
         match self {
             Self::Noll | Self::Ansi => ZernikeNormalisation::Orthonormal,
@@ -63,34 +64,35 @@ pub enum ZernikeNormalisation {
     Unnormalised,
 }
 
-/// A conic and a sum of Zernike polynomials.
+/// Zernike surface: a conic plus a sum of Zernike polynomials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Zernike {
     base: Conic,
     pub(super) normalisation_radius_mm: f64,
-    /// Azimuthal order m and, for k = (n - m) / 2 from 0 up, the coefficients of cosine and sine in millimetres.
+    /// Azimuthal order m, and the coefficients of cosine and sine in millimetres for k = (n - m) / 2 from 0 up.
     orders: Vec<(u32, Vec<[f64; 2]>)>,
 }
 
-/// A Zernike surface as written.
+/// Definition of a Zernike surface in a file.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ZernikeDefinition {
     /// Numbering of the coefficients.
     pub numbering: ZernikeNumbering,
-    /// Radius of the disc in millimetres.
+    /// Normalisation radius: radius of the disc in millimetres.
     pub normalisation_radius_mm: f64,
     /// Coefficient by index, `{ Z4 = 1e-3 }` or `{ 4 = 1e-3 }`, in millimetres.
     pub coefficients_mm: BTreeMap<String, f64>,
-    /// Normalisation of the terms, if it is not the default of the numbering.
+    /// Normalisation of the terms; the default of the numbering if it is not given.
     pub normalisation: Option<ZernikeNormalisation>,
-    /// The conic the polynomials are added to; none for a plane.
+    /// Conic to which the polynomials are added; a plane if it is not given.
     pub base: Option<ConicDefinition>,
 }
 
 impl Zernike {
-    /// Returns the sag and its gradient; none at the edge of the base conic and far beyond the normalisation radius.
+    /// Returns the sag and its gradient; `None` at the edge of the base conic and beyond, and farther than 1.5
+    /// normalisation radii from the axis.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -118,7 +120,7 @@ impl Zernike {
         Some((sag + z, [2.0 * x * slope + gu * scale, 2.0 * y * slope + gv * scale]))
     }
 
-    /// How many terms an evaluation sums.
+    /// Returns the number of terms that one evaluation sums.
     pub(super) fn term_count(&self) -> usize {
         1 + self.orders.iter().map(|(_, coefficients)| 2 * coefficients.len()).sum::<usize>()
     }
@@ -155,20 +157,22 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
     }
 }
 
-/// Noll's numbering: degree by degree, |m| rising; even indices are cosines, odd ones sines.
+/// Returns degree and order by Noll's numbering: degree by degree with |m| rising; even indices are cosines, odd ones
+/// sines.
 fn noll(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index.checked_sub(1)?);
     let m = if n % 2 == 0 { place.div_ceil(2) * 2 } else { place / 2 * 2 + 1 };
     Some((n, if index.is_multiple_of(2) { m as i32 } else { -(m as i32) }))
 }
 
-/// The ANSI numbering: degree by degree, m rising from -n to n in steps of 2.
+/// Returns degree and order by the ANSI numbering: degree by degree, with m rising from -n to n in steps of 2.
 fn ansi(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index);
     Some((n, 2 * place as i32 - n as i32))
 }
 
-/// The Fringe numbering: (n + |m|) / 2 rising, within it |m| falling, the cosine before the sine.
+/// Returns degree and order by the Fringe numbering: (n + |m|) / 2 rises; within it |m| falls, and the cosine precedes
+/// the sine.
 fn fringe(index: u32) -> Option<(u32, i32)> {
     // The set stops after (n + |m|) / 2 = 5 and adds one more spherical term.
     if index == 37 {
@@ -181,7 +185,8 @@ fn fringe(index: u32) -> Option<(u32, i32)> {
     Some((2 * group - m, if rest % 2 == 0 { m as i32 } else { -(m as i32) }))
 }
 
-/// Returns the row of a place in a triangle of rows 1, 2, 3 ... long, and the place within the row, all from 0.
+/// Returns the row and the position in the row of the element with index `place` in a triangle whose rows have 1, 2, 3
+/// ... elements. All are counted from 0.
 fn triangular(place: u32) -> (u32, u32) {
     let row = ((8 * u64::from(place) + 1).isqrt() - 1) / 2;
     (row as u32, (u64::from(place) - row * (row + 1) / 2) as u32)

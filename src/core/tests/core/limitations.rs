@@ -232,7 +232,7 @@ fn better_probe_side_is_certain() {
     let measured = cloud(WHOLE, [80, 40]);
     for to_x_mm in [51.0, 12.0] {
         let found = register(&part_of_the_free_form(to_x_mm), &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
-        assert!(!has_warning(&found, "on which side"), "{to_x_mm}: {:?}", found.quality.warnings);
+        assert!(!has_warning(&found, "the side of the probe"), "{to_x_mm}: {:?}", found.quality.warnings);
     }
 }
 

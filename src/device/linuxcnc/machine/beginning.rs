@@ -71,8 +71,9 @@ impl LinuxcncGrinder {
         DeviceError::NotReady { machine: self.machine(), reason: why }
     }
 
-    /// Has the controller open the record and reads the token in it. This proves that both see one folder, that the
-    /// controller can write in it, and that later lines of the record are of this preparation.
+    /// Makes the controller write `token` into a new record, and reads it back here. This proves three facts: this
+    /// computer and the controller see the same folder, the controller can write in it, and later lines of the record
+    /// belong to this preparation.
     async fn open_record(&mut self, program: &FramedProgram, token: u32) -> DeviceResult<()> {
         let record = path(&self.folders.remote, &program.name, RECORD);
         self.controller.enter(ControllerMode::Mdi, MachineCommand::Prepare).await?;

@@ -35,8 +35,8 @@ impl LinuxcncGrinder {
         Ok((seen, status))
     }
 
-    /// Notes a running program that does not move. A controller whose task has died keeps reporting its last state, and
-    /// it has no heartbeat that would prove it.
+    /// Adds a note if the controller reports a running program and the machine does not move. A controller whose task
+    /// has died continues to report its last state, and has no heartbeat that would show this.
     fn note_standstill(&mut self, seen: &ControllerState) {
         match &self.last_motion {
             Some((line, at, since)) if (*line, at) == (seen.line, &seen.position) => {
@@ -94,7 +94,7 @@ impl LinuxcncGrinder {
             }
             Verdict::Unresolved => self.note(
                 "it has stopped, and its program recorded neither its begin nor its end: check the machine, then \
-                 regrind confirm done, or regrind confirm still"
+                 regrind confirm done if the pass is complete, otherwise regrind confirm still"
                     .to_owned(),
             ),
             Verdict::InState(_) | Verdict::Foreign(_) => {}
@@ -154,7 +154,8 @@ impl LinuxcncGrinder {
     }
 }
 
-/// Returns the fault that blocks a machine without a job.
+/// Returns the fault that prevents any job: an open stop circuit, or drives that are off. Returns `None` if there is
+/// neither.
 pub(super) fn standing_fault(seen: &ControllerState) -> Option<Fault> {
     match (seen.stop_circuit_open, seen.drives_on) {
         (true, _) => Some(Fault::StopCircuit),

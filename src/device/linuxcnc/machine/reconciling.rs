@@ -1,4 +1,4 @@
-//! Fate of a job after a lost connection, or of one that an earlier process had begun.
+//! Outcome of a job after a lost connection, or of a job that an earlier process had begun.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use crate::linuxcnc::work::Stage;
 use crate::words::{Armed, Reconciled};
 
 impl LinuxcncGrinder {
-    /// Returns what became of a job, if that is known now.
+    /// Returns the outcome of the start of the job. Returns `None` if it is not known yet, or if there is no job.
     pub(super) async fn start_outcome(&mut self) -> DeviceResult<Option<Reconciled>> {
         let (seen, status) = self.read_status().await?;
         let Some(work) = &self.job else { return Ok(None) };
@@ -48,12 +48,12 @@ impl LinuxcncGrinder {
                 let (_, status) = self.read_status().await?;
                 Ok(Reconciled::NotStarted(status))
             }
-            Some(_) => Ok(unknown("its record shows that it began, but not that it ended")),
-            None => Ok(unknown("the record of its preparation is no longer in the folder of programs")),
+            Some(_) => Ok(unknown("the .log file of its program shows its begin, but not its end")),
+            None => Ok(unknown("the .log file of its program is no longer in the folder of programs")),
         }
     }
 
-    /// Finds the program that was prepared before this process started.
+    /// Finds the program that was prepared before this process started, and assigns it to the job.
     pub(super) async fn find_prepared_program(&mut self, intended: &Armed) -> DeviceResult<()> {
         let (cycle, token) = (intended.job.batch_id().cycle.saturating_sub(1), intended.token);
         if let Some(program) = self.in_folders(move |folders| folders.prepared(cycle, token)).await? {

@@ -27,8 +27,8 @@ pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io
     Ok(tokio_serial::new(device, baud).parity(parity).stop_bits(stop_bits).open_native_async()?)
 }
 
-/// Returns in words that a port is not on this computer, and which ports are. Returns `None` if it is there or has no
-/// name.
+/// Returns a message that a port does not exist on this computer, with the names of the existing ports. Returns `None`
+/// if the port exists or `device` is empty.
 pub(crate) fn missing(device: &str) -> Option<String> {
     if device.is_empty() || is_there(device) {
         return None;
