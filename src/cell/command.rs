@@ -128,32 +128,6 @@ pub(super) fn format_label((name, device): (&'static str, Option<Device>)) -> St
 }
 
 impl Command {
-    /// Returns true if two commands are equal, texts for people excepted. So the record of a program with other texts
-    /// can be replayed.
-    pub fn is_same_decision(&self, other: &Self) -> bool {
-        self.without_texts() == other.without_texts()
-    }
-
-    fn without_texts(&self) -> Self {
-        let mut command = self.clone();
-        match &mut command {
-            Self::Announce(Judgement { reason, .. }) | Self::Refuse { why: reason, .. } => reason.clear(),
-            Self::Raise(alarm) => {
-                alarm.what.clear();
-                alarm.consequence.clear();
-                alarm.remedy.clear();
-            }
-            Self::Finish(
-                Ending::Accepted { reason, .. }
-                | Ending::NotAccepted { reason, .. }
-                | Ending::Stopped { reason, .. }
-                | Ending::Aborted { reason, .. },
-            ) => reason.clear(),
-            _ => {}
-        }
-        command
-    }
-
     /// Returns the name of the command as it is recorded, with its machine.
     pub fn name(&self) -> String {
         format_label(self.label())

@@ -1,4 +1,5 @@
-//! `regrind accuracy`: the accuracy of distances to a nominal surface, and the sampling that it needs.
+//! `regrind accuracy`: estimates the error of distances to a nominal surface, and the point spacing for a required
+//! accuracy.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -20,8 +21,9 @@ use super::{Outcome, finite_above_zero};
 /// Estimate from a nominal surface alone the error of distances to it, and the spacing for a required accuracy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Most points are withheld, twice, and their distance from the surface of the other points is measured. The points lie on
-the nominal surface, so the distance is the error. The result is extrapolated from these two errors.
+The command builds two coarser surfaces from a part of the points, and measures the distances of the other points from
+each. All points lie on the nominal surface, so these distances are errors. The error of the whole surface is
+extrapolated from the errors of the two coarser surfaces.
 
 Example:
   regrind accuracy --nominal lens.csv --want 1
@@ -67,7 +69,8 @@ struct Kind {
     order: f64,
     observed_order: f64,
     trust: &'static str,
-    /// Absent where nothing was wanted, or where no spacing brings it.
+    /// Point spacing in mm for the error that `--want` allows. `None` without `--want`, or if no spacing reaches that
+    /// error.
     wanted_spacing_mm: Option<f64>,
 }
 

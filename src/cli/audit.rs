@@ -44,7 +44,7 @@ enum AuditCommand {
 #[command(after_help = "\
 RUN is the folder of a run; by default the newest under runs/. In a folder of runs, each run is verified, and missing,
 renamed or exchanged runs are named: each run has a number and names the record of the run before. Missing newest runs
-show only by an anchor that was kept elsewhere, or at a plant. A record whose end was cut off together with its anchor
+are found only by an anchor kept elsewhere, or at a plant. A record whose end was cut off together with its anchor
 is detected only with --anchor and a copy of journal.anchor that was kept elsewhere. A record that was rewritten from
 its beginning is detected only with this copy, or with --key and the public key that was kept elsewhere. Without --key,
 the signatures are checked against the key that the record itself names. docs/journal.md shows how to verify a record
@@ -177,7 +177,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
     if is_folder_of_runs(&folder) {
         if let Some(anchor) = &arguments.anchor {
-            let reason = "it is of one run, and a folder of runs was given: name the run".to_owned();
+            let reason = "the anchor belongs to one run, but a folder of runs was given: name the run".to_owned();
             return Err(Failure::Anchor { path: anchor.clone(), reason });
         }
         return succession::prove(&folder, &arguments.key, arguments.json);
@@ -215,16 +215,19 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     }
 }
 
-/// Returns true if a sound run is complete, false if it is still under way, or an error that names what it lacks.
+/// Returns true if a verified record is complete, and false if its run is still active. Returns an error that names
+/// what is missing if the record is incomplete.
 pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
     match verified {
         // With a key, an end that this key has not signed is not trusted, even if a process holds the lock.
         verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
-            "its end is not signed, and the run names a key: who has no key may have written what follows the last seal",
+            "its end is not signed, although the run names a key: somebody without the key can have written the records after the last seal",
         ),
-        Verified { anchored: 0, .. } => Err("journal.anchor is missing: whether its end was cut off cannot be told"),
+        Verified { anchored: 0, .. } => {
+            Err("journal.anchor is missing: it is unknown whether the end of the record was cut off")
+        }
         Verified { closed: false, under_way: false, .. } => Err(
-            "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known",
+            "the run was interrupted: no program drives it, and its record has no end; what happened after the last record is unknown",
         ),
         verified => Ok(verified.closed && !verified.lacks_last_seal()),
     }
@@ -241,18 +244,18 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
         && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
-    let report = if edited { "report      report.html is not what the record gives\n" } else { "" };
+    let report = if edited { "report      report.html differs from the report of this record\n" } else { "" };
     let others: Vec<&str> = unrecorded.iter().filter(|name| *name != RUN_REPORT).map(String::as_str).collect();
     match others.len() {
         0 => report.to_owned(),
-        _ => format!("{report}beside      not on record: {}\n", others.join(", ")),
+        _ => format!("{report}files       not on record: {}\n", others.join(", ")),
     }
 }
 
 fn read_anchor(path: &Path) -> Result<Anchor, Failure> {
     let wrong = |reason: String| Failure::Anchor { path: path.to_owned(), reason };
     let bytes = std::fs::read(path).map_err(|error| wrong(error.to_string()))?;
-    serde_json::from_slice(&bytes).map_err(|error| wrong(format!("no anchor: {error}")))
+    serde_json::from_slice(&bytes).map_err(|error| wrong(format!("not an anchor: {error}")))
 }
 
 fn first(folder: &Path) -> Result<Value, Failure> {
@@ -269,11 +272,11 @@ fn mark(begin: &Value) -> &'static str {
 fn signed(verified: &Verified, as_given: bool) -> String {
     let Verified { keys, signed, records, .. } = verified;
     let [first, others @ ..] = keys.as_slice() else {
-        return "no: who wrote it had no key (`regrind audit key` makes one)".to_owned();
+        return "no: the run had no key (`regrind audit key` creates one)".to_owned();
     };
     let named = |key: &PublicKey| format!("{key} ({})", key.fingerprint());
     let then: String = others.iter().map(|key| format!(", then by {}", named(key))).collect();
-    let given = if as_given { ", as given" } else { "; that this is the key of your cell, only --key can tell" };
+    let given = if as_given { ", as given" } else { "; only --key proves that this is the key of your cell" };
     let reach = match verified.closed && !verified.lacks_last_seal() {
         true => "to its end".to_owned(),
         false => format!("up to record {signed} of {records}"),
@@ -286,11 +289,11 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> S
     let records = super::words::counted(*records as usize, "record");
     let files = super::words::counted(*artefacts as usize, "file");
     let end = match (closed, anchored) {
-        (true, _) => "the run is closed: nothing follows, nothing was cut off".to_owned(),
-        (false, 0) => "the run is not closed and has no anchor: a cut of its end would not be seen".to_owned(),
+        (true, _) => "the run is closed: no record follows, and none was cut off".to_owned(),
+        (false, 0) => "the run is not closed and has no anchor: a cut of its end would not be detected".to_owned(),
         (false, anchored) => {
             format!(
-                "the run is not closed: nothing was cut off up to record {anchored}; a cut behind it would not be seen"
+                "the run is not closed: nothing was cut off up to record {anchored}; a later cut would not be detected"
             )
         }
     };

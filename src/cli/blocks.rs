@@ -10,26 +10,29 @@ type Pixel = Option<[u8; 3]>;
 pub(super) struct Blocks {
     /// Upper and lower half of each character, row by row from the top.
     pub(super) rows: Vec<Vec<[Pixel; 2]>>,
-    /// Value of the darkest red in µm, or of the brightest colour if no value is below zero.
+    /// Maximum absolute value of the pixels in µm: the value at the end of the colour scale.
     pub(super) limit_um: f64,
 }
 
 impl Blocks {
-    /// Paints an error map. `most` is the maximum number of characters in width and height.
+    /// Paints an error map. `most` is the maximum width and height in characters; a character shows two pixels, one
+    /// above the other.
     ///
-    /// Shape: nodes of x, y and error in mm. Half a character is about as wide as it is high.
+    /// Returns `None` if the nodes have no extent in x or in y, or if `most` contains 0.
     pub(super) fn paint_error(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::error).collect();
         Self::painted(&nodes, most, |share| ColourMap::Diverging.at(0.5 + 0.5 * share))
     }
 
-    /// Paints the standard deviation of the error, from dark (minimum) to bright.
+    /// Paints the standard deviation of the error, from dark (0) to bright (maximum). The parameters and `None` are
+    /// those of [`Blocks::paint_error`].
     pub(super) fn paint_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::sigma).collect();
         Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
     }
 
-    /// Paints values. `colour` takes the value as a share of the maximum magnitude.
+    /// Paints the third component of each node over x and y. `colour` receives the mean value of a pixel divided by the
+    /// maximum absolute mean: a number from -1 to 1.
     fn painted(nodes: &[[f64; 3]], most: [usize; 2], colour: impl Fn(f64) -> [u8; 3]) -> Option<Self> {
         let range = |k: usize| nodes.iter().fold([f64::MAX, f64::MIN], |[a, b], node| [a.min(node[k]), b.max(node[k])]);
         let ([x0, x1], [y0, y1]) = (range(0), range(1));
@@ -76,7 +79,7 @@ impl Blocks {
     }
 }
 
-/// Draws a series of values, one character per cycle, on a logarithmic scale. The highest bar is the maximum.
+/// Draws a series of values as bars, one character per value, on a logarithmic scale. The maximum has the highest bar.
 pub(super) fn sparkline(values: impl Iterator<Item = f64> + Clone) -> String {
     const STEPS: [char; 8] =
         ['\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}', '\u{2588}'];

@@ -1,5 +1,5 @@
 //! Status of the cell whose runs are in a folder: the active run, an interrupted run, and the result of the last run.
-//! The status is published as it is found.
+//! `regrind tell` and `regrind ship` publish this status.
 //!
 //! The current run is the one with the newest record. The time of the folder does not count, because anybody can read,
 //! copy or create a folder.
@@ -16,19 +16,21 @@ use regrind_live::{CellStatus, EndedRun, RunStatus};
 
 use super::control;
 
-/// Time that a run can be starting, ending or silent before it counts as not answering.
+/// Time for which a run may give no answer, for example while it starts or ends. After this time its status is
+/// `Unresponsive`.
 const GRACE: Duration = Duration::from_secs(5);
 
 /// Status of the cell, updated by repeated reading of the runs in a folder.
 pub(super) struct CellMonitor {
     runs: PathBuf,
     status: CellStatus,
-    /// Run that does not answer, and the time since when.
+    /// Run that does not answer, and the time of its first missing answer.
     silent: Option<(PathBuf, Instant)>,
-    /// Time of the last record of each run, with the stamp of its files at that time. `None` for a folder that is not a
-    /// run.
+    /// Time of the last record of each run, with the stamp of its files when it was read. `None` for the record of a
+    /// recovery, which is not a run of a part.
     known: HashMap<PathBuf, (Stamp, Option<Timestamp>)>,
-    /// Last current run, with the stamp of its files. While the stamp is unchanged, the run is not read again.
+    /// Run whose summary was read last, with the stamp of its files at that time. While the stamp is unchanged, the run
+    /// is not read again.
     settled: Option<(PathBuf, Stamp)>,
 }
 
@@ -59,7 +61,8 @@ impl CellMonitor {
         &self.status
     }
 
-    /// Updates the status on its own thread, because a record can be long and a run can fail to answer.
+    /// Calls [`CellMonitor::poll`] on a separate thread, and returns the monitor: a long record, or a run that does not
+    /// answer, would block the caller.
     pub(super) async fn poll_in_background(mut self) -> Self {
         let runs = self.runs.clone();
         let looked = tokio::task::spawn_blocking(move || {
@@ -74,7 +77,7 @@ impl CellMonitor {
         &self.status
     }
 
-    /// Sets the status of the active run, which the caller received.
+    /// Sets a status that the caller has received from the active run.
     pub(super) fn set_run_status(&mut self, now: RunStatus) {
         (self.status.run_status, self.silent) = (now, None);
     }
@@ -90,8 +93,8 @@ impl CellMonitor {
         self.silent = Some((run, since));
     }
 
-    /// Determines the status from the records. No run listens: a run is starting or ending, was interrupted, or is
-    /// over.
+    /// Determines the status from the records, for the case that no run listens at its control socket: a run starts or
+    /// ends, was interrupted, or has ended.
     fn update_from_records(&mut self) {
         let folders: Vec<PathBuf> = control::folders(&self.runs).collect();
         self.known.retain(|run, _| folders.contains(run));
@@ -156,7 +159,7 @@ impl CellMonitor {
     }
 }
 
-/// Returns the name of a run.
+/// Returns the name of a run: the name of its folder.
 pub(super) fn name(folder: &Path) -> String {
     folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }

@@ -119,7 +119,8 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     ("recipe", checked)
 }
 
-/// Returns true if the file has one of these tables. They identify the kind of a file even if the rest is invalid.
+/// Returns true if a line of the file begins with one of the table headers in `heads`. The headers identify the kind of
+/// a file even if its other content is invalid. Only the first MiB is read.
 fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
@@ -128,7 +129,8 @@ fn has_table(path: &Path, heads: &[&str]) -> bool {
     read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
 }
 
-/// Reads the files that a recipe names.
+/// Reads the nominal surface and the measuring plan that a recipe names. Returns the problems of all files that cannot
+/// be used.
 fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     let mut problems: Option<Problems> = None;
     let mut add = |key: &str, failure: &dyn std::fmt::Display| {
@@ -161,7 +163,7 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     problems.map_or(Ok(()), Err)
 }
 
-/// Reads the truth of a simulated cell in the same way as the simulator.
+/// Checks the table `[simulation]` of a recipe, the true shape of the simulated part, in the same way as the simulator.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     let Some(table) = recipe.simulation.clone() else { return Ok(()) };
     let remedy = "correct it, or leave it out: every key has a usual value";

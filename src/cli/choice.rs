@@ -1,4 +1,5 @@
-//! Arguments that are one word of an enum. The words are serde's; their help comes from the doc comments.
+//! Parser of arguments that name a variant of an enum. The names are those of serde, and the help texts are the doc
+//! comments.
 
 use std::ffi::OsStr;
 use std::marker::PhantomData;
@@ -9,10 +10,10 @@ use serde::de::DeserializeOwned;
 use serde::de::value::{Error, StrDeserializer};
 use serde_json::Value;
 
-/// Parser of a word of an enum.
+/// Parser of a command-line argument that names a variant of the enum `T`.
 pub(super) struct WordOf<T>(PhantomData<fn() -> T>);
 
-/// Returns the parser of a word of an enum.
+/// Returns the parser of an argument that names a variant of the enum `T`.
 pub(super) fn word_of<T>() -> WordOf<T> {
     WordOf(PhantomData)
 }
@@ -42,7 +43,7 @@ impl<T: Clone + DeserializeOwned + JsonSchema + Send + Sync + 'static> TypedValu
     }
 }
 
-/// Returns the words of an enum with their help.
+/// Returns the names of the variants of the enum `T` with their help texts, from its JSON schema.
 fn words<T: JsonSchema>() -> Vec<PossibleValue> {
     let schema = schemars::schema_for!(T).to_value();
     let list = |of: &Value, key: &str| of.get(key).and_then(Value::as_array).cloned().unwrap_or_default();

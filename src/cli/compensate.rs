@@ -140,21 +140,22 @@ fn summary(amended: &Amended) -> String {
     );
     if amended.beside_map_mm > 0.0 {
         text += &format!(
-            "beside the map: {} mm of {} mm at feed, where the outermost values of the map are levelled off\n",
+            "outside the map: {} mm of {} mm at feed, where the outermost values of the map are levelled off\n",
             three_digits(amended.beside_map_mm),
             three_digits(amended.feed_mm)
         );
     }
     if amended.unit_assumed {
-        text += "unit: neither G20 nor G21 stands before the first coordinate; millimetres were taken, and G21 was written\n";
+        text +=
+            "unit: there is no G20 or G21 before the first coordinate; millimetres are assumed, and G21 was added\n";
     }
     text
 }
 
-/// Distance in nodes within which a map is levelled off outside its grid.
+/// Distance outside the grid, in nodes, within which the values of a map level off.
 const LEVEL_OFF_NODES: f64 = 5.0;
 
-/// Reads the nominal surface.
+/// Reads a nominal surface, and returns it as a target surface without a correction.
 fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
     let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };

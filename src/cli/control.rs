@@ -16,7 +16,7 @@ use super::failure::Failure;
 use super::show::{how_far, limits, preview_text, pv_name};
 use super::words::time_left;
 
-/// Returns the text after the help of each order.
+/// Returns the text that follows the help of an order, with an example command.
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
@@ -96,7 +96,7 @@ enum ConfirmedState {
     Over,
 }
 
-/// Sends an order. `order` builds it from its reason.
+/// Sends an order to a cell. `order` builds the request from the reason on the command line.
 pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Result<Outcome, Failure> {
     give(arguments.run.as_deref(), &order(arguments.reason.clone()), arguments.json)
 }
@@ -236,7 +236,8 @@ pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     live_or(runs, newest)
 }
 
-/// Returns the folder of the active run, or the result of `otherwise` if none is active.
+/// Returns the folder of the active run, or the result of `otherwise` if no run is active. Returns an error if several
+/// runs are active, or if `otherwise` finds no run.
 pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
     if live.is_empty() {

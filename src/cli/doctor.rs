@@ -1,4 +1,4 @@
-//! `regrind doctor`: checks whether anything prevents a run. It moves nothing and keeps no machine.
+//! `regrind doctor`: checks whether anything prevents a run. It moves no machine, and locks none after the check.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -61,9 +61,9 @@ struct Finding {
 #[serde(rename_all = "snake_case")]
 enum FindingLevel {
     Good,
-    /// No obstacle, and worth knowing.
+    /// Information that does not prevent a run.
     Notice,
-    /// It stands in the way of a run.
+    /// Problem that prevents a run.
     Obstacle,
 }
 
@@ -109,7 +109,7 @@ fn in_words(finding: &Finding) -> String {
     format!("{mark:<9}{what}: {words}\n")
 }
 
-/// Checks whether runs can be written, and how much space there is.
+/// Checks whether runs can be written to a folder, and how much space its disk has.
 fn folder(runs: &Path) -> Finding {
     const LITTLE_BYTES: u64 = 1 << 30;
     // A missing folder is created, tested, and removed again.
@@ -130,8 +130,8 @@ fn folder(runs: &Path) -> Finding {
     }
 }
 
-/// Finds runs that every user of the computer can read, as those of earlier versions. A reader of a record can block
-/// its writer.
+/// Finds runs whose folders every user of the computer can read; earlier versions created such folders. A process that
+/// reads a record can block its writer.
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
@@ -142,7 +142,7 @@ fn open_runs(runs: &Path) -> Option<Finding> {
     (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
 }
 
-/// Checks that the clock is not before the recorded times.
+/// Checks that the clock shows neither a time before the last recorded run nor a time before the release of this code.
 fn clock(runs: &Path) -> Finding {
     /// Date of this code. A correct clock shows no earlier time.
     const MIN: &str = "2026-01-01T00:00:00Z";
@@ -154,8 +154,8 @@ fn clock(runs: &Path) -> Finding {
     let last = last.unwrap_or_default();
     if now.as_str() < MIN || now < last {
         let words = format!(
-            "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the numbers of the \
-             records keep their order"
+            "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the order of the \
+             records does not depend on it"
         );
         return Finding::new("clock", FindingLevel::Notice, words);
     }
@@ -236,10 +236,11 @@ async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M
     Finding::from_result(&what, looked.await)
 }
 
-/// Time for which a line is listened to.
+/// Time for which the line of a machine that prints its hits is read.
 const LISTENS: Duration = Duration::from_secs(5);
 
-/// Checks a machine that only prints: opens its line, and reports the lines that arrive with the matching formats.
+/// Checks a machine that only prints its hits: reads its line for [`LISTENS`], and reports each printed line with the
+/// formats that match it.
 async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Finding {
     let what = Device::Cmm.to_string();
     let _taken = match lock_machine(link, MachineKind::Cmm, Path::new("regrind doctor")) {

@@ -16,7 +16,7 @@ use regrind::surface::{DefinitionError, SurfaceError};
 use regrind_plant::PlantError;
 use thiserror::Error;
 
-/// Exit code if the checked object is not as it must be.
+/// Exit code for a failed check: a broken or incomplete record, a copy that differs from it, or unfinished work.
 const NOT_AS_IT_SHOULD_BE: u8 = 1;
 /// Exit code for invalid arguments, recipe or data.
 const BAD_INPUT: u8 = 2;
@@ -65,10 +65,10 @@ pub(super) enum Failure {
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
-    /// The record was read and is not trustworthy.
+    /// The record was read. It was changed, or its author is not proven.
     #[error(transparent)]
     Broken(JournalError),
-    #[error("{}: {flaws} flaw(s) among the runs, the first: {first}", .runs.display())]
+    #[error("{}: the runs have {flaws} flaw(s); the first flaw: {first}", .runs.display())]
     RunsLack { runs: PathBuf, flaws: usize, first: String },
     #[error(
         "{}: the cell file requires a signed record (cell.require_signature), and this user has no key; make one \
@@ -87,7 +87,7 @@ pub(super) enum Failure {
     NoPlaceForKey,
     #[error(transparent)]
     Report(ReportError),
-    #[error("--state {name}: no state begins with this; give one of {known}")]
+    #[error("--state {name}: no state has a name that begins with this text; give one of {known}")]
     NoState { name: String, known: String },
     #[error(transparent)]
     Journal(JournalError),
@@ -171,7 +171,7 @@ pub(super) enum Failure {
     #[error("{}: its simulated machines ended with its program; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(
-        "{}: regrind {program} began it, and this program cannot resume it ({what}); resume it with that version, or \
+        "{}: the run was started by Regrind {program}, and this version cannot resume it ({what}); resume it with that version, or \
          bring the machines home with `regrind recover` and begin a new run",
         .run.display()
     )]
@@ -185,7 +185,9 @@ pub(super) enum Failure {
     Port { device: regrind::cell::Device, source: io::Error },
     #[error("{device}: {source}")]
     Recover { device: regrind::cell::Device, source: regrind::drive::recovery::RecoveryError },
-    #[error("it is unknown whether both machines are idle; begin again, or check the machine without a wire")]
+    #[error(
+        "it is unknown whether both machines are idle; run `regrind recover` again, or inspect a machine without a wire yourself"
+    )]
     NotHome,
     #[error(transparent)]
     Learned(regrind::formats::LearnedError),
@@ -213,7 +215,7 @@ pub(super) enum Failure {
     Ended { reason: String },
     #[error("the result cannot be given: {what} is not a finite number; report it with the files that led to it")]
     NotFinite { what: &'static str },
-    /// The input was valid and the place was writable before, but writing failed.
+    /// The input was valid and the output folder was writable at the start, but writing the result failed.
     #[error("the result could not be saved: {0}")]
     NotSaved(FormatError),
     #[error("signals of the operating system cannot be received: {0}")]

@@ -1,4 +1,4 @@
-//! `regrind init`: creates a folder with which a shop can begin.
+//! `regrind init`: creates a folder to start with: recipe, cell file and their schemas.
 
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
@@ -62,7 +62,7 @@ impl Machines {
         }
     }
 
-    /// Returns the recipe for that cell, and the name of its part.
+    /// Returns the text of the shipped recipe for these machines, and the name of the part in it.
     fn recipe(self) -> (&'static str, &'static str) {
         match self {
             // Machines that exchange files have no pattern from Regrind.
@@ -77,22 +77,22 @@ impl Machines {
         let before = match self {
             Self::ModbusTcp | Self::ModbusRtu => Some((
                 "regrind simulate recipe.toml --cell cell.toml",
-                "the simulated machines, in a terminal of their own",
+                "runs the simulated machines, in a second terminal",
             )),
             Self::Files => Some((
                 "mkdir -p exchange/cmm/in exchange/cmm/out exchange/grinder/in exchange/grinder/out",
-                "the folders of both machines",
+                "creates the folders of both machines",
             )),
             Self::Simulated | Self::Manual => None,
         };
         let always = [
             (run, "makes a part"),
-            ("regrind runs", "what was made, and how it ended"),
-            ("regrind audit verify", "is the record of the newest run unbroken?"),
+            ("regrind runs", "the list of the runs and their results"),
+            ("regrind audit verify", "verifies the record of the newest run"),
         ];
         let checked = [
             ("regrind check recipe.toml cell.toml", "every problem with its line, column and remedy"),
-            ("regrind plan recipe.toml --cell cell.toml", "what would be commanded, and how long it takes"),
+            ("regrind plan recipe.toml --cell cell.toml", "shows the commands of a run and their duration"),
         ];
         checked.into_iter().chain(before).chain(always).collect()
     }
@@ -105,7 +105,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     make(&folder, machines, recipe_of(recipe, shipped_name, name), name)
 }
 
-/// Files to create.
+/// Settings of the new folder, from the arguments or from the answers of a person.
 struct InitSettings {
     folder: PathBuf,
     machines: Machines,
@@ -187,7 +187,7 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
     Ok(Outcome::Accepted)
 }
 
-/// Returns the recipe with the name of the new part.
+/// Returns a shipped recipe with the name of the new part, and with paths in the new folder.
 fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
     let named = toml::Value::String(name.to_owned()).to_string();
     shipped
@@ -198,7 +198,7 @@ fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
         .replace("config/file-exchange.toml", "cell.toml")
 }
 
-/// Returns the cell file for a separate folder, with the files that it names in that folder.
+/// Returns a shipped cell file with paths in the new folder.
 fn cell_of(shipped: &str) -> String {
     let text = shipped
         .replace("../docs/cell.schema.json", "cell.schema.json")
@@ -227,7 +227,7 @@ fn readme(name: &str, machines: Machines) -> String {
 
 fn words(folder: &Path, machines: Machines) -> String {
     let mut text =
-        format!("made {}: recipe.toml, cell.toml, README.md and two schemas\nnext:\n  cd {0}\n", folder.display());
+        format!("created {}: recipe.toml, cell.toml, README.md and two schemas\nnext:\n  cd {0}\n", folder.display());
     for (command, _) in machines.commands() {
         let _ = writeln!(text, "  {command}");
     }

@@ -9,12 +9,12 @@ use serde::Deserialize;
 
 use super::failure::Failure;
 
-/// Maximum size of the file: far more than the result of a registration.
+/// Maximum size of the file in bytes, far above the size of registration.json.
 const MAX_BYTES: u64 = 64 << 20;
 
 type Rows = [[f64; 4]; 4];
 
-/// The one key of an earlier registration that is read.
+/// The only key that is read from the registration.json of an earlier registration.
 #[derive(Deserialize)]
 struct Earlier {
     cmm_from_model: Rows,

@@ -66,24 +66,24 @@ fn made_or_read(path: &Path) -> Result<(AuditKey, bool), JournalError> {
 }
 
 fn in_words(public: &PublicKey, path: &Path, made: bool) -> String {
-    let made = if made { "made now" } else { "was there" };
+    let made = if made { "created now" } else { "existed already" };
     let fingerprint = public.fingerprint();
     format!(
         "public key   {public}\nfingerprint  {fingerprint}\nfile         {}, {made}\n\n\
          Runs of this user sign their records with it from now on. Keep the public key where nobody at this computer can change it:\n\
-         give it to quality, who proves a record with `regrind audit verify --key`. The file itself stays here and goes into no\n\
-         copy that others can read. Without it no record is lost; later ones are signed with another key.\n",
+         give it to the quality department, which verifies records with `regrind audit verify --key`. Keep the key file on this\n\
+         computer, and in no copy that others can read. If it is lost, no record is lost, but later runs need another key.\n",
         path.display()
     )
 }
 
-/// Place of a user's key.
+/// Location of the key file of a user.
 enum Place {
-    /// Named by the user: the key must exist.
+    /// File that REGRIND_KEY names; it must exist.
     Named(PathBuf),
-    /// Excluded by the user: no key is used.
+    /// REGRIND_KEY is empty: no key is used.
     Nowhere,
-    /// Default folder of settings. The key is optional.
+    /// File in the folder of the user's settings; it is optional. `None` if there is no such folder.
     Usual(Option<PathBuf>),
 }
 
@@ -114,13 +114,15 @@ pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
     AuditKey::read(&path).map(Some).map_err(Failure::Journal)
 }
 
-/// Parses a public key of the command line: its digits, or the path of its file.
+/// Parses a public key of the command line: its 64 hexadecimal digits, or the path of a file with the output of
+/// `regrind audit key`.
 pub(super) fn public(word: &str) -> Result<PublicKey, String> {
     if let Ok(key) = word.parse() {
         return Ok(key);
     }
     let text = std::fs::read_to_string(word).map_err(|error| {
-        format!("neither 64 small hexadecimal digits nor a file ({error}); give what `regrind audit key` printed")
+        format!("neither 64 lower-case hexadecimal digits nor a file ({error}); give what `regrind audit key` printed")
     })?;
-    PublicKey::from_text(&text).map_err(|()| "no public key in it; give what `regrind audit key` printed".to_owned())
+    PublicKey::from_text(&text)
+        .map_err(|()| "the file contains no public key; give what `regrind audit key` printed".to_owned())
 }

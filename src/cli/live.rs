@@ -26,7 +26,7 @@ pub(super) struct RunContext<'a> {
     pub(super) part: &'a str,
     /// Folder of the run.
     pub(super) folder: &'a Path,
-    /// Number of the part's run, for the machines.
+    /// Number that identifies this run at the machines.
     pub(super) job: u32,
     pub(super) actor: Actor,
     pub(super) json: bool,
@@ -50,7 +50,8 @@ pub(super) struct PreparedRun {
 }
 
 impl RunContext<'_> {
-    /// Locks the machines and opens their wires. Sends nothing to them. `now` is the time as an epoch.
+    /// Locks the machines and opens their wires. Sends nothing to them. `now` is the current time in s, as
+    /// [`super::run::epoch`] returns it.
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
         let taken = [
@@ -92,13 +93,14 @@ impl RunContext<'_> {
         let report = regrind::report::write_run_report(self.folder);
         shown??;
         if let Err(error) = report {
-            super::print(&format!("no report: {error}\n"))?;
+            super::print(&format!("the report was not written: {error}\n"))?;
         }
         Ok(ending)
     }
 }
 
-/// Gives the machines to the run and starts it.
+/// Runs the cell with its machines until the run ends. Meanwhile, passes on orders from the control sockets, from the
+/// terminal and from signals.
 async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let Machines { cmm, grinder, taken } = machines;
@@ -108,7 +110,10 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
     if let Some(door) = taken.iter().flatten().map(MachineLock::control_socket).next()
         && let Err(error) = drive.listen_also_at(door)
     {
-        eprintln!("{}: no orders come in there: {error}", regrind::document::visible(&door.display().to_string()));
+        eprintln!(
+            "{}: orders cannot be received there: {error}",
+            regrind::document::visible(&door.display().to_string())
+        );
     }
     let endings = Endings::new().map_err(Failure::Signals)?;
     let heeding = [
@@ -121,7 +126,8 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
     Ok(ending)
 }
 
-/// Holds at the next safe place on the first Ctrl-C and aborts on the second. After a resume the count starts again.
+/// Holds the cell at the next safe place on the first Ctrl-C, and aborts it on the second. After a resume, the next
+/// Ctrl-C counts as the first one, except within [`IN_ONE_GO`].
 async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
@@ -136,8 +142,8 @@ async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     }
 }
 
-/// Confirms the loaded part on Enter, if a person at this terminal is asked for it. Keys pressed earlier confirm
-/// nothing.
+/// Confirms the loaded part when a person presses Enter at this terminal while the cell waits for this confirmation.
+/// Keys pressed earlier are discarded.
 async fn heed_enter(orders: OrderSender, actor: Actor) {
     let mut status = orders.status();
     if status.wait_for(|seen| seen.next_step == NextStep::Load).await.is_err() || !reads_keys() {
@@ -163,10 +169,11 @@ async fn heed_enter(orders: OrderSender, actor: Actor) {
     }
 }
 
-/// Time between two checks whether a person is still asked.
+/// Time between two checks whether the cell still waits for the confirmation of the loaded part.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// Ends the run in order on the first event and aborts it on the next. A closing terminal can send the event twice.
+/// Stops the run in order on the first event from outside, and aborts it on the next. A closing terminal can send its
+/// event twice: the second one is ignored within [`IN_ONE_GO`].
 async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     let mut first: Option<Instant> = None;
     while let Some(outside::Ending { by, hung_up }) = endings.next().await {
@@ -198,8 +205,8 @@ pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> 
     Ok(taken)
 }
 
-/// Returns the number of this run as a client of its machines. It depends only on the station and the run folder, so it
-/// is the same for every person who resumes the run.
+/// Returns the number that identifies this run as a client of its machines. It depends only on the station and the run
+/// folder, so it is the same for every person who resumes the run.
 pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");
@@ -221,5 +228,6 @@ pub(super) fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
     }
 }
 
-/// Two presses within this time count as one, even if the state of the cell changed after the first.
+/// Time after the first Ctrl-C in which a second one always aborts, even if the cell executes again by then. Also the
+/// time in which the second event of a closing terminal is ignored.
 const IN_ONE_GO: Duration = Duration::from_secs(3);

@@ -214,7 +214,7 @@ fn name(text: &str) -> Result<String, String> {
     const LONGEST: usize = 300;
     match (misleading(text), text.trim()) {
         (Some(hidden), _) => Err(format!(
-            "it has the character U+{:04X}, which is not seen or turns what is read; type it anew",
+            "it has the character U+{:04X}, which is invisible or changes the order of the letters; type the text again",
             u32::from(hidden)
         )),
         (None, "") => Err("it is empty".into()),

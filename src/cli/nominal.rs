@@ -30,7 +30,7 @@ impl NominalTable {
     }
 }
 
-/// Reads a nominal file. `table` describes a table of points where the file itself does not.
+/// Reads a nominal file. `table` gives the columns and the unit of a table of points whose header does not state them.
 ///
 /// # Errors
 /// Returns an error if the file cannot be read, if columns are missing, or if a projection is given for anything but a
@@ -68,7 +68,8 @@ pub(super) fn sampled(path: &Path, text: &str) -> Result<SampledSurface, Failure
     sample().map_err(|source| Failure::Definition { path: path.to_owned(), source })
 }
 
-/// Returns the kind of source of a nominal surface, in words.
+/// Returns the kind of a nominal surface as text: grid with its size, scattered points with their projection, mesh, or
+/// number of patches.
 pub(super) fn kind_in_words(kind: NominalKind) -> String {
     match kind {
         NominalKind::Grid { columns, rows } => format!("grid of {} x {}", count(columns), count(rows)),

@@ -50,7 +50,7 @@ struct Document {
     part_identity: String,
     nominal_points: usize,
     targets: usize,
-    /// Whether they are touched batch by batch until enough is known.
+    /// True if the targets are touched in batches, and the measurement ends when enough is known.
     touches_are_chosen: bool,
     sphere_points: usize,
     most_cycles: u32,
@@ -70,13 +70,13 @@ struct Document {
     /// Volume that the wheel loses in one pass; absent if the recipe gives no grinding ratio.
     #[serde(skip_serializing_if = "Option::is_none")]
     wheel_loss_mm3_a_pass: Option<f64>,
-    /// The passes that the recipe allows, and the measurements beside them.
+    /// Maximum number of passes and of measurements that the recipe allows.
     most_passes: u32,
     most_measurements: u32,
     /// Minimum duration of one measurement, from its search moves alone; absent if the operator takes the points.
     #[serde(skip_serializing_if = "Option::is_none")]
     least_measuring_minutes: Option<f64>,
-    /// All passes and what is known of all measurements.
+    /// Hours of all passes, plus the minimum duration of all measurements.
     least_hours_to_last: f64,
     /// Warnings to read before the run.
     warnings: Vec<String>,
@@ -86,31 +86,32 @@ struct Document {
     /// Arcs of the program of one pass; absent if the cell does not require arcs.
     #[serde(skip_serializing_if = "Option::is_none")]
     arcs: Option<ArcsDocument>,
-    /// The dialect that it is written in.
+    /// Name of the dialect of the program.
     dialect: String,
-    /// How the head tilts the wheel; absent where it does not.
+    /// Tilt of the wheel by the head; absent if the head does not tilt the wheel.
     #[serde(skip_serializing_if = "Option::is_none")]
     tilt: Option<TiltDocument>,
-    /// Why none can be made.
+    /// Reason why no program can be made; absent if one can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     no_program: Option<String>,
-    /// Whether a run would begin with what an earlier one learned.
+    /// True if the recipe lets a run start from the learned error of an earlier run.
     learns: bool,
 }
 
-/// Pass in arcs, compared with the same pass in lines.
+/// Program of a pass with arcs, compared with the program of the same pass with lines only.
 #[derive(Serialize)]
 struct ArcsDocument {
     arcs: u64,
-    /// Lines at feed that are left.
+    /// Number of lines at feed that no arc replaces.
     lines: u64,
-    /// Arcs and lines for each second at feed; the same of lines alone.
+    /// Number of moves (arcs and lines) per second at feed, and the same number for the program with lines only.
     moves_per_second: f64,
     lines_alone_per_second: f64,
-    /// How far an arc is from the path at most.
+    /// Maximum distance of an arc from the path, and its limit.
     largest_deviation_um: f64,
     within_um: f64,
-    /// Largest angle between the end of one move and the beginning of the next; the same of lines alone.
+    /// Largest angle between the direction at the end of a move and the direction at the start of the next move, and
+    /// the same angle for the program with lines only.
     largest_corner_mrad: f64,
     lines_alone_corner_mrad: f64,
 }
@@ -147,14 +148,15 @@ impl ArcsDocument {
     }
 }
 
-/// Tilt of the wheel by the head, on the scale of its axis.
+/// Tilt of the wheel by the head, in readings of its rotary axis.
 #[derive(Serialize)]
 struct TiltDocument {
     axis: char,
     least_deg: f64,
     most_deg: f64,
     largest_rate_deg_min: f64,
-    /// Between the upright direction of the head and the normals of the part, at least: at 0 the pole of a ball stands still where it touches.
+    /// Minimum angle between the upright direction of the head and the normals of the part. At 0, a spherical wheel
+    /// touches with its pole, where the surface speed is 0.
     least_lean_deg: f64,
 }
 
@@ -175,7 +177,7 @@ impl TiltDocument {
     fn in_words(&self) -> String {
         let n = three_digits;
         format!(
-            "tilt        {} from {} to {} degrees, {} degrees a minute at most; the normal is {} degrees and more from upright in the head\n",
+            "tilt        {} from {} to {} degrees, {} degrees a minute at most; the normals are at least {} degrees from the upright direction of the head\n",
             self.axis,
             n(self.least_deg),
             n(self.most_deg),
@@ -205,7 +207,8 @@ impl ScallopsDocument {
         Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
     }
 
-    /// Returns the tolerances of which the scallops take more than their share, each with that share.
+    /// Returns the tolerances of which the scallops use more than [`MAX_SCALLOP_SHARE`]. Each text has the used
+    /// percentage and the recipe key.
     fn beyond(&self) -> Vec<String> {
         let taken = [
             ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),
@@ -318,7 +321,8 @@ fn arcs_of(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> Result<Opt
 }
 
 /// Returns the minimum measuring time in minutes: the time in which the probe searches every target from its approach
-/// distance. The moves between targets are not included, because the measuring machine chooses them.
+/// distance. The moves between targets are not included, because the measuring machine chooses them. Returns `None` if
+/// the recipe has no targets.
 fn min_measuring_minutes(task: &Task) -> Option<f64> {
     let targets = task.targets.len() + task.reference_sphere.map_or(0, |sphere| sphere.points);
     let seconds = targets as f64 * task.probing.approach_mm / task.probing.speed_mm_s;
@@ -331,7 +335,7 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     let mut warnings = Vec::new();
     if grinding_minutes > MAX_MINUTES {
         warnings.push(format!(
-            "a pass takes {} h, more than a shift of {} h: {} mm of path at {} mm/min; see that grinding.feed_mm_min is not in mm/s and that \
+            "a pass takes {} h, more than a shift of {} h: {} mm of path at {} mm/min; check that grinding.feed_mm_min is not in mm/s and that \
              grinding.track_mm is not too small",
             n(grinding_minutes / 60.0),
             MAX_MINUTES / 60.0,
@@ -342,7 +346,7 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MAX_MINUTES) {
         warnings.push(format!(
             "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; see measure.speed_mm_s and how many \
-             points are asked for",
+             points are required",
             n(minutes / 60.0),
             MAX_MINUTES / 60.0,
             counted(task.targets.len(), "point"),
@@ -359,8 +363,8 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
     (!beyond.is_empty()).then(|| {
         format!(
-            "the scallops between the tracks take {}, more than {} %, and no correction takes them back; write grinding.track_mm = {} or less, or \
-             take a wheel that is blunter across the tracks",
+            "the scallops between the tracks take {}, more than {} %, and no correction can remove them; write grinding.track_mm = {} or less, or \
+             use a wheel with a larger radius across the tracks",
             beyond.join(" and "),
             100.0 * MAX_SCALLOP_SHARE,
             setup::track_for_tolerance_mm(recipe, &scallops),
@@ -372,7 +376,7 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
 fn time_in_words(d: &Document) -> String {
     let n = three_digits;
     let measurements = counted(d.most_measurements as usize, "measurement");
-    let measuring = d.least_measuring_minutes.map_or("of a time that is not known".to_owned(), |minutes| {
+    let measuring = d.least_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
         format!("of {} minutes and more by the search moves alone", n(minutes))
     });
     format!(
@@ -389,17 +393,15 @@ fn removal_in_words(d: &Document) -> String {
     let n = three_digits;
     let most = f64::from(d.most_passes);
     let wheel = match d.wheel_loss_mm3_a_pass {
-        Some(loss) => format!(
-            "the wheel loses about {} mm3 by it, {} mm3 by all passes that are allowed",
-            n(loss),
-            n(most * loss)
-        ),
-        None => "what the wheel loses by it is told where grinding.grinding_ratio is given".to_owned(),
+        Some(loss) => {
+            format!("the wheel loses about {} mm3 in a pass, {} mm3 in all allowed passes", n(loss), n(most * loss))
+        }
+        None => "the loss of the wheel is unknown; set grinding.grinding_ratio to estimate it".to_owned(),
     };
     format!("about {} mm3 a pass; {wheel}", n(d.removed_mm3_a_pass))
 }
 
-/// Plans and checks the path of the first pass. Returns `None` if only the grinder's controller can plan one.
+/// Plans and checks the path of the first pass. Returns `None` if only the controller of the grinder can plan the path.
 pub(super) fn first_path(
     task: &Task,
     recipe: &Recipe,
@@ -419,7 +421,7 @@ fn words(d: &Document) -> String {
     let arcs = d.arcs.as_ref().zip(d.program_points);
     let arcs = arcs.map_or(String::new(), |(arcs, points)| format!("arcs        {}\n", arcs.in_words(points)));
     let learns = if d.learns {
-        "learn       a run begins with the correction that the last one like it left; what is told and written here is without it\n"
+        "learn       a run starts with the correction that the last similar run learned; this plan is without that correction\n"
     } else {
         ""
     };
@@ -432,7 +434,7 @@ fn words(d: &Document) -> String {
         counted(d.nominal_points, "point"),
         d.part_identity,
         match (d.targets, d.touches_are_chosen) {
-            (0, _) => "where the operator takes the points".to_owned(),
+            (0, _) => "points that the operator chooses".to_owned(),
             (targets, false) => counted(targets, "point"),
             (targets, true) =>
                 format!("{FIRST_BATCH} of {}, then batches until enough is known", counted(targets, "point")),
@@ -441,7 +443,9 @@ fn words(d: &Document) -> String {
         d.tracks,
         n(d.path_mm),
         n(d.grinding_minutes),
-        d.scallops.as_ref().map_or("not told where no path is laid".to_owned(), |told| told.in_words(d.track_mm)),
+        d.scallops
+            .as_ref()
+            .map_or("unknown, because no path can be planned here".to_owned(), |told| told.in_words(d.track_mm)),
         n(d.first_level_um),
         n(d.depth_of_cut_um),
         n(d.last_level_um),

@@ -49,7 +49,7 @@ pub(super) struct Arguments {
     /// Print a line of JSON for each event
     #[arg(long)]
     json: bool,
-    /// End a little after standard input does: with the program that began this one
+    /// End shortly after the end of standard input, that is, after the end of the program that started this one
     #[arg(long, hide = true)]
     while_stdin: bool,
 }
@@ -84,14 +84,14 @@ fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
     match &config.cell {
         _ if config.sparkplug.is_none() && config.opcua.is_none() => {
-            missing("sparkplug", "say by [sparkplug] or [opcua] to whom the cell is told")
+            missing("sparkplug", "name the receiver of the values in a table [sparkplug] or [opcua]")
         }
         Some(cell) => Ok(cell.clone()),
-        None => missing("plant.cell", "say what this cell is called"),
+        None => missing("plant.cell", "give the name of this cell"),
     }
 }
 
-/// Waits until no other program publishes this cell.
+/// Waits until no other program publishes this cell, and returns the publisher lock.
 async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<PublisherLock, Failure> {
     let folder = config.path().with_extension("live");
     let mut waits = false;
@@ -100,7 +100,7 @@ async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<Pu
             return Ok(turn);
         }
         if !std::mem::replace(&mut waits, true) && !arguments.while_stdin {
-            eprintln!("tell: another program tells this cell already; this one waits until that has ended");
+            eprintln!("tell: another program publishes this cell already; this program waits until the other one ends");
         }
         tokio::time::sleep(ROUND).await;
     }
@@ -211,12 +211,12 @@ async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, j
         for news in some.drain(..) {
             match news {
                 PublisherEvent::Connected { place } => {
-                    say(json, &json!({ "tells": place }), &format!("{place} is told from now on"))
+                    say(json, &json!({ "tells": place }), &format!("publishing to {place}"))
                 }
                 PublisherEvent::Retrying { place, why } => say(
                     json,
                     &json!({ "waits": place, "why": why }),
-                    &format!("{place} is not told for now: {why}; the cell goes on, and it is tried again"),
+                    &format!("not publishing to {place}: {why}; the cell continues, and this program tries again"),
                 ),
                 PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => {
                     refuse(&runs, json, &by, &what).await
@@ -227,7 +227,8 @@ async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, j
         }
         let over = matches!(heard, Ok(0));
         if let Some(more) = quota.summed_up(Instant::now(), over) {
-            refuse(&runs, json, "the same or others", &format!("{more} more of what cannot be done from there")).await;
+            refuse(&runs, json, "these or other clients", &format!("{more} further requests that are not allowed"))
+                .await;
         }
         if over {
             return;
@@ -255,7 +256,7 @@ impl Quota {
         }
     }
 
-    /// Returns true if one more refusal is reported individually.
+    /// Counts a refusal, and returns true if it is to be reported individually.
     fn takes(&mut self, now: Instant) -> bool {
         self.turn(now);
         self.reported += 1;
@@ -278,7 +279,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     say(
         json,
         &json!({ "refused": what, "by": by }),
-        &format!("refused to {by}: {what}; live values are only to be looked at"),
+        &format!("refused a request of {by}: {what}; live values can only be read"),
     );
     let runs = runs.to_owned();
     let remark = Request::Remark { what: format!("live values: refused: {what}") };
@@ -289,7 +290,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
         Some(regrind_control::send_request_on_behalf(&run, &remark, Some(by)).is_ok_and(|reply| reply.taken))
     });
     if recorded.await.ok().flatten() == Some(false) {
-        eprintln!("tell: the run did not take it on record");
+        eprintln!("tell: the run did not record the refused request");
     }
 }
 

@@ -111,10 +111,10 @@ impl Recovery {
         let Some(settings) = settings else {
             let words = match (link.wire.ippdme_address(), link.wire.linuxcncrsh_address()) {
                 (Some(_), _) => {
-                    "its server keeps no job, so there is none to end; see at the machine that the probe is clear"
+                    "its server stores no job, so no job has to be ended; check at the machine that the probe is clear"
                 }
-                (_, Some(_)) => "its controller keeps no job; end a program that runs or is paused at the machine",
-                _ => "it tells nothing over a wire; bring it home at the machine",
+                (_, Some(_)) => "its controller stores no job; if a program runs or is paused, end it at the machine",
+                _ => "it reports nothing over a wire; bring it to idle at the machine",
             };
             super::print(&format!("{device}: {words}\n"))?;
             return Ok(false);
@@ -134,12 +134,12 @@ impl Recovery {
             let Some(step) = RecoveryStep::for_state(seen.state) else { return Ok(true) };
             if let Some(run) = seen.job.and_then(|job| self.run_of(job.job)) {
                 super::print(&format!(
-                    "  this is the job of {run}, which broke off: `regrind resume {run}` goes on with it; recover only if that is refused\n"
+                    "  this is a job of the interrupted run {run}: `regrind resume {run}` continues it; recover only if resume is refused\n"
                 ))?;
             }
             super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.consequence(device)))?;
             if answer()? != step.name() {
-                super::print("it is left as it is\n")?;
+                super::print("the machine is left in this state\n")?;
                 return Ok(false);
             }
             match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await
@@ -152,7 +152,8 @@ impl Recovery {
         }
     }
 
-    /// Returns the local run without a recorded end to which a job belongs.
+    /// Returns the folder of the run on this computer that has this job number and no recorded end; `None` if there is
+    /// none.
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;

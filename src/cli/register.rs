@@ -235,7 +235,7 @@ fn form_in_words(form: &Form) -> String {
     let Form { hyperparameters, figures, frame_covariance, .. } = form;
     let drift = match hyperparameters.noise_autocorrelation {
         0.0 => String::new(),
-        drift => format!(", of which the next point along the path has {} %", (100.0 * drift).round()),
+        drift => format!(", correlated by {} % with the next point along the path", (100.0 * drift).round()),
     };
     let lay = hyperparameters.field.anisotropy.angle_rad().map_or(String::new(), |angle_rad| {
         let (times, degrees) = (three_digits(hyperparameters.field.anisotropy.stretch), angle_rad.to_degrees().round());
@@ -245,15 +245,15 @@ fn form_in_words(form: &Form) -> String {
     let areas = area_in_words(form);
     let few = match form.is_underdetermined {
         true => format!(
-            "warning     {} degrees of freedom are too few to tell the form from the scatter, 20 do: the upper ends are those of a form that is all \
-             of what was found; touch more points\n",
+            "warning     {} degrees of freedom are too few to separate the form from the noise, 20 are enough: the upper limits assume that the whole \
+             deviation is form; measure more points\n",
             form.degrees_of_freedom
         ),
         false => String::new(),
     };
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       the form is {} µm strong and {} mm wide{lay}, a point scatters by {} µm{drift}\n\
-         frame       known to {sigma} µm along x, y, z beside that form\n",
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       form with standard deviation {} µm and range {} mm{lay}; noise of a point {} µm{drift}\n\
+         frame       standard uncertainty {sigma} µm along x, y, z, with that form unknown\n",
         within(&figures.rms),
         within(&figures.pv),
         within(&figures.pv_998),

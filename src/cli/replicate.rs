@@ -46,7 +46,7 @@ pub(super) struct Arguments {
     /// Print a line of JSON for each event
     #[arg(long)]
     json: bool,
-    /// End a little after standard input does: with the program that began this one
+    /// End shortly after the end of standard input, that is, after the end of the program that started this one
     #[arg(long, hide = true)]
     while_stdin: bool,
 }
@@ -82,7 +82,7 @@ struct Replication<'a> {
     shipper: Replicator,
     link: Option<DatabaseLink>,
     arguments: &'a Arguments,
-    /// Last known status of the cell. `None` while it is being read.
+    /// Monitor of the status of the cell. `None` before the first round, and while the status is read.
     monitor: Option<CellMonitor>,
     /// True if the message about an unreachable plant was printed.
     waits: bool,
@@ -94,12 +94,13 @@ impl Replication<'_> {
         self.ended()
     }
 
-    /// Returns the outcome of the command: whether any copy differs.
+    /// Returns the outcome of the command: `NotInTolerance` if any run differs from its copy at the plant.
     fn ended(&self) -> Result<Outcome, Failure> {
         Ok(if self.shipper.skipped().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
     }
 
-    /// Runs rounds. If requested, ends shortly after standard input is closed.
+    /// Replicates in rounds; retries while the plant cannot be reached. With `--while-stdin`, ends shortly after
+    /// standard input is closed.
     async fn go_on(&mut self) -> Result<(), Failure> {
         let mut over = self.arguments.while_stdin.then(end_of_input);
         let mut last = None;
@@ -185,7 +186,7 @@ impl Replication<'_> {
     /// Prints once that the plant is unreachable.
     fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
-            eprintln!("ship: {error}; the cell goes on, and its records wait for it here");
+            eprintln!("ship: {error}; the cell continues, and its records wait here until the plant can be reached");
         }
         Ok(())
     }

@@ -74,7 +74,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))
 }
 
-/// Continues an interrupted run. Everything is checked before anything opens.
+/// Continues an interrupted run. Checks the record, the recipe, the cell file and the task before it opens a machine.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
     // From here on, another program that resumes or verifies the run finds it driven.
@@ -94,7 +94,9 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     if !arguments.json {
         let marked = if cell.is_marked_simulation() { "SIMULATION  " } else { "" };
         let state = interrupted.describe_state();
-        super::print(&format!("{marked}broke off in {state}\nthe record is whole, and done again nothing differs\n"))?;
+        super::print(&format!(
+            "{marked}interrupted in {state}\nthe record is complete, and its replay gives the same results\n"
+        ))?;
     }
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
@@ -103,7 +105,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let machines = live.open(epoch(SystemTime::now()))?;
         let mut journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
         if let Some(what) = &begun.lost {
-            let remark = format!("gone on with by --despite-loss, though the end of the record may be lost: {what}");
+            let remark = format!("resumed with --despite-loss, although the end of the record may be lost: {what}");
             let Actor { name: actor, station } = live.actor.clone();
             let note = Entry::new(RecordKind::Note, 0, begun.cycle, json!({ "remark": remark }));
             let entry = Entry { actor, station, ..note };
@@ -125,7 +127,7 @@ fn is_bare(run: &Path) -> bool {
 struct RunStart {
     recipe: PathBuf,
     cell: PathBuf,
-    /// Where relative paths begin.
+    /// Working folder of the program that began the run; relative paths start there.
     working_folder: PathBuf,
     nominal_sha256: String,
     setting: String,
@@ -136,10 +138,10 @@ struct RunStart {
     table_version: u32,
     #[serde(default)]
     rehearsal: bool,
-    /// Text about records that may be lost, if a person continues in spite of it.
+    /// Reason why records may be lost, if a person continues with `--despite-loss`.
     #[serde(skip)]
     lost: Option<String>,
-    /// The last cycle of the record.
+    /// Highest cycle number in the record.
     #[serde(skip)]
     cycle: u32,
     /// The files that are on record, by their names: nothing else of the folder is read.
@@ -188,8 +190,10 @@ impl RunStart {
             what: error.to_string(),
         })?;
         if begun.table_version != TABLE_VERSION {
-            let what =
-                format!("it decides by table {}, and this program by table {TABLE_VERSION}", begun.table_version);
+            let what = format!(
+                "it uses version {} of the transition table, and this program uses version {TABLE_VERSION}",
+                begun.table_version
+            );
             return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
         }
         for record in records().filter(|record| record.kind == RecordKind::Artefact) {
@@ -208,7 +212,8 @@ impl RunStart {
     fn text(&self, run: &Path, name: &str) -> Result<String, Failure> {
         let path = run.join(name);
         let Some(file) = self.files.get(name) else {
-            let source = std::io::Error::new(std::io::ErrorKind::NotFound, "it is on no record of this run");
+            let source =
+                std::io::Error::new(std::io::ErrorKind::NotFound, "the record of this run does not contain it");
             return Err(Failure::File(FormatError::Unreadable { path, source }));
         };
         String::from_utf8(file.read(run).map_err(Failure::Journal)?).map_err(|error| {

@@ -69,7 +69,7 @@ pub(super) struct Arguments {
     #[cfg(feature = "plant")]
     #[arg(long, value_name = "FILE")]
     pub(super) plant: Option<PathBuf>,
-    /// The part of a plant's queue that it makes
+    /// Part from the queue of the plant that this run makes
     #[cfg(feature = "plant")]
     #[arg(skip)]
     pub(super) work: Option<Box<super::run_queue::ConfirmedPart>>,
@@ -188,7 +188,8 @@ async fn carry_out(
     live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await
 }
 
-/// Returns a number that increases from program to program.
+/// Returns a time as whole seconds since 1970 (31 bits, at least 1), so that a program that starts later has a higher
+/// number.
 pub(super) fn epoch(now: SystemTime) -> u32 {
     let seconds = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     u32::try_from(seconds & 0x7fff_ffff).unwrap_or(1).max(1)
@@ -220,7 +221,7 @@ impl EarlierKnowledge {
         Ok(earlier)
     }
 
-    /// Initialises a task with the usable knowledge of other cells of the plant.
+    /// Initialises a task with the learned results of other cells of the plant, if they can be used.
     #[cfg(feature = "plant")]
     fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::query_knowledge(plant, task)?;
@@ -283,17 +284,18 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
             others.comparisons
         ),
         true => format!(
-            "begins with the form knowledge from {runs}, and without a correction: {}\n",
+            "begins with the form statistics that {runs} learned, but without a correction: {}\n",
             match others.comparisons {
                 0 =>
                     "machine similarity is unknown: grind one recipe on two machines, or set `[plant] machines_differ`",
-                _ => "the machines have nothing in common",
+                _ => "the compared machines show no common error",
             }
         ),
     }
 }
 
-/// Returns true if the machines of a cell are simulated in this process. Only then can a port be left open.
+/// Returns true if the machines of a cell are simulated in this process. Only then can the cell file leave a port open
+/// (0).
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &LinkConfig| {
         matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
@@ -354,8 +356,7 @@ fn begin(
     Ok(journal)
 }
 
-/// Records the initial correction of a first pass from learned knowledge, and its program, as if an earlier cycle had
-/// made it.
+/// Saves the correction of the first pass and its program in the folder `cycle-0`, and records the files.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
     let folder = journal.folder().join("cycle-0");
     for name in task.save_first_pass(&folder).map_err(Failure::Programs)? {

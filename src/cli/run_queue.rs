@@ -165,7 +165,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     let read = match check::or_show(Recipe::read(&path)) {
         Ok(read) => read,
         Err(error) => {
-            lease.hand_back(&link, "its recipe is not as it should be for this cell's program").await?;
+            lease.hand_back(&link, "the program of this cell rejects its recipe").await?;
             return Err(error);
         }
     };
@@ -177,7 +177,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
         true => Ok(Next::Part(path, Box::new(ConfirmedPart { config: config.clone(), lease }))),
         false => {
             lease.hand_back(&link, "nobody at the cell confirmed it").await?;
-            super::print("it is given back\n")?;
+            super::print("the part is given back\n")?;
             Ok(Next::GivenBack)
         }
     }
@@ -197,7 +197,7 @@ async fn confirmed(
     if !recipe.cycle.confirm_work {
         return Ok(true);
     }
-    super::print("  type or scan its serial number to begin it, anything else gives it back: ")?;
+    super::print("  type or scan the serial number of the part to begin it; any other input gives it back: ")?;
     let mut answer = tokio::task::spawn_blocking(recover::answer);
     loop {
         tokio::select! {
@@ -211,7 +211,7 @@ async fn confirmed(
     }
 }
 
-/// Returns an error if a part that began here has not ended. No further part is taken then.
+/// Returns an error if the run of a part that this cell has started is not over: then the cell takes no further part.
 async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure> {
     for begun in StartedPart::all(link).await? {
         let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
@@ -220,15 +220,15 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             RunProgress::Over => continue,
             RunProgress::UnderWay => {
                 let why = format!(
-                    "run {run} of {serial} is not over: regrind resume {}; where that is refused: regrind work --give-up {serial} --why \"...\"",
+                    "run {run} of {serial} is not over: regrind resume {}; if resume is refused: regrind work --give-up {serial} --why \"...\"",
                     folder.display()
                 );
                 return Err(Failure::OpenWork { why });
             }
             RunProgress::Nowhere => {
-                format!("of which there is no record in {}; look whether anything was ground: if not", runs.display())
+                format!("which has no record in {}; check whether the part was ground; if it was not", runs.display())
             }
-            RunProgress::Begun => "in which nothing was asked of a machine".to_owned(),
+            RunProgress::Begun => "which sent no request to a machine".to_owned(),
         };
         let why = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
         return Err(Failure::OpenWork { why });
@@ -236,30 +236,30 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
     Ok(())
 }
 
-/// Returns a part without a run to the queue, or gives it up for the reason in `up`.
+/// Returns a started part to the queue if its run did nothing, or gives the part up for the reason in `up`.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
     let Some(begun) = begun else {
-        super::print(&format!("{serial} is not begun by this cell\n"))?;
+        super::print(&format!("{serial} was not started by this cell\n"))?;
         return Ok(Outcome::NotInTolerance);
     };
     let (run, folder) = (&begun.run, runs.join(&begun.run));
     let refused = |why: String| Err(Failure::OpenWork { why });
     if is_live(&folder) {
-        return refused(format!("run {run} of {serial} is on; regrind stop ends it"));
+        return refused(format!("run {run} of {serial} is active; regrind stop ends it"));
     }
     if let Some(why) = up {
         begun.give_up(&link, why).await?;
-        super::print(&format!("{serial} is given up; it is made again where a planner queues it\n"))?;
+        super::print(&format!("{serial} is given up; it is made again only if a planner queues it again\n"))?;
         return Ok(Outcome::Accepted);
     }
     if matches!(run_progress(&folder), RunProgress::UnderWay | RunProgress::Over) {
         return refused(format!(
-            "run {run} of {serial} is here: regrind resume goes on with it, regrind work --give-up ends it"
+            "run {run} of {serial} has a record here: regrind resume continues it, regrind work --give-up gives the part up"
         ));
     }
-    begun.give_back(&link, "nothing came of its run").await?;
+    begun.give_back(&link, "its run did nothing").await?;
     super::print(&format!("{serial} is given back to the queue\n"))?;
     Ok(Outcome::Accepted)
 }
@@ -306,7 +306,7 @@ fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Fail
         let inside = Path::new(name);
         if !plant::is_below(inside) {
             let what = format!(
-                "{} names the file {name:?}, which would lie outside of its folder; bring it anew",
+                "{} names the file {name:?}, which would lie outside of its folder; propose the recipe again",
                 recipe.name
             );
             return Err(PlantError::Recipe(what).into());

@@ -68,7 +68,7 @@ fn in_words(run: &Listed) -> String {
     let counted = format!("{cycles} cycle{}", if cycles == 1 { "" } else { "s" });
     let ended = match summary.result {
         _ if *is_live => "on now",
-        RunResult::Open if summary.machines_within => "broke off, and its simulated machines with it",
+        RunResult::Open if summary.machines_within => "interrupted, and its simulated machines are gone",
         result => word(result),
     };
     format!("{}\n    {}  {}, {counted}{measured}\n", folder.display(), ended, summary.part)
@@ -81,7 +81,7 @@ fn word(result: RunResult) -> &'static str {
         RunResult::Stopped => "STOPPED",
         RunResult::Aborted => "ABORTED",
         RunResult::Recovery => "machines brought home",
-        RunResult::Open => "broke off: regrind resume",
+        RunResult::Open => "interrupted: regrind resume",
     }
 }
 

@@ -45,7 +45,7 @@ pub(super) struct Arguments {
     listen: SocketAddr,
     #[command(flatten)]
     door: PageAccess,
-    /// End when standard input does: with the program that began this one
+    /// End after the end of standard input, that is, after the end of the program that started this one
     #[arg(long, hide = true)]
     while_stdin: bool,
 }
@@ -66,7 +66,8 @@ pub(super) struct PageAccess {
 }
 
 impl PageAccess {
-    /// Listens at an address, if the page can be served there.
+    /// Listens at an address. Returns an error if other computers can reach the address and a certificate or the list
+    /// of users is missing.
     pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
         let Self { certificate, key, users } = self;
         let tls =
@@ -117,7 +118,7 @@ async fn end_of_input() {
     drop(end.await);
 }
 
-/// Page of a run. It ends shortly after the program that holds this value.
+/// Process that shows the page of a run. It ends shortly after the program that holds this value.
 pub(super) struct PageProcess {
     _page: Child,
 }
@@ -137,7 +138,7 @@ impl PageProcess {
     }
 }
 
-/// Plan of the run that was requested last.
+/// Cache of planned points: those of the run that was requested last.
 #[derive(Default)]
 struct PlannedPointsCache(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
 
@@ -155,7 +156,8 @@ impl PlannedPointsCache {
     }
 }
 
-/// Recomputes the planned points of a run from its stored recipe and cell file.
+/// Recomputes the planned points (x, y) of a run in mm from its stored recipe and cell file; `None` if one of them is
+/// missing or invalid.
 fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
     let first = Reader::open(run).ok()?.records(0).next()?.ok()?.value();
     let content = &first["content"];

@@ -21,7 +21,7 @@ use super::failure::Failure;
 use super::outside::is_in_front;
 use super::words::{judged, three_digits, time_left, wrapped};
 
-/// Minimum time between two lines without news.
+/// Minimum time between two lines about the progress of the same job.
 const QUIET: Duration = Duration::from_secs(2);
 
 /// Display of a run.
@@ -31,7 +31,8 @@ pub(super) struct Show {
     head: String,
     tolerance: Tolerance,
     folder: String,
-    /// True if touches are chosen. Their batches are too many to report the speed of each.
+    /// True if the measurement selects its touches in batches. The transfer speed is then not shown, because there are
+    /// too many batches.
     is_chosen: bool,
     bar: Option<ProgressBar>,
     /// Time of the last plain line about progress.
@@ -137,7 +138,7 @@ impl Show {
                     self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
                 }
                 if let Some(mm) = summary.map_rms_mm {
-                    self.line(&format!("cycle {cycle}: left for the map: {} µm RMS", three_digits(1e3 * mm)))?;
+                    self.line(&format!("cycle {cycle}: remaining error for the map: {} µm RMS", three_digits(1e3 * mm)))?;
                 }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
@@ -275,7 +276,8 @@ impl Show {
         self.striking(text, "", "")
     }
 
-    /// Prints lines. A terminal shows one word of them in colour and rings its bell.
+    /// Prints text. If `word` is not empty, a terminal shows its first occurrence in colour (`colour` is an ANSI code)
+    /// and rings its bell.
     fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
         // Parts of the text come from a machine or a file.
         let text = &visible(text);
@@ -321,7 +323,7 @@ fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// Returns the text for the work of a machine.
+/// Returns the text for the activity of a machine.
 fn doing(device: Device) -> &'static str {
     match device {
         Device::Cmm => "measuring",
@@ -346,7 +348,7 @@ pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_u
     )
 }
 
-/// Returns the name of the peak to valley that is judged.
+/// Returns the name of the peak-to-valley figure that has the limit: of all points, or of 99.8 % of them.
 pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     match tolerance.pv_of {
         PvPoints::All => "PV",
@@ -361,7 +363,8 @@ pub(super) fn limits(tolerance: &Tolerance) -> String {
     limits.map(|(name, mm)| format!("{name} {} µm", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the gains as text: one value, or from the shortest to the longest wavelength.
+/// Returns the gains (the second number of each pair) as text: one value, or the range from the smallest to the
+/// largest.
 fn gains(gains: &[[f64; 2]]) -> String {
     let least = gains.iter().map(|gain| gain[1]).fold(f64::INFINITY, f64::min);
     let most = gains.iter().map(|gain| gain[1]).fold(0.0, f64::max);

@@ -41,9 +41,9 @@ pub(super) struct SimulatedCell {
     dme: Option<ServingDme>,
     /// Measuring machine that prints its hits, and the folder for its list if the cell file names none.
     hits: Option<(ServingHits, Option<ScratchFolder>)>,
-    /// Links to terminals, placed at the device paths of serial lines.
+    /// Paths of the links to pseudo-terminals, which take the place of the serial devices.
     links: Vec<PathBuf>,
-    /// Truth of the part. It lives as long as the machines and is read only on request.
+    /// World with the true shape of the part. It lives as long as the machines, and is read only on request.
     #[cfg_attr(not(feature = "plant"), expect(dead_code))]
     world: World,
 }
@@ -67,10 +67,11 @@ impl Drop for SimulatedCell {
     }
 }
 
-/// Reads the truth of a recipe.
+/// Reads the true shape of the simulated part from the table `[simulation]` of a recipe. `seed` replaces the seed in
+/// the table.
 ///
 /// # Errors
-/// Returns an error if the recipe has no truth or an invalid one.
+/// Returns an error if the recipe has no table `[simulation]`, or an invalid one.
 pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec, Failure> {
     let none = || {
         Failure::Simulation {
@@ -107,13 +108,14 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         let path = grinder.executed_path(folder).map(|command| executed(command, &world, recipe));
         let path = path.transpose().map_err(&failed)?;
         let Wire::Ippdme(wire) = &mut cell.cmm.link.wire else {
-            return Err(failed("beside LinuxCNC only a measuring machine behind I++ DME is simulated".into()));
+            return Err(failed("with LinuxCNC, only a measuring machine with I++ DME can be simulated".into()));
         };
         simulated.serve_dme(wire, world.touch_probe(), speed, probe_radius_mm, path).await.map_err(&failed)?;
         return Ok(simulated);
     }
     let line = |link: &LinkConfig| {
-        let none = "a machine that a person serves cannot be simulated; its part is yours to play";
+        let none =
+            "a machine that a person operates cannot be simulated; operate it yourself, for example with --rehearsal";
         link.wire.modbus_line().ok_or_else(|| failed(none.into()))
     };
     if recipe.grinding.tilt.is_some() && cell.grinder.program.folder.is_none() {
@@ -160,29 +162,31 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
-        return Err(
-            "the simulated wheel beside LinuxCNC stays upright; leave grinding.tilt or the simulation out".into()
-        );
+        return Err("the simulated wheel of LinuxCNC stays upright; remove grinding.tilt, or do not simulate".into());
     }
     let (WheelDimensions::Sphere { radius_mm }, TrackPattern::Raster) = (grinding.wheel, grinding.pattern) else {
         return Err(
-            "the simulated wheel is a ball on tracks along x; take another recipe, or leave the simulation out".into(),
+            "the simulated wheel is spherical and its tracks are along x; use another recipe, or do not simulate"
+                .into(),
         );
     };
     let wheel = world.wheel(radius_mm).map_err(|error| error.to_string())?;
     let program = command.get_program().to_string_lossy().into_owned();
     ExecutedPath::follow(command, wheel).map_err(|error| {
-        format!("grinder.wire.executed_path: {program} cannot be begun: {error}; correct the cell file")
+        format!("grinder.wire.executed_path: {program} cannot be started: {error}; correct the cell file")
     })
 }
 
-/// Returns the place of the programs for the simulated control: the place where the cell puts them.
+/// Returns the source of programs for the simulated control: the folder into which the cell writes them. `None` if the
+/// cell file names no folder.
 fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let program = &cell.grinder.program;
     let Some(folder) = program.folder.clone() else { return Ok(None) };
     let name = &program.dialect.dialect.name;
     let control = Control::named(name).ok_or_else(|| {
-        format!("no control is simulated that reads the dialect `{name}`; leave grinder.program.folder out of a simulated cell")
+        format!(
+            "no simulated control reads the dialect `{name}`; remove grinder.program.folder from the simulated cell"
+        )
     })?;
     let head = cell.grinder.rotary.map(|axis| Head {
         letter: if axis.letter == RotaryLetter::A { 'A' } else { 'B' },
@@ -281,7 +285,7 @@ impl SimulatedCell {
                 serving
             }
             HitSource::Serial { device, .. } => {
-                let serving = ServingHits::serial().map_err(|e| format!("no pseudo-terminal can be had: {e}"))?;
+                let serving = ServingHits::serial().map_err(|e| format!("no pseudo-terminal can be created: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
                 if wire.has_dynamic_address() {
                     wire.device = Some(terminal.display().to_string());
@@ -329,7 +333,7 @@ impl SimulatedCell {
             }
             LineAddress::Rtu { device, baud, .. } => {
                 let serving = Serving::rtu(units, rtu::Line::paced(*baud), SharedFaultPlan::none())
-                    .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
+                    .map_err(|e| format!("no pseudo-terminal can be created for {device}: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
                 self.link(&terminal, device)?;
                 self.places.push(format!("Modbus RTU {device} at {baud} baud, {}", names.join(" and ")));
@@ -340,7 +344,7 @@ impl SimulatedCell {
     }
 }
 
-/// Returns a folder for the list, for a cell file that names none.
+/// Creates a temporary folder for the list of points that the part program reads, for a cell file that names no folder.
 fn list_folder() -> Result<ScratchFolder, FormatError> {
     let path = std::env::temp_dir().join(format!("regrind-list-{:016x}", rand::random::<u64>()));
     let folder = ScratchFolder::at(path)?;

@@ -84,7 +84,7 @@ fn text(rows: &[&TransitionRow], all: bool) -> String {
     for row in rows {
         if state != Some(row.state) {
             let gap = if state.is_some() { "\n" } else { "" };
-            let end = if row.state.is_end() { ": an end, nothing follows" } else { "" };
+            let end = if row.state.is_end() { ": final state" } else { "" };
             let _ = writeln!(text, "{gap}{}{end}", row.state);
             state = Some(row.state);
         }

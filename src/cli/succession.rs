@@ -24,12 +24,13 @@ const NEWEST: usize = 200;
 const TURN_COMES_WITHIN: Duration = Duration::from_secs(5);
 const ASKED_EVERY: Duration = Duration::from_millis(20);
 
-/// The place of a run among those of its folder.
+/// Position of a run in the sequence of the runs of a folder.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct RunPlace {
-    /// Its number, from 1 on.
+    /// Number of the run, from 1.
     number: u64,
-    /// The run before it, as it was then; none where there was none, or it was not there any more.
+    /// State of the previous run when this run began; `None` if there was no previous run, or if its anchor could not
+    /// be read.
     before: Option<Before>,
 }
 
@@ -54,7 +55,8 @@ impl Drop for SuccessionLock {
 }
 
 impl RunPlace {
-    /// Returns the next place in a folder of runs, and its lock. Keep the lock until the run has its first record.
+    /// Returns the position of the next run in a folder, and the lock of the folder. Keep the lock until the run has
+    /// its first record.
     pub(super) fn next(runs: &Path) -> Result<(Self, SuccessionLock), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
         // Any user can hold this lock. It does not prevent a run, but without it the run can receive the number of
@@ -69,20 +71,21 @@ impl RunPlace {
         Ok((Self { number, before }, SuccessionLock(folder)))
     }
 
-    /// Adds the place to the first record of a run.
+    /// Adds the number and the previous run to the content of the first record of a run.
     pub(super) fn in_record(&self, content: &mut Value) {
         content["number"] = json!(self.number);
         content["before"] = json!(self.before);
     }
 
-    /// Reads the place from the first record of a run. Returns `None` for a run from before runs had numbers.
+    /// Reads the number and the previous run from the first record of a run. Returns `None` for a run from before runs
+    /// had numbers.
     fn read(folder: &Path) -> Option<Self> {
         let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
         serde_json::from_value(first.value()["content"].clone()).ok()
     }
 }
 
-/// Returns the hash of a record of a run that was verified.
+/// Returns the hash of record number `seq` of a run; `None` if there is no such record.
 fn hash_of(folder: &Path, seq: u64) -> Option<String> {
     let record = Reader::open(folder).ok()?.records(seq).next()?.ok()?;
     (record.seq == seq).then_some(record.hash)
@@ -197,7 +200,7 @@ impl Proof {
             .ok()
             .and_then(|reader| Some(reader.records(0).next()?.ok()?.value()["run"].as_str()?.to_owned()));
         if let Some(begun_as) = begun_as.filter(|begun_as| *begun_as != name) {
-            self.flaws.push(format!("{name}: the run was begun as {begun_as}: its folder was renamed"));
+            self.flaws.push(format!("{name}: the run began with the name {begun_as}: its folder was renamed"));
         }
         let words = format!("{number:>6}  {name}  {stands}");
         self.told
@@ -225,10 +228,11 @@ impl Proof {
         let Some((_, last)) = last.filter(|_| number == due) else { return };
         let last_name = name_of(last);
         if last_name != *run {
-            self.flaws.push(format!("{last_name}: it stands before {name}, which followed {run}"));
+            self.flaws
+                .push(format!("{last_name}: it is the run before {name}, but {name} names {run} as the run before it"));
         } else if hash_of(last, *records).as_deref() != Some(head) {
-            let what = format!("its record {records} has another hash than when {name} began");
-            self.flaws.push(format!("{run}: it is not the run that {name} followed: {what}"));
+            let what = format!("the hash of its record {records} has changed since {name} began");
+            self.flaws.push(format!("{run}: it differs from the run that {name} names as the run before it: {what}"));
         }
     }
 }

@@ -91,7 +91,7 @@ fn remove(name: &str, path: &Path) -> Result<(), Failure> {
         return Err(Failure::NoUser { name: name.to_owned(), path: path.to_owned() });
     }
     write_private(path, users.to_text().as_bytes())?;
-    super::print(&format!("{name} may sign in no more\n"))
+    super::print(&format!("{name} can no longer sign in\n"))
 }
 
 fn print_users(users: &Users, as_json: bool) -> Result<(), Failure> {

@@ -109,7 +109,7 @@ struct View {
     as_sigma: bool,
     /// Time of the last check of the record for a newer map, and the number of the cell's state at that time.
     looked: Option<(Instant, u64)>,
-    /// Result of the last key.
+    /// Message about the result of the last key.
     said: String,
 }
 
@@ -263,7 +263,7 @@ impl View {
         };
         let lines: Vec<Line> = blocks.rows.iter().map(|row| row.iter().map(cell).collect()).collect();
         let title = match self.as_sigma {
-            true => format!("known to: {:.3} µm at worst", blocks.limit_um),
+            true => format!("standard deviation: up to {:.3} µm", blocks.limit_um),
             false => format!("error, filtered: ± {:.2} µm", blocks.limit_um),
         };
         frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(title)), area);

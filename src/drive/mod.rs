@@ -14,6 +14,7 @@
 
 mod adaptive_measurement;
 mod blocking_executor;
+mod comparison;
 mod cycle_output;
 mod cycles;
 mod notice;

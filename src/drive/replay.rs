@@ -17,11 +17,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 use thiserror::Error;
 
+use super::comparison::{is_same_decision, is_same_file, is_same_result};
 use super::cycles::Cycles;
 use super::outcome;
 use super::pipeline;
@@ -248,9 +248,8 @@ impl<'t> Replay<'t> {
         if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
             recorded.remove("intent");
         }
-        let is_same = Command::deserialize(&recorded).is_ok_and(|recorded| command.is_same_decision(&recorded));
-        if !is_same {
-            let due = serde_json::to_value(&command).unwrap_or_default();
+        let due = serde_json::to_value(&command).unwrap_or_default();
+        if !is_same_decision(&due, &recorded) {
             return Err(self.differs(format!("the program sends {due}, but the record has {recorded}")));
         }
         if let Some(id) = id.filter(|_| outcome::expects_answer(&command)) {
@@ -291,7 +290,7 @@ impl<'t> Replay<'t> {
             return Err(ReplayError::NotSaved { run: self.run_folder.to_owned(), what });
         }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());
-        if !are_equal_but_for_texts(&recorded, &again) {
+        if !is_same_result(&recorded, &again) {
             return Err(self.differs(format!(
                 "the repeated computation of cycle {number} gives {again}, but the record has {recorded}"
             )));
@@ -342,28 +341,15 @@ impl<'t> Replay<'t> {
                 return Err(self.differs(format!("the repeated computation does not give {}", recorded.name)));
             }
             let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
-            if sha256_hex(&bytes) != recorded.sha256 && !self.is_same_document(recorded, &bytes)? {
+            if sha256_hex(&bytes) != recorded.sha256
+                && !is_same_file(&recorded.name, &recorded.read(self.run_folder)?, &bytes)
+            {
                 return Err(
                     self.differs(format!("the repeated computation of {} differs from the record", recorded.name))
                 );
             }
         }
         Ok(())
-    }
-
-    /// Returns true if a recorded file and the repeated one differ only in the version of the program, or as JSON
-    /// documents in texts for people.
-    fn is_same_document(&self, recorded: &Artefact, repeated: &[u8]) -> Result<bool, ReplayError> {
-        let bytes = recorded.read(self.run_folder)?;
-        let [Ok(one), Ok(other)] = [&bytes, repeated].map(|bytes| std::str::from_utf8(bytes).map(without_version))
-        else {
-            return Ok(false);
-        };
-        if !recorded.name.ends_with(".json") {
-            return Ok(one == other);
-        }
-        let [one, other] = [one, other].map(|text| serde_json::from_str::<Value>(&text));
-        Ok(one.is_ok_and(|one| other.is_ok_and(|other| are_equal_but_for_texts(&one, &other))))
     }
 
     /// Checks that the last preparation of each machine agrees with its cycle, and counts the files in the run folder.
@@ -446,76 +432,5 @@ impl<'t> Replay<'t> {
 
     fn differs(&self, what: String) -> ReplayError {
         ReplayError::Differs { run: self.run_folder.to_owned(), seq: self.last_sequence, what }
-    }
-}
-
-/// Removes the version of the program that wrote a text: `Regrind 1.2.3` in a comment, `"version": "1.2.3"` in a document.
-fn without_version(text: &str) -> String {
-    let is_of_version = |c: char| c.is_ascii_digit() || c == '.';
-    [r#"Regrind "#, r#""version": ""#].into_iter().fold(text.to_owned(), |text, before| {
-        let mut pieces = text.split(before);
-        let first = pieces.next().unwrap_or_default().to_owned();
-        pieces.fold(first, |whole, piece| whole + before + piece.trim_start_matches(is_of_version))
-    })
-}
-
-/// Returns true if two JSON values are equal, texts for people excepted. So a computation can be repeated by a program
-/// with other texts. A string with a space counts as a text; names, codes and digests have no spaces.
-fn are_equal_but_for_texts(one: &Value, other: &Value) -> bool {
-    let is_text = |text: &str| text.contains(' ');
-    match (one, other) {
-        (Value::String(one), Value::String(other)) => one == other || is_text(one) && is_text(other),
-        (Value::Array(one), Value::Array(other)) => {
-            one.len() == other.len() && one.iter().zip(other).all(|(one, other)| are_equal_but_for_texts(one, other))
-        }
-        (Value::Object(one), Value::Object(other)) => {
-            one.len() == other.len()
-                && one.iter().all(|(key, one)| other.get(key).is_some_and(|other| are_equal_but_for_texts(one, other)))
-        }
-        _ => one == other,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    #[test]
-    fn version_is_removed_and_nothing_else() {
-        let of = |version: &str| {
-            format!(
-                "(Regrind {version} tool path)\nG1 X1.5 (Regrind)\n{{\"program\": {{\"version\": \"{version}\"}}}}\n1.5"
-            )
-        };
-        assert_eq!(without_version(&of("0.1.0")), without_version(&of("10.22.3")));
-        assert_eq!(without_version(&of("0.1.0")), of(""));
-        assert_ne!(without_version("G1 X1.5"), without_version("G1 X1.6"));
-        assert_eq!(without_version(""), "");
-    }
-
-    #[test]
-    fn only_texts_may_differ() {
-        let one = json!({ "weak": ["y shift: found again to 6.7 um only"], "rms_mm": 0.1, "kind": "pass", "n": null });
-        let with = |key: &str, value: Value| {
-            let mut other = one.clone();
-            other[key] = value;
-            other
-        };
-        for (other, is_equal) in [
-            (with("weak", json!(["y position repeats only to 6.7 µm"])), true),
-            (with("weak", json!(["y"])), false),
-            (with("weak", json!([])), false),
-            (with("weak", json!("y position repeats only to 6.7 µm")), false),
-            (with("rms_mm", json!(0.100_000_000_000_000_02)), false),
-            (with("kind", json!("other")), false),
-            (with("kind", json!("pass it")), false),
-            (with("n", json!(0)), false),
-            (with("more", json!(0)), false),
-            (one.clone(), true),
-        ] {
-            assert_eq!(are_equal_but_for_texts(&one, &other), is_equal, "{other}");
-            assert_eq!(are_equal_but_for_texts(&other, &one), is_equal, "{other}");
-        }
     }
 }

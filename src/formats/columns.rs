@@ -19,12 +19,12 @@ use serde::{Deserialize, Serialize};
 use super::error::{FormatError, excerpt};
 use regrind_core::geometry::{Point, Vector};
 
-/// How to read a table that does not state its columns or units, or whose statements are ambiguous.
+/// Columns and units of a table of points, given by a person because the table does not state them clearly.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Table {
     /// Columns of x, y and z; `None` for those that the header names.
     pub columns: Option<Columns>,
-    /// Unit of the coordinates; `None` for the millimetre, and then a table that states another unit is rejected.
+    /// Unit of the coordinates. `None` means millimetres; a table that states another unit is then rejected.
     pub unit: Option<Unit>,
     /// Unit of z, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
@@ -47,7 +47,8 @@ impl Table {
     }
 }
 
-/// Which columns of a table are x, y and z: `x=X_act,y=Y_act,z=Z_act` by their names, or `x=4,y=5,z=6` by their numbers from 1.
+/// Columns of a table that hold x, y and z: `x=X_act,y=Y_act,z=Z_act` by their names, or `x=4,y=5,z=6` by their numbers
+/// from 1.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 #[schemars(with = "String")]
@@ -55,9 +56,9 @@ pub struct Columns([Column; 3]);
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Column {
-    /// In lower case.
+    /// Name of the column in the header, in lower case.
     Named(String),
-    /// From 0.
+    /// Index of the column, from 0.
     Numbered(usize),
 }
 
@@ -116,7 +117,7 @@ impl fmt::Display for Columns {
 }
 
 impl Columns {
-    /// Returns true if a header has all columns that are given by name, each once.
+    /// Returns true if each column that is given by its name occurs exactly once in `names`, the names of a header.
     pub(super) fn are_in(&self, names: &[String]) -> bool {
         self.0.iter().all(|column| match column {
             Column::Named(_) => column.among(names).len() == 1,
@@ -129,7 +130,8 @@ impl Columns {
         self.0.iter().all(|column| matches!(column, Column::Numbered(_)))
     }
 
-    /// Returns the indices of the columns among `count` columns, or an error in words.
+    /// Returns the indices, from 0, of the columns x, y and z in a table of `count` columns with the header `names`.
+    /// The error is a reason for [`FormatError::HeaderNames`].
     pub(super) fn places(&self, names: &[String], count: usize) -> Result<[usize; 3], String> {
         let mut places = [0; 3];
         for (place, column) in places.iter_mut().zip(&self.0) {
@@ -150,7 +152,8 @@ impl Columns {
 }
 
 impl Column {
-    /// Returns the indices of the columns of that name, with or without its unit.
+    /// Returns the indices of the columns with this name, compared with and without the unit in a name. The list is
+    /// empty for a column that is given by its number.
     fn among(&self, names: &[String]) -> Vec<usize> {
         let Self::Named(wanted) = self else { return Vec::new() };
         let is = |name: &String| name.trim() == wanted || split_unit(name).0 == wanted;
@@ -346,7 +349,7 @@ fn axis_of(name: &str) -> Option<(usize, Group)> {
     axis.map(|axis| (axis, group))
 }
 
-/// Columns of each group and axis, from 0.
+/// Columns that hold coordinates: their indices, from 0, by group and axis.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Axes {
     groups: [[Vec<usize>; 3]; 3],
@@ -354,16 +357,16 @@ pub(super) struct Axes {
     unknown: Option<String>,
 }
 
-/// Words in the name of an axis that show that the column is not a coordinate: deviations, directions, tolerances,
-/// uncertainties.
+/// Words in the name of a column which show that it is not a coordinate, but for example a deviation, a direction, a
+/// tolerance or an uncertainty.
 #[rustfmt::skip]
 const NON_COORDINATE_WORDS: [&str; 41] = [
     "d", "dev", "devs", "deviation", "delta", "diff", "difference", "err", "error", "off", "offset", "abw", "abweichung", "ecart", "écart", "n", "norm", "normal", "normale", "normalvector", "dir", "direction",
     "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
 ];
 
-/// Returns the axis that a name in lower case contains, and the rest of the name; in a name of one word, the axis is a
-/// letter at either end.
+/// Returns the axis (0 to 2) that the name of a column contains, and the rest of the name; `None` if there is no axis
+/// or no rest. In a name of one word, the axis is the first or the last letter. The name is in lower case.
 fn axis_in_name(name: &str) -> Option<(usize, String)> {
     let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
     let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
@@ -405,13 +408,13 @@ impl Axes {
         &self.groups[group as usize]
     }
 
-    /// Returns true if the header names all three axes of some points, even with an unknown word.
+    /// Returns true if the header names x, y and z of at least one group of points, known or unknown.
     pub(super) fn are_named(&self) -> bool {
         self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
 
-    /// Returns the columns x, y and z, or a text that says why the names are ambiguous; `of_nominal` allows nominal
-    /// columns.
+    /// Returns the indices of the columns x, y and z. The error is the reason why the names do not determine them.
+    /// Columns of nominal points are rejected if `of_nominal` is false.
     pub(super) fn chosen(&self, of_nominal: bool) -> Result<[usize; 3], String> {
         let there: Vec<Group> = Group::ALL
             .into_iter()
@@ -451,7 +454,7 @@ pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// Splits a column's name in lower case into the name itself and the unit that it states.
+/// Splits a column's name in lower case into the name itself and the unit that it states; `None` if it states no unit.
 pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
     let name = name.trim();
     for (open, close) in [('[', ']'), ('(', ')')] {
@@ -485,10 +488,11 @@ pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
-/// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches".
+/// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches"; `None`
+/// if it states no unit.
 ///
-/// An explicit statement has priority over a word. In a sentence, short words can mean anything: only words of at least
-/// four letters are read as units there.
+/// A statement such as "units: inch" has priority over a single word of a sentence. A single word must have at least
+/// four letters, because a shorter word can mean anything.
 fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
     unit_statement(text).or_else(|| {
@@ -520,13 +524,13 @@ impl StatedUnits {
     }
 }
 
-/// Returns the place of the unit of the heights in a text in lower case.
+/// Returns the byte range of the unit of the heights in a text in lower case; `None` if the text states no such unit.
 fn height_unit(text: &str) -> Option<Range<usize>> {
     const HEIGHTS: [&str; 10] =
         ["z", "height", "heights", "höhe", "höhen", "hoehe", "sag", "hauteur", "hauteurs", "altura"];
     const NO_LENGTHS: [&str; 6] = ["wave", "waves", "fringe", "fringes", "lambda", "radians"];
     const BETWEEN: [&str; 6] = ["is", "are", "in", "en", "given", "unit"];
-    /// Words before it which show that another height is meant, not that of the points.
+    /// Words before a word for height that show that it is not the height of the points, as in "step height".
     const OTHER: [&str; 14] = [
         "step",
         "peak",
@@ -543,7 +547,8 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         "noise",
         "tolerances",
     ];
-    /// A single letter next to a name can be part of another name.
+    /// Minimum number of letters of a unit directly after a word for height: a single letter can belong to another
+    /// name.
     const SHORTEST: usize = 2;
     let mut words: Vec<Range<usize>> = Vec::new();
     for (at, c) in text.char_indices().filter(|(_, c)| c.is_alphanumeric()) {
@@ -573,8 +578,8 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
-/// Returns the unit after a word such as "units:", if there is one; after a colon, `=` or `/` returns any text that is
-/// there, because it is meant as a unit.
+/// Returns the unit that follows the word "unit" or "units"; `None` if there is none. After a colon, `=` or `/`, an
+/// unknown text is returned too, because it is meant as a unit.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind
@@ -592,7 +597,7 @@ fn unit_statement(text: &str) -> Option<String> {
         .next()
 }
 
-/// Rejects a file whose header states a unit other than the one in which it is read.
+/// Rejects a file whose header states a unit other than `unit` for all coordinates, or other than `height_unit` for z.
 pub(super) fn check_stated_unit(
     path: &Path,
     line: u64,

@@ -1,8 +1,8 @@
 //! Results as DMIS output (ISO 22093): the actual points of features, `FA(P17) = FEAT/POINT,CART,x,y,z,i,j,k`.
 //!
 //! A statement ends with its line unless the line ends with `$`; `$$` begins a comment. `UNITS` gives the unit and must
-//! come before the first point. Text that a program wrote with `TEXT/OUTFIL` contains the statements about the file,
-//! such as `'plan: 5f3c...'`. `PRCOMP/ON` means that the machine has compensated the radius of the probe, `PRCOMP/OFF`
+//! come before the first point. Text that a program wrote with `TEXT/OUTFIL` states what the file belongs to, such as
+//! `'plan: 5f3c...'`. `PRCOMP/ON` means that the machine has compensated the radius of the probe. `PRCOMP/OFF` means
 //! that it has not.
 
 use std::path::Path;
@@ -31,7 +31,7 @@ struct Statement {
     line: u64,
 }
 
-/// State of the reader.
+/// Content of the statements that were read so far.
 #[derive(Default)]
 struct Reading {
     unit_mm: Option<f64>,
@@ -41,7 +41,7 @@ struct Reading {
     is_ended: bool,
 }
 
-/// Reads the statements of a file about itself.
+/// Reads what a file states about its measurement, such as the plan and the cycle.
 ///
 /// # Errors
 /// A statement with an impossible value.
@@ -70,7 +70,7 @@ pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     })
 }
 
-/// Returns the number of the target in the name of its feature: `P17`.
+/// Returns the number of the target from the name of its feature: 17 for `P17`; `None` for any other name.
 pub(super) fn index_of(name: &str) -> Option<u32> {
     let digits = name.trim().strip_prefix(['P', 'p'])?;
     digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok()).flatten()
@@ -92,7 +92,7 @@ fn read(path: &Path, text: &[u8]) -> Result<Reading, FormatError> {
     Ok(reading)
 }
 
-/// Joins lines into statements.
+/// Joins the lines of a text into statements; comments are omitted.
 fn statements(text: &str) -> Vec<Statement> {
     let (mut all, mut begun): (Vec<Statement>, Option<Statement>) = (Vec::new(), None);
     for (line, number) in text.lines().zip(1..) {
@@ -152,7 +152,8 @@ impl Reading {
         Ok(())
     }
 
-    /// Reads text that a program wrote: `OUTFIL,'plan: 5f3c...'`.
+    /// Reads a text that the measuring program wrote into the file, such as `OUTFIL,'plan: 5f3c...'`; a text without a
+    /// colon is ignored.
     fn written(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
         let quoted = after.split_once('\'').and_then(|(_, rest)| rest.rsplit_once('\''));
         match quoted.and_then(|(text, _)| text.split_once(':')) {

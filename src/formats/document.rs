@@ -37,7 +37,7 @@ pub struct RegistrationDocument<'a> {
     pub warnings: &'a [String],
     pub converged: bool,
     pub iterations: usize,
-    /// Values after each accepted step.
+    /// Value of the objective function after each accepted step of the fit.
     pub objective_mm2: Vec<f64>,
     pub points: usize,
     pub used: usize,
@@ -46,10 +46,10 @@ pub struct RegistrationDocument<'a> {
     pub residual_sigma_mm: f64,
     pub coverage: f64,
     pub side: Side,
-    /// Indices of the measured points, from 0.
+    /// Indices of the outliers among the measured points, from 0.
     pub outliers: Vec<usize>,
     pub off_part: Vec<usize>,
-    /// Points that did not take part, each with the reason.
+    /// Points that the fit did not use, each with the reason.
     pub left_out: Vec<LeftOut>,
     /// Figures including the outliers; absent if there are no outliers.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -88,7 +88,7 @@ pub struct MeasuredInput<'a> {
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct LeftOut {
-    /// From 0.
+    /// Index of the point among the measured points, from 0.
     pub index: usize,
     pub deviation_mm: f64,
     /// `alone`: far from the surface, and no neighbour has the same deviation. `off_part`: its projection is beyond the
@@ -104,7 +104,7 @@ pub struct Alternative {
     pub rms_mm: f64,
 }
 
-/// Square roots of the diagonal of the covariance.
+/// Standard uncertainties of the pose: the square roots of the diagonal of its covariance.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct StandardUncertainty {

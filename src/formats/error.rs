@@ -8,8 +8,8 @@ use thiserror::Error;
 use super::columns::Unit;
 use super::number::LIMIT_MM;
 
-/// Reason why a file could not be read or written. Lines, columns and rows count from 1, bytes and vertices from 0. A
-/// place is a line or a byte, in words. The text found is shortened.
+/// Reason why a file could not be read or written. Lines, columns and rows count from 1, bytes and vertices from 0.
+/// `place` is a text that names a line, a byte or an element. `found` is a shortened piece of the file.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -184,13 +184,13 @@ pub enum FormatError {
 }
 
 impl FormatError {
-    /// Returns true if the file only ended too early, and everything in it up to there is valid.
+    /// Returns true if the only fault of the file is that it ends too early.
     pub fn is_cut(&self) -> bool {
         matches!(self, Self::Cut { .. } | Self::CutLine { .. } | Self::Empty { .. })
     }
 }
 
-/// Returns a piece of a file in backquotes; an empty piece is reported as nothing.
+/// Returns a piece of a file in backquotes, or the word `nothing` if the piece is empty.
 fn quoted(found: &str) -> String {
     if found.is_empty() { "nothing".to_owned() } else { format!("`{found}`") }
 }

@@ -18,7 +18,7 @@ use regrind_core::model::Form;
 struct FiguresDocument<'a> {
     simulation: bool,
     frame: &'static str,
-    /// Number of points that took part.
+    /// Number of points that the figures are computed from.
     points: Option<usize>,
     /// Form of the part: each figure with its credible interval, and the raw figure.
     form: Vec<FormFigureRow>,
@@ -49,7 +49,7 @@ struct SeriesDocument {
     polynomials: &'static str,
     normalisation: &'static str,
     centre_mm: [f64; 2],
-    /// Radius of the disc, or half the sides of the rectangle.
+    /// Radius of the disc (twice), or half of the width and of the height of the rectangle.
     half_size_mm: [f64; 2],
     points: usize,
     residual_rms_nm: f64,
@@ -71,10 +71,10 @@ struct TermDocument {
 pub type CycleFigures<'a> =
     (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
-/// Writes `figures.json`: the figures of the form, those of the points and the slopes of the map, all with the terms
-/// that were removed before.
+/// Writes `figures.json`: the figures of the form, the figures of the points and the slopes of the map. Each figure is
+/// written with `taken_out`, the terms that were removed before it was computed.
 ///
-/// If there are no figures, the file gives the reason.
+/// For figures that do not exist, the file gives the reason.
 ///
 /// # Errors
 /// A file that cannot be written.

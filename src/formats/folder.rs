@@ -56,7 +56,8 @@ impl Drop for ResultFolder {
     }
 }
 
-/// Removes a socket without a listener; leaves anything else of that name unchanged.
+/// Removes the file of a socket; leaves any other file of that name unchanged. The caller must know that no program
+/// listens on the socket.
 ///
 /// # Errors
 /// A folder that is not writable; a file of that name that is not a socket.

@@ -1,10 +1,11 @@
-//! Files of other programs that are not read, detected by their first bytes, each with a remedy.
+//! Detection, from the first bytes of a file, of formats of other programs that Regrind does not read, each with a
+//! remedy.
 
 use std::path::Path;
 
 use super::error::FormatError;
 
-/// File format that is not read, and the way to provide its content in another format.
+/// File format that Regrind does not read, and the way to provide its content in another format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Foreign {
     /// Name of the format, with its article.
@@ -12,7 +13,7 @@ pub(super) struct Foreign {
     pub remedy: &'static str,
 }
 
-/// Alternative that is read.
+/// Formats that are read, for the message.
 const EXPECTED: &str = "points as text or PLY, a mesh, or a map as X3P, SDF or MetroPro";
 
 const AS_TEXT: &str = "save the sheet with the points as CSV";
@@ -49,7 +50,8 @@ const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"BEGIN PGM", "a program in Klartext", "give the measured points"),
 ];
 
-/// Detects a file format that is not read by the first bytes.
+/// Detects, from the first bytes of a file, a format that this program does not read; `None` if there is no such
+/// format.
 pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     let plain = narrowed(head);
     let text = plain.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&plain).trim_ascii_start();
@@ -58,7 +60,7 @@ pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     begins.or_else(|| packed(head)).or_else(|| by_lines(text)).or_else(|| surface_data(head))
 }
 
-/// Rejects a file of another program.
+/// Rejects a file if its first bytes show a format that this program does not read.
 pub(super) fn check_is_ours(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     let Some(Foreign { found, remedy }) = foreign(head) else { return Ok(()) };
     Err(FormatError::WrongKind { path: path.to_owned(), expected: EXPECTED, found, remedy })
@@ -77,7 +79,8 @@ pub(super) fn is_utf16(head: &[u8]) -> bool {
     head.len() > 3 && (is_wide(0) || is_wide(1))
 }
 
-/// Returns the first bytes of text, with one byte per character.
+/// Returns the first bytes of a file. If they are text with two bytes per character, only its ASCII characters are
+/// returned, one byte each.
 fn narrowed(head: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     if is_utf16(head) { head.iter().copied().filter(|b| (1..0x80).contains(b)).collect() } else { head.into() }
 }
@@ -85,7 +88,7 @@ fn narrowed(head: &[u8]) -> std::borrow::Cow<'_, [u8]> {
 /// Detects the content of a zip container by the names of its first entries; X3P is a zip container too.
 fn packed(head: &[u8]) -> Option<Foreign> {
     const LOCAL: &[u8] = b"PK\x03\x04";
-    /// Offsets of the length of a name and of the name.
+    /// Offsets in the local header of an entry: of the length of the name, and of the name itself.
     const LENGTH: usize = 26;
     const NAME: usize = 30;
     if !head.starts_with(LOCAL) {
@@ -111,7 +114,7 @@ fn packed(head: &[u8]) -> Option<Foreign> {
     found.map(|(found, remedy)| Foreign { found, remedy })
 }
 
-/// Detects text formats by their first lines.
+/// Detects, from the first lines of a text, a format that this program does not read.
 fn by_lines(text: &[u8]) -> Option<Foreign> {
     /// Column of the section letter in a line of IGES.
     const SECTION: usize = 72;

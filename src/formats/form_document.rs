@@ -50,8 +50,8 @@ struct FormDocument<'a> {
     /// The same figures of the measured deviations, which include the noise of the probe.
     raw_rms_mm: f64,
     raw_pv_mm: f64,
-    /// Uncertainty of the position of the nominal frame; `covariance` of registration.json is the repeatability of the
-    /// same pose.
+    /// Standard uncertainty of the pose of the nominal frame. The `covariance` in registration.json describes only the
+    /// repeatability of the pose.
     frame_standard_uncertainty: StandardUncertainty,
     frame_covariance: [[f64; 6]; 6],
 }

@@ -28,12 +28,12 @@ pub(super) struct FormFigureRow {
 
 const POINTS: &str = "of the form at all points";
 const POWER: &str = "A of ISO 10110-5: PV of the best sphere";
-const RIM: &str = "height of that sphere at the rim over the middle, above 0 where the rim stands proud";
-const IRREGULARITY: &str = "B of ISO 10110-5: PV of what piston, tilt and power leave";
-const SYMMETRIC: &str = "C of ISO 10110-5: PV of the part of that which is symmetric about the middle";
-const RMS_TOTAL: &str = "of what piston and tilt leave";
-const RMS_IRREGULARITY: &str = "of what piston, tilt and power leave";
-const RMS_VARYING: &str = "of the part of that which is not symmetric about the middle";
+const RIM: &str = "height of the best sphere at the rim above its middle; positive if the rim is proud";
+const IRREGULARITY: &str = "B of ISO 10110-5: PV of the form without piston, tilt and power";
+const SYMMETRIC: &str = "C of ISO 10110-5: PV of the part of the irregularity that is symmetric about the middle";
+const RMS_TOTAL: &str = "of the form without piston and tilt";
+const RMS_IRREGULARITY: &str = "of the form without piston, tilt and power";
+const RMS_VARYING: &str = "of the part of the irregularity that is not symmetric about the middle";
 
 /// Returns the figures of a form, in the order of a report: in micrometres, those of ISO 10110-5 in nanometres, slopes
 /// in microradians.
@@ -66,7 +66,7 @@ pub(super) fn form_figure_rows(
     ];
     if let Some(of) = form.slope {
         let made = format!(
-            "of the smooth form, over {:.3} mm, at {} places that have others all around; raw: of the map",
+            "of the smooth form, over {:.3} mm, at {} positions with neighbours on all sides; raw: of the map",
             of.integration_mm, of.places
         );
         let urad = |name, of: AngleInterval, raw_rad: Option<f64>| {

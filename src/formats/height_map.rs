@@ -21,7 +21,7 @@ pub struct HeightMap {
     pub heights_mm: Vec<f64>,
     /// True for each sample that was measured.
     pub valid: Vec<bool>,
-    /// Decisions of the reader about ambiguous content, in words.
+    /// Notes on ambiguous content of the file and how it was read, in words.
     pub notes: Vec<String>,
 }
 
@@ -152,7 +152,7 @@ fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Re
     Ok(())
 }
 
-/// Measured points of a map, and the decisions of the reader about it.
+/// Measured points of a map, and notes on how ambiguous content was read.
 pub(super) struct MapPoints {
     pub(super) points: Vec<Point>,
     pub(super) notes: Vec<String>,

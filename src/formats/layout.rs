@@ -19,7 +19,8 @@ pub(super) enum Separator {
 }
 
 impl Separator {
-    /// In the order in which they are tried: a semicolon or a tab is almost never anything else.
+    /// All separators, in the order in which they are tried: a tab or a semicolon in a line is almost always the
+    /// separator.
     const ALL: [Self; 4] = [Self::Tab, Self::Semicolon, Self::Comma, Self::Blank];
 
     /// Returns the byte that separates columns; for blanks, one of the two possible bytes.
@@ -122,7 +123,7 @@ impl Layout {
 
     /// Determines the decimal mark from the first lines that show it.
     ///
-    /// Errors: the first number with a comma, if nothing tells what the commas mean.
+    /// Errors: the first number with a comma, if no line shows whether commas separate decimals or thousands.
     pub(super) fn settle_decimal(&mut self, path: &Path, text: &[u8]) -> Result<(), FormatError> {
         if self.separator == Separator::Comma && !text.contains(&b'"') {
             return Ok(());
@@ -178,7 +179,7 @@ impl<'p> Preamble<'p> {
         Self { path, of_nominal, table, comment: None, header: None, units: None, title: None }
     }
 
-    /// Returns the names of the columns in lower case, if a header names each of them.
+    /// Returns the names of the columns in lower case; empty if there is no header.
     pub(super) fn names(&self, separator: Separator) -> Vec<String> {
         let header = self.header.as_ref().or(self.comment.as_ref());
         header.map_or(Vec::new(), |(_, line)| names(line, separator))
@@ -265,31 +266,31 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Rejects a unit that a table states, unless it is the one in which the table is read.
+    /// Rejects `found`, a unit that a table states, unless it is `unit`, the unit in which the table is read.
     fn check_unit(&self, line: u64, found: String, unit: Unit) -> Result<(), FormatError> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
 
-    /// Rejects a text that mentions other units.
+    /// Rejects a text that states a unit other than the units in which the table is read.
     fn check_stated(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         self.check_heights(line, text)?;
         let of_all = StatedUnits::found_in(&text_of(text)).of_all;
         of_all.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[0]))
     }
 
-    /// Rejects a text that mentions another unit of the heights.
+    /// Rejects a text that states, for the heights, a unit other than the unit in which z is read.
     fn check_heights(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         let of_heights = StatedUnits::found_in(&text_of(text)).of_heights;
         of_heights.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[2]))
     }
 
-    /// Rejects a title that mentions another unit. If a person gave the unit, the title's statement about all
-    /// coordinates is ignored.
+    /// Rejects a title that states a unit other than the units in which the table is read. If a person gave the unit,
+    /// the title is checked only for the unit of the heights.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
         if self.table.unit.is_some() { self.check_heights(number, title) } else { self.check_stated(number, title) }
     }
 
-    /// Rejects other units that a header states for x, y and z.
+    /// Rejects a header that states, for x, y or z, a unit other than the unit in which this column is read.
     fn check_units(&self, line: u64, columns: [usize; 3], names: &[String]) -> Result<(), FormatError> {
         let stated = |column: usize| split_unit(names.get(column)?).1;
         let pairs = columns.into_iter().zip(self.table.units());
@@ -298,8 +299,8 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(line, found, unit))
     }
 
-    /// Rejects other units in the line below the header; if it does not have one unit per column, all of its units
-    /// count for x and y.
+    /// Rejects units in the line below the header that differ from those in which the table is read. If the line does
+    /// not have one unit per column, each of its units is compared with the unit of x and y.
     fn check_unit_line(&self, columns: [usize; 3], count: usize) -> Result<(), FormatError> {
         let Some((line, units)) = &self.units else { return Ok(()) };
         let of_axes = self.table.units();
@@ -315,7 +316,7 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(*line, found.clone(), unit))
     }
 
-    /// Reads a line of units below a header; returns false if it is not one.
+    /// Stores the units of a line below a header; returns false if the line is not a line of units.
     fn take_units(&mut self, fields: &[&[u8]], number: u64) -> bool {
         let unit = |field: &&[u8]| text_of(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
         let units: Vec<String> = fields.iter().map(unit).collect();
@@ -397,7 +398,7 @@ impl<'p> Preamble<'p> {
     }
 }
 
-/// Returns true if the last three of six columns are a direction.
+/// Returns true if the last three of six columns are a unit vector.
 fn has_normal(line: &[u8], separator: Separator) -> bool {
     const OFF: f64 = 1e-3;
     let last = Fields::new(line, separator).skip(3);
@@ -406,8 +407,8 @@ fn has_normal(line: &[u8], separator: Separator) -> bool {
     squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
 }
 
-/// Returns the separator with which a line is a point: preferably three numbers at the start, or else three numbers
-/// anywhere.
+/// Returns the separator with which a line contains a point: preferably three numbers at the start, or else three
+/// numbers anywhere; `None` if the line contains no point.
 fn data_separator(line: &[u8]) -> Option<Separator> {
     let numbers = |separator: Separator, first: usize| {
         let fields = Fields::new(line, separator).take(first);

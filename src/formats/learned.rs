@@ -32,12 +32,13 @@ pub struct Learned {
     pub run: String,
     /// Correction that the next pass of that part would have had.
     pub correction: Correction,
-    /// State of learning: how well the correction is known.
+    /// State of learning: the estimate of the error common to all passes, with its uncertainty.
     pub known: LearningState,
     /// Priors of the error fields, learned from this part and those before it; absent in files of earlier versions.
     #[serde(default)]
     pub fields: PartPriors,
-    /// Kind that other cells must share with these passes to begin with this file; absent in files of earlier versions.
+    /// Kind of these passes: another cell can begin with this file only if its passes are of the same kind. Absent in
+    /// files of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<String>,
     /// Cells that the knowledge comes from, if it is from other cells and not from a run of this one.
@@ -66,7 +67,7 @@ pub struct CellRun {
     pub run: String,
 }
 
-/// Fields that decide if the rest of a file is read.
+/// Fields of a file that are read first and decide if the rest is read.
 #[derive(Deserialize)]
 struct Head {
     #[serde(default)]
@@ -93,12 +94,13 @@ impl Learned {
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
-    /// Returns the start for the first part of a recipe on a machine that has not ground it yet: the results of other
-    /// machines, as far as machines are similar. Returns `None` if they give no information. `fresh` and `none` are the
-    /// state and the correction to begin with otherwise.
+    /// Returns the knowledge for the first part of a recipe on a machine that has not ground this recipe yet. It is
+    /// computed from `others`, the results of other machines, as far as machines are similar (`alike`). Returns `None`
+    /// if these results give no information. `fresh` and `none` are the state and the correction of a machine without
+    /// knowledge.
     ///
-    /// The wheel and the setting of another machine differ from those of this one: the correction by its parameters is
-    /// part of the map here.
+    /// The wheel and the setting of another machine differ from those of this machine. Therefore the correction by
+    /// parameters of the other machine becomes part of the map.
     pub fn from_others(
         others: &[(CellRun, Self)],
         alike: &MachineSimilarity,
@@ -166,7 +168,7 @@ impl Learned {
             && learned.taught_by.is_none();
         let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
         match learned.known.transfer_obstacle() {
-            _ if !is_meant => broken("it is of another kind of parts than requested".into()),
+            _ if !is_meant => broken("the knowledge is for another kind of parts than this recipe".into()),
             Some(why) => broken(why),
             None => Ok(learned),
         }
@@ -210,8 +212,8 @@ impl Learned {
         (!self.known.is_valid()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
-    /// Returns the correction of the first pass of another part: the error that repeated in every pass of this one, on
-    /// the grid of `none`.
+    /// Returns the correction for the first pass of another part, resampled to the grid of `none`. It compensates the
+    /// error that repeated in every pass of this part.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
         let set = self.correction.set.as_ref().map(|set| ParameterCorrections {

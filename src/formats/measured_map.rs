@@ -6,7 +6,7 @@ use super::error::FormatError;
 use super::height_map::MapFormat;
 use super::{metropro, sdf, whole, x3p};
 
-/// All formats; a new format needs a file of its own and a line here.
+/// All formats of maps. A new format needs its own source file and an entry here.
 const FORMATS: [MapFormat; 3] = [x3p::FORMAT, sdf::FORMAT, metropro::FORMAT];
 
 /// Returns the format that the first bytes belong to; `None` if the file is not a map.

@@ -34,8 +34,8 @@ pub enum PointNote {
         found: String,
         /// Value that was read from the line.
         point: Point,
-        /// Number of digits after the mark, or in the exponent, of that number, and the minimum in the lines above, if
-        /// the latter is larger.
+        /// Number of digits of `found` after the decimal mark, or in the exponent, and the minimum of this number in
+        /// the lines above; `None` if the last line does not have fewer digits.
         fewer_digits: Option<[usize; 2]>,
     },
     /// Exactly one number of the file has a separator between its thousands.

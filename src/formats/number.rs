@@ -127,7 +127,7 @@ fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
 }
 
-/// Reads a number after removing the thousands separators and replacing the decimal mark by a point.
+/// Reads a number with the decimal mark `mark` and, if `group` is given, with the thousands separator `group`.
 fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
     let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
     let (whole, fraction) = (&field[..at], &field[at + 1..]);
@@ -154,7 +154,7 @@ fn is_grouped(whole: &[u8], group: u8) -> bool {
     well_begun && rest.peek().is_some() && rest.all(|part| part.len() == 3 && part.iter().all(u8::is_ascii_digit))
 }
 
-/// Returns true if a field such as 2,512 is ambiguous.
+/// Returns true if the comma of a field such as 2,512 is either a decimal mark or a thousands separator.
 fn is_one_group(field: &[u8]) -> bool {
     is_grouped(field, b',')
 }

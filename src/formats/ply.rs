@@ -44,8 +44,8 @@ pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
     parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses PLY whose comments can state only these units, for everything and for the heights; the coordinates are not
-/// converted.
+/// Parses a PLY file, and rejects a comment that states a unit other than `units`: the unit of all coordinates, and the
+/// unit of z. The coordinates are not converted.
 pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
     let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];
@@ -130,7 +130,7 @@ impl Element {
         self.properties.iter().position(|property| property.name == name)
     }
 
-    /// Returns the indices of three scalar properties, if all exist.
+    /// Returns the indices of three scalar properties; `None` if one of them does not exist.
     fn triple(&self, names: [&str; 3]) -> Option<[usize; 3]> {
         let found = names.map(|name| self.position(name).filter(|&at| self.properties[at].list.is_none()));
         if let [Some(a), Some(b), Some(c)] = found { Some([a, b, c]) } else { None }
@@ -234,7 +234,7 @@ impl Header {
         Ok(())
     }
 
-    /// Checks that the file has something to read.
+    /// Checks that the header declares one element vertex with x, y and z, and vertex indices of an integer type.
     fn check(&self, path: &Path) -> Result<(), FormatError> {
         let fault = |expected: &str, found: &str| FormatError::Unexpected {
             path: path.to_owned(),
@@ -310,7 +310,7 @@ impl Encoding {
     }
 }
 
-/// Returns the list of vertex indices of an element face.
+/// Returns the property of an element face that lists its vertex indices; `None` if there is none.
 fn indices_of(face: &Element) -> Option<&Property> {
     let is_indices = |p: &&Property| p.list.is_some() && matches!(p.name.as_str(), "vertex_indices" | "vertex_index");
     face.properties.iter().find(is_indices)
@@ -325,8 +325,8 @@ struct Reading<'a> {
 }
 
 impl Reading<'_> {
-    /// Reads all items: calls `value` with the property, the index in its list and the value, and `done` at the end of
-    /// each item.
+    /// Reads all items: calls `value` with the index of the property and each of its values, and `done` with the index
+    /// of the item at its end.
     fn each<S: Source>(
         &self,
         source: &mut S,
@@ -432,7 +432,7 @@ impl Reading<'_> {
 /// Reason why the next value could not be read.
 struct Fault {
     place: String,
-    /// Text at that place; empty at the end of the file.
+    /// Text at the place; `None` at the end of the file.
     found: Option<String>,
 }
 

@@ -87,7 +87,8 @@ pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<
     Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
-/// Reads a point cloud with the columns and units that the cell states; the decimal mark can be given too.
+/// Reads a point cloud with the columns, the units and the decimal mark that the cell states. If `decimal` is `None`,
+/// the decimal mark is detected.
 pub(super) fn parse_points_with(
     path: &Path,
     text: &[u8],
@@ -124,7 +125,8 @@ struct Grouped {
 }
 
 impl Grouped {
-    /// Checks a line that was read as a point, unless two lines are known already.
+    /// Records a line if one of its coordinates has a separator between thousands. Does nothing if two such lines are
+    /// recorded already. `lines_before` is the number of lines before it in the text.
     fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
         if self.lines > 1 || !has_both_marks(line) {
             return;

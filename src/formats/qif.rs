@@ -3,8 +3,8 @@
 //!
 //! The unit is that of `FileUnits/PrimaryUnits/LinearUnit`, by its factor to the metre. `Compensated` of a point set
 //! says if its points are contacts (true) or centres of the probe (false); the set can also give its `ProbeRadius`.
-//! Attributes anywhere in the file are the statements about it: `<AttributeStr name="regrind plan" value="5f3c..."/>`,
-//! and likewise `regrind part` and `regrind cycle`. Features named `P17` belong to target 17.
+//! Attributes anywhere in the file state what it belongs to: `<AttributeStr name="regrind plan" value="5f3c..."/>`, and
+//! likewise `regrind part` and `regrind cycle`. Features named `P17` belong to target 17.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -31,7 +31,7 @@ pub(super) fn is_xml(head: &[u8]) -> bool {
     head.starts_with(b"<?xml") || head.starts_with(b"<QIFDocument") || head.starts_with(b"<!--")
 }
 
-/// Reads the statements of a document about itself.
+/// Reads what a document states about its measurement, such as the plan and the cycle.
 ///
 /// # Errors
 /// A file that is not a document of QIF 3; a statement with an impossible value.
@@ -78,7 +78,7 @@ struct Qif<'p, 'a, 'i> {
     root: Node<'a, 'i>,
 }
 
-/// Points and their meaning.
+/// Points, and what the document states about them.
 #[derive(Default)]
 struct QifPoints {
     points: Vec<Point>,
@@ -203,7 +203,8 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Stores if points are compensated, and the radius of the probe; all sets must agree.
+    /// Stores whether the points of a set are contacts or centres, and the radius of the probe; rejects a set that
+    /// differs from the sets before it.
     fn what_they_are(&self, set: Node<'_, '_>, unit_mm: f64, found: &mut QifPoints) -> Result<(), FormatError> {
         if let Some(compensated) = child(set, "Compensated") {
             let says = match compensated.text().unwrap_or_default().trim() {

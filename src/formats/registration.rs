@@ -258,7 +258,7 @@ impl Drop for Draft<'_> {
     }
 }
 
-/// Makes the rename of a path durable.
+/// Flushes the folder of a path to the disk, so that a rename of the path is durable.
 ///
 /// # Errors
 /// A folder that cannot be flushed to the disk.

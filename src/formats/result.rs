@@ -1,4 +1,4 @@
-//! Result file of a measurement: points, and the statements of the file about itself.
+//! Result file of a measurement: points, and what the file states about its measurement (part, plan, cycle, probe).
 //!
 //! Any point file that the library reads is accepted. The file can also make statements in comments above the points:
 //!
@@ -84,7 +84,7 @@ pub struct Content {
     pub columns: Option<Columns>,
 }
 
-/// Statements of a file about itself.
+/// Properties of a measurement that a result file states; `None` for a property that it does not state.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Statements {
     /// Part that the file belongs to.
@@ -118,13 +118,13 @@ pub struct ResultFile {
     pub probe_radius_mm: Option<f64>,
     /// Number of rows that were skipped because they are switched off.
     pub switched_off: usize,
-    /// Decisions of the reader about ambiguous content, in words.
+    /// Notes on ambiguous content of the file and how it was read, in words.
     pub notes: Vec<String>,
-    /// Statements of the file about itself.
+    /// Properties of the measurement that the file states.
     pub statements: Statements,
 }
 
-/// Checks that the last line of a text has its line end; a file that was cut in its last number has none.
+/// Checks that the last line of a text has a line end. Without one, the file may be cut in its last number.
 ///
 /// # Errors
 /// A last line that is cut.

@@ -70,13 +70,13 @@ fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>
 /// Header fields that are used.
 struct Header {
     size: [usize; 2],
-    /// Metres per step.
+    /// Length in metres of one step of x, of y and of z.
     scale_m: [f64; 3],
     kind: u8,
 }
 
 impl Header {
-    /// Checks the fields in the order of [`FIELDS`].
+    /// Creates the header from the values of its fields, in the order of [`FIELDS`], and rejects impossible values.
     fn new(path: &Path, fields: [f64; 8]) -> Result<Self, FormatError> {
         let [columns, rows, x, y, z, compression, kind, check] = fields;
         let field = |k: usize, expected: &str| unexpected(path, FIELDS[k], expected, fields[k].to_string());

@@ -178,7 +178,7 @@ impl<'a> Words<'a> {
         Ok(&word[..end])
     }
 
-    /// Reads one of three words and returns which one.
+    /// Reads a word that must be one of `wanted`, and returns its index in `wanted`.
     fn one_of(&mut self, wanted: [&str; 3]) -> Result<usize, FormatError> {
         let word = self.next(wanted[0])?;
         let found = wanted.iter().position(|w| word.eq_ignore_ascii_case(w.as_bytes()));
@@ -191,7 +191,8 @@ impl<'a> Words<'a> {
         if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
     }
 
-    /// An incomplete word at the very end means that the file is cut.
+    /// Returns the error for `word`. If it is the beginning of one of the `wanted` words at the end of the file, the
+    /// error is that the file is cut.
     fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
         let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));

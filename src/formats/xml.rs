@@ -14,7 +14,8 @@ pub(super) struct Beyond {
     pub(super) found: String,
 }
 
-/// Scans a document once, even if it is not XML, for content beyond the limits of the parser.
+/// Returns the first limit that a document exceeds; `None` if it exceeds none. The document is scanned once and need
+/// not be XML.
 pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     let bytes = text.as_bytes();
     let (mut at, mut depth, mut namespaces) = (0, 0_usize, 0);

@@ -66,7 +66,8 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Returns the hash of a record, which chains it to the record before.
+/// Returns the hash of a record: the SHA-256 of [`DOMAIN`], the hash of the record before, a line feed, and the text of
+/// this record without hashes.
 pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     let mut digest = Sha256::new();
     for part in [DOMAIN, prev_hash, "\n", text] {

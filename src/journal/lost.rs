@@ -51,9 +51,9 @@ pub fn newest_cycle(folder: &Path) -> u32 {
     names.filter_map(number).max().unwrap_or(0)
 }
 
-/// Returns a message if the log has committed changes that were on the disk after a damaged place. Returns `None` if
-/// all frames are valid, or if the invalid part is only the end that a power failure left: a transaction is on the disk
-/// before the first frame of the next transaction is written.
+/// Returns a message if changes that were committed and on the disk follow an invalid part of the log: these changes
+/// are lost. Returns `None` if all frames are valid, or if only the end is invalid, as after a power failure: a
+/// transaction is on the disk before the first frame of the next transaction is written.
 fn damage(log: &[u8]) -> Option<String> {
     if log.len() <= LOG_HEADER {
         return None;

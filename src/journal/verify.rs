@@ -350,7 +350,9 @@ impl<'a> VerifierState<'a> {
             return wrong("it does not seal the record before it");
         }
         if !is_signed(&key, &self.run, seal.records, &seal.head, &seal.signature) {
-            return wrong("its signature is wrong: the author of it or of the records before it did not have the key");
+            return wrong(
+                "its signature is wrong: the author of this seal or of the records before it did not have the key",
+            );
         }
         self.seals += 1;
         self.signed = self.records;

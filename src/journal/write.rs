@@ -191,8 +191,8 @@ impl Journal {
         &self.part
     }
 
-    /// Checks that the files of the record are at the paths where they are written. A file that has lost its name
-    /// accepts every write, and all of it is lost.
+    /// Checks that the files of the record are at the paths where they are written. A file that was deleted still
+    /// accepts every write, but the written content is lost.
     ///
     /// # Errors
     /// [`JournalError::Gone`] with the path of a file that is missing or was replaced.
@@ -457,8 +457,8 @@ impl Journal {
         Ok(stands)
     }
 
-    /// Checks that no record was cut off or changed since the anchor. A journal that fails is not continued: that would
-    /// sign the changes.
+    /// Checks that no record was cut off or changed since the anchor. A journal that fails this check is not continued,
+    /// because its next seal would sign the changed records.
     fn is_whole(&self) -> Result<(), JournalError> {
         let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
         let (mut records, mut head) = (0, Tail::empty().hash);

@@ -17,14 +17,14 @@ pub enum LiveError {
     Trust(#[from] TrustError),
     #[error("{of} {name:?} cannot be a part of a topic: it is empty, or has one of + / #; give it another name")]
     Topic { of: &'static str, name: String },
-    #[error("{}: what outlives the program cannot be kept there: {source}; check that the folder is there, and yours to write", .path.display())]
+    #[error("{}: the state of the publisher cannot be stored there: {source}; check that the folder exists, and that you have the right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
     #[error(
-        "{listen} is open to other computers, and OPC UA is shown here without a cipher; listen at 127.0.0.1, and reach it from elsewhere \
+        "{listen} is open to other computers, and this OPC UA server has no encryption; listen at 127.0.0.1, and connect from other computers \
          through a tunnel: ssh -L 4840:127.0.0.1:4840 CELL"
     )]
     ForOthers { listen: SocketAddr },
-    #[error("the server of OPC UA cannot go on: {what}")]
+    #[error("the OPC UA server cannot continue: {what}")]
     Server { what: String },
     #[error(transparent)]
     File(#[from] FormatError),

@@ -89,50 +89,52 @@ pub const FIGURES: &[Figure] = &[
     text("Status/UnitModeName", "Name of the mode", |told| {
         told.snapshot().map(|now| in_words(if now.simulation { "Simulation" } else { "Production" }))
     }),
-    truth("Simulation", "Whether any machine of the cell is simulated", |told| {
+    truth("Simulation", "True if any machine of the cell is simulated", |told| {
         told.snapshot().map(|now| FigureValue::Truth(now.simulation))
     }),
     text("Message", "State and phase, for people", |told| match &told.run_status {
         RunStatus::NoRun => Some(in_words("no run is on")),
         RunStatus::Unresponsive { run } => Some(FigureValue::Text(format!(
-            "the program of {run} does not answer: what the machines do is not known; see to them"
+            "the program of {run} does not answer: the state of the machines is unknown; inspect them"
         ))),
         RunStatus::ProgramGone { run, machines_within: true } => Some(FigureValue::Text(format!(
             "the program of {run} has gone before its end, and its simulated machines with it"
         ))),
         RunStatus::ProgramGone { run, machines_within: false } => Some(FigureValue::Text(format!(
-            "the program of {run} has gone before its end: what the machines do is not known; see to them, then: regrind resume"
+            "the program of {run} ended before the end of the run: the state of the machines is unknown; inspect them, then: regrind resume"
         ))),
         RunStatus::Active { snapshot, .. } => Some(in_words(&snapshot.message)),
     }),
-    text("Next Step", "What a person does next", |told| told.snapshot().map(|now| in_words(&now.next))),
-    text("Phase", "Phase of the cycle, in which the cell is or will go on", |told| {
+    text("Next Step", "Next action of a person", |told| told.snapshot().map(|now| in_words(&now.next))),
+    text("Phase", "Phase of the cycle that the cell executes, or that it will continue", |told| {
         told.snapshot()?.phase.map(|phase| in_words(phase.name()))
     }),
-    text("Run", "What the run is called", |told| told.run().map(in_words)),
-    text("Part", "What the part is called", |told| told.snapshot().and_then(|now| if_known(&now.part))),
+    text("Run", "Name of the run", |told| told.run().map(in_words)),
+    text("Part", "Name of the part", |told| told.snapshot().and_then(|now| if_known(&now.part))),
     text("Serial", "Serial number of the part", |told| told.snapshot().and_then(|now| if_known(&now.serial))),
     whole("Cycle", "Number of the cycle; 0 before the first", |told| {
         told.snapshot().map(|now| FigureValue::Whole(now.cycle))
     }),
-    whole("Max Cycles", "How many cycles there are at most", |told| {
+    whole("Max Cycles", "Maximum number of cycles", |told| {
         told.snapshot().map(|now| now.max_cycles).filter(|most| *most > 0).map(FigureValue::Whole)
     }),
-    text("Job/Machine", "The machine that is at a job: cmm or grinder", |told| {
+    text("Job/Machine", "Machine that executes a job: cmm or grinder", |told| {
         job(told).map(|job| in_words(job.device.name()))
     }),
-    whole("Job/Done", "Points, or parts of the path, that are done", |told| {
+    whole("Job/Done", "Points, or parts of the path, of the job that are done", |told| {
         job(told).map(|job| FigureValue::Whole(job.done))
     }),
-    whole("Job/Total", "How many there are", |told| job(told).map(|job| FigureValue::Whole(job.total))),
-    number("Job/Progress", "%", "How far the job is", |told| {
+    whole("Job/Total", "Points, or parts of the path, of the whole job", |told| {
+        job(told).map(|job| FigureValue::Whole(job.total))
+    }),
+    number("Job/Progress", "%", "Progress of the job", |told| {
         job(told)
             .filter(|job| job.total > 0)
             .map(|job| FigureValue::Number(100.0 * f64::from(job.done) / f64::from(job.total)))
     }),
-    number("Job/Least Time Left", "s", "Least time that the job still takes", |told| time_left_s(told, 0)),
-    number("Job/Most Time Left", "s", "Most time that the job still takes", |told| time_left_s(told, 1)),
-    whole("Figures/Cycle", "The last cycle that was measured, to which PV and RMS belong", |told| {
+    number("Job/Least Time Left", "s", "Minimum remaining time of the job", |told| time_left_s(told, 0)),
+    number("Job/Most Time Left", "s", "Maximum remaining time of the job", |told| time_left_s(told, 1)),
+    whole("Figures/Cycle", "Last measured cycle, to which PV and RMS belong", |told| {
         measured(told).map(|row| FigureValue::Whole(row.cycle))
     }),
     number("Figures/PV", "um", "Peak to valley of the form, as it is judged", |told| {
@@ -141,26 +143,30 @@ pub const FIGURES: &[Figure] = &[
     number("Figures/RMS", "um", "Root mean square of the form, as it is judged", |told| {
         measured(told).map(|row| FigureValue::Number(row.judged_um()[1]))
     }),
-    number("Limits/PV", "um", "Limit of PV; none where it is not limited", |told| {
+    number("Limits/PV", "um", "Limit of PV; no value if PV has no limit", |told| {
         told.snapshot()?.tolerance.map(|limits| FigureValue::Number(1e3 * limits.pv_mm))
     }),
-    number("Limits/RMS", "um", "Limit of RMS; none where it is not limited", |told| {
+    number("Limits/RMS", "um", "Limit of RMS; no value if RMS has no limit", |told| {
         told.snapshot()?.tolerance.map(|limits| FigureValue::Number(1e3 * limits.rms_mm))
     }),
-    whole("Alarms/Count", "How many alarms stand", |told| {
+    whole("Alarms/Count", "Number of active alarms", |told| {
         told.snapshot().map(|now| FigureValue::Whole(u32::try_from(now.alarms.len()).unwrap_or(u32::MAX)))
     }),
-    text("Alarms/Text", "What the alarms say, the first first; empty where none stands", |told| {
+    text("Alarms/Text", "Texts of the active alarms, one on each line; empty without an alarm", |told| {
         told.snapshot().map(|now| listed(now.alarms.iter().map(|alarm| &*alarm.what), "\n"))
     }),
-    text("Unconfirmed", "Machines that have not confirmed that they stand, in a state that is taken for it", |told| {
-        told.snapshot().map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", "))
-    }),
-    text("Last Run/Name", "The last run that came to its end", |told| {
+    text(
+        "Unconfirmed",
+        "Machines that have not confirmed that they are at rest, in a state where the cell is considered to be at rest",
+        |told| told.snapshot().map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", ")),
+    ),
+    text("Last Run/Name", "Name of the last run that ended", |told| {
         told.last_run.as_ref().map(|last| in_words(&last.run))
     }),
-    text("Last Run/Verdict", "How it ended", |told| told.last_run.as_ref().map(|last| in_words(&last.verdict))),
-    truth("Last Run/Accepted", "Whether its part is accepted", |told| {
+    text("Last Run/Verdict", "Result of the last run that ended", |told| {
+        told.last_run.as_ref().map(|last| in_words(&last.verdict))
+    }),
+    truth("Last Run/Accepted", "True if the part of the last run that ended is accepted", |told| {
         told.last_run.as_ref().map(|last| FigureValue::Truth(last.accepted))
     }),
 ];

@@ -2,9 +2,9 @@
 //! reported.
 //!
 //! ```text
-//!  Snapshot --> Told --> FIGURES --> Sparkplug B: births, values that change, deaths --> broker
-//!                                 \-> OPC UA: nodes and events --> whoever looks
-//!  News <-- what was refused, and whether somebody is there <---/
+//!  Snapshot --> CellStatus --> FIGURES --> Sparkplug B: births, changed values, deaths --> broker
+//!                                       \-> OPC UA: nodes and events --> clients
+//!  PublisherEvent <-- refused requests, and whether the publisher is connected <--/
 //! ```
 #![cfg(feature = "plant")]
 

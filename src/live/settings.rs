@@ -1,4 +1,4 @@
-//! Where live values go, as a person writes it.
+//! Settings of the plant file for the receivers of live values.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -26,8 +26,9 @@ pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     AlarmTexts { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
 }
 
-/// Returns the part of an alarm's cause that follows its head: the values of the case. An older record has another
-/// wording of the head, with as many colons.
+/// Returns the part of `what`, the cause of an alarm, that follows the general text `head`: a colon and the values of
+/// this alarm, or "." if there are none. The end of the general text is found by its number of colons, because the
+/// general text of an older record can have other words.
 fn case<'a>(what: &'a str, head: &str) -> &'a str {
     let colons = head.matches(": ").count();
     what.match_indices(": ").nth(colons).map_or(".", |(at, _)| &what[at..])

@@ -42,7 +42,8 @@ impl Line {
     }
 }
 
-/// Draws the chart; empty if nothing was measured.
+/// Returns the chart as SVG; empty if nothing was measured. If `ahead` is true, the chart contains the forecast for the
+/// next cycle.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
     let lines = [
         Line::new(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),

@@ -37,7 +37,7 @@ const TOKEN: &str = "x-regrind-token";
 const TOKEN_LASTS: Duration = Duration::from_secs(30);
 const TOKENS: usize = 1024;
 
-/// Maximum number of wrong keys within a minute. For further ones, the answer is that there are too many.
+/// Maximum number of wrong keys within a minute. Each further wrong key gets the answer that there were too many.
 const WRONG_KEYS: u32 = 20;
 /// Maximum number of refusals that are logged within a minute. Further ones are only counted.
 const MAX_LOGGED_REFUSALS: u32 = 10;
@@ -104,7 +104,7 @@ pub(crate) struct Guard {
     /// Browser that has control.
     holder: Mutex<Option<String>>,
     log: Box<LogSink>,
-    /// Function that writes a message to the record of the runs concerned.
+    /// Function that writes a message to the record of each run that it concerns.
     on_record: Box<dyn Fn(String) + Send + Sync>,
 }
 
@@ -197,8 +197,9 @@ impl Guard {
         self.set_cookie(response.headers_mut(), SESSION_COOKIE, session);
     }
 
-    /// Returns true if a key is correct, and `None` if it is one of too many wrong keys. A correct key is always
-    /// accepted: it cannot be found by guessing, and wrong guesses of others must not lock out an operator.
+    /// Returns true if a key is correct, false if it is wrong, and `None` if there were too many wrong keys within a
+    /// minute. A correct key is always accepted: it cannot be found by guessing, and wrong guesses of others must not
+    /// lock out an operator.
     fn is_key(&self, key: &str) -> Option<bool> {
         if same(key, &self.key) {
             return Some(true);
@@ -244,12 +245,12 @@ impl Guard {
             (refusals.count(), untold)
         };
         if untold > 0 {
-            (self.log)(&format!("{untold} more were refused in that minute"));
+            (self.log)(&format!("{untold} further requests were refused in that minute"));
         }
         if told <= MAX_LOGGED_REFUSALS {
             (self.log)(&format!("refused {what}"));
         } else if told == MAX_LOGGED_REFUSALS + 1 {
-            (self.log)("more was refused within the same minute: it is counted, and not told one by one");
+            (self.log)("further refusals within this minute are counted, but not logged one by one");
         }
         told <= MAX_LOGGED_REFUSALS
     }
@@ -329,7 +330,7 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
         next.run(request).await
     } else {
         guard.record_refusal(&format!("a request for the host {}", printable(host)));
-        (StatusCode::MISDIRECTED_REQUEST, "this page goes by another name\n").into_response()
+        (StatusCode::MISDIRECTED_REQUEST, "this page is served under another name\n").into_response()
     };
     let headers = response.headers_mut();
     let policy = HeaderName::from_static("content-security-policy");
@@ -399,7 +400,8 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     })
 }
 
-/// Sends the key cookie and a session name to a browser. A browser with a session keeps it in all its tabs.
+/// Sends the key cookie and the name of a session to a browser. A browser that has a session keeps this session in all
+/// its tabs.
 fn welcome(guard: &Guard, request: &Request) -> Response {
     let headers = request.headers();
     let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));

@@ -31,8 +31,8 @@ use super::{assets, sign_in};
 const KNOWN: usize = 512;
 const STRANGERS: usize = 384;
 const STRANGERS_OF_ADDRESS: usize = 64;
-/// Timeout for a client to send its request, and timeout until the answer to an order begins. The second one covers the
-/// body of the order and a cell that does not answer at once.
+/// Timeout for a client to send its request, and timeout until the answer to an order begins. The second timeout
+/// includes the time for the body of the order and for the answer of the cell.
 const PATIENCE: Duration = Duration::from_secs(10);
 const ANSWERS_WITHIN: Duration = Duration::from_secs(25);
 /// Maximum length of the body of an order, in bytes.

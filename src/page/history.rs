@@ -30,7 +30,7 @@ impl History {
         Self { runs, read: Mutex::default() }
     }
 
-    /// Returns the folder of a run from its name; `None` if the name is not the name of a folder here.
+    /// Returns the folder of a run from its name; `None` if this list has no run with that name.
     pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
         let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
         let folder = self.runs.join(id);

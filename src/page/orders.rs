@@ -45,7 +45,7 @@ pub(crate) async fn order(
     let request = serde_json::from_slice::<Request>(&body).ok();
     // Other requests that the cell understands are for programs and the terminal only.
     let Some((request, name)) = request.and_then(|request| name_of(&request).map(|name| (request, name))) else {
-        return refuse(&page, &run, "what is no order of the page".into(), StatusCode::BAD_REQUEST).await;
+        return refuse(&page, &run, "a request that is not an order of the page".into(), StatusCode::BAD_REQUEST).await;
     };
     if let Some(what) = not_for(&session, name) {
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
@@ -80,14 +80,14 @@ fn name_of(request: &Request) -> Option<&'static str> {
     }
 }
 
-/// Returns the reason why the person at a browser cannot give an order.
+/// Returns the reason why the person at a browser cannot give an order; `None` if the role of the person allows it.
 fn not_for(session: &Session, order: &str) -> Option<String> {
     let person = session.person.as_ref().filter(|_| !session.may(order))?;
-    Some(format!("the order {order} of {person}: it is not for that role"))
+    Some(format!("the order {order} of {person}: the role of this person cannot give it"))
 }
 
-/// Returns the reason why a person cannot continue: only a process engineer clears the active alarm, and the person is
-/// not one.
+/// Returns the reason to refuse a resume: only a process engineer can clear an active alarm, and the person at the
+/// browser is not a process engineer. Otherwise returns `None`.
 async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;

@@ -55,7 +55,8 @@ fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option
     Some(folder.join(named(of)?))
 }
 
-/// Answers with bytes. They are made on a blocking thread, so that no other request waits.
+/// Answers with the bytes that `make` returns, or with the status 404 if it returns `None`. `make` runs on a blocking
+/// thread, so that no other request waits.
 async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatError>> + Send + 'static) -> Response {
     match spawn_blocking(make).await {
         Ok(Some(Ok(Some(bytes)))) => {

@@ -1,5 +1,5 @@
-//! Sign-in and sign-out, if there are users. Passwords are checked one at a time, and the attempts of each place are
-//! limited.
+//! Sign-in and sign-out, if there are users. Passwords are checked one at a time. The attempts of each place are
+//! limited; a place is an IPv4 address or an IPv6 network.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -35,7 +35,7 @@ const NAMES_OF_PLACE: usize = 64;
 /// Maximum number of password checks that one place can have waiting, so that its guesses do not delay the sign-in of
 /// others.
 const WAITING_OF_PLACE: usize = 2;
-/// Maximum time that a user waits for the guesses of others, and interval at which a waiting sign-in asks again.
+/// Maximum time that a sign-in waits for the password checks of others, and interval at which it tries again.
 const WAITS: Duration = Duration::from_secs(5);
 const ASKED_EVERY: Duration = Duration::from_millis(20);
 
@@ -62,8 +62,8 @@ impl Default for SignedIn {
 }
 
 impl SignedIn {
-    /// Returns the person who has signed in with a browser; `None` if that person's line in the list has changed since
-    /// then.
+    /// Returns the person who has signed in with a browser; `None` if nobody has, if the session has expired, or if the
+    /// entry of the person in the list has changed since the sign-in.
     pub(crate) fn person(&self, session: &str, users: &UsersFile) -> Option<Person> {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.retain(|(.., since)| since.elapsed() < SESSION_LIFETIME);
@@ -112,8 +112,8 @@ impl SignedIn {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }
 
-    /// Reserves a waiting place for a password check, until the place is dropped; `None` if the place of the
-    /// client has no free share before the timeout.
+    /// Reserves a slot in the queue of password checks, which is released when the value is dropped. Waits until the
+    /// place of the client has a free slot; returns `None` after the timeout.
     async fn wait_a_while(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let began = Instant::now();
         loop {
@@ -124,7 +124,7 @@ impl SignedIn {
         }
     }
 
-    /// Reserves a waiting place at once; `None` if the place of the client has used its share.
+    /// Reserves a slot in the queue at once; `None` if the place of the client uses all its slots.
     fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let place = place(from);
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -137,7 +137,7 @@ impl SignedIn {
     }
 }
 
-/// Waiting place for a password check. It is released on drop.
+/// Slot in the queue of password checks. It is released on drop.
 struct Waiting<'s> {
     of: &'s SignedIn,
     place: IpAddr,

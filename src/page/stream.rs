@@ -18,7 +18,8 @@ use super::live::ObservedRun;
 use super::texts::Language;
 use super::view::{self, Piece};
 
-/// Maximum silence of the stream. A browser that gets nothing for longer shows that its figures are old.
+/// Maximum time between two messages of the stream. A browser that gets no message for longer shows that its figures
+/// are old.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// Browser that shows a run.

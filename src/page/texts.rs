@@ -41,7 +41,7 @@ impl Language {
 
 macro_rules! texts {
     ($($name:ident { $en:literal, $de:literal, $zh:literal })+) => {
-        /// Something that the page says.
+        /// Text of the page.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub(crate) enum Text {
             $($name,)+
@@ -51,7 +51,7 @@ macro_rules! texts {
             #[cfg(test)]
             const ALL: &[Self] = &[$(Self::$name),+];
 
-            /// Says it.
+            /// Returns the text in a language.
             pub(crate) fn to(self, language: Language) -> &'static str {
                 match self {
                     $(Self::$name => [$en, $de, $zh][language as usize],)+
@@ -108,21 +108,21 @@ texts! {
     TimeLeft { "left", "verbleiben", "剩余" }
     PreliminaryPoints { "preliminary", "vorläufig", "初步" }
     PreliminaryMeans {
-        "from where the plan has the part; not registered, not judged",
+        "relative to the planned position of the part; not registered, not judged",
         "gegen die Lage des Teils im Plan; nicht eingepasst, nicht beurteilt",
         "相对于计划中的工件位置；未配准，未判定"
     }
     Waits { "Waiting for", "Wartet auf", "等待" }
     WhatToDo { "What to do", "Was zu tun ist", "处理方法" }
     ClearedBy { "Cleared by", "Quittiert durch", "复位人" }
-    ByItself { "nobody: it goes by itself", "niemand: er geht von selbst", "无需：自行消失" }
+    ByItself { "nobody: the alarm ends by itself", "niemand: er geht von selbst", "无需：自行消失" }
     ByOperator { "the operator", "den Bediener", "操作员" }
     ByEngineer { "the process engineer", "den Prozessingenieur", "工艺工程师" }
     NoAlarm { "No alarm", "Kein Alarm", "无报警" }
     NoAlarmRaised { "No alarm was raised", "Kein Alarm wurde ausgelöst", "未触发过报警" }
     Raised { "raised", "ausgelöst", "触发于" }
     Withdrawn { "gone", "behoben", "消除于" }
-    StoodAtTheEnd { "stood at the end", "stand am Ende noch an", "结束时仍存在" }
+    StoodAtTheEnd { "active at the end", "stand am Ende noch an", "结束时仍存在" }
     // Figures.
     Convergence { "Convergence", "Konvergenz", "收敛" }
     Figures { "Figures", "Kennwerte", "数值" }
@@ -141,7 +141,7 @@ texts! {
     Points { "Points", "Punkte", "测点" }
     Histogram { "Distribution", "Verteilung", "分布" }
     NoRelief {
-        "This browser draws no relief: the map is shown.",
+        "This browser cannot draw the relief: the map is shown instead.",
         "Dieser Browser zeichnet kein Relief: die Karte wird gezeigt.",
         "此浏览器无法绘制立体图：显示误差图。"
     }
@@ -244,17 +244,17 @@ texts! {
     AtCompensate { "computing the correction", "Korrektur berechnen", "计算补偿" }
     // First action of a resume.
     GoesOn {
-        "the machine goes on with its job from where it stands",
+        "the machine continues its job from its present position",
         "die Maschine setzt ihren Auftrag dort fort, wo sie steht",
         "机器从当前位置继续作业"
     }
     Asks {
-        "the machine is asked what became of its job; nothing moves before it has answered",
+        "the cell asks the machine for the state of its job; nothing moves before the machine has answered",
         "die Maschine wird nach ihrem Auftrag gefragt; nichts bewegt sich vor ihrer Antwort",
         "询问机器作业结果；应答前不会有任何动作"
     }
     SendsAnew {
-        "the job is sent to the machine anew and checked; then it starts",
+        "the job is sent to the machine again and checked; then the machine starts",
         "der Auftrag wird der Maschine neu gesendet und geprüft; dann startet sie",
         "重新发送并检查作业；然后启动"
     }
@@ -264,17 +264,17 @@ texts! {
         "重新读取机器结果"
     }
     GivesBack {
-        "the machine is told that it may forget its result",
+        "the cell tells the machine that it can delete its result",
         "der Maschine wird gesagt, dass sie ihr Ergebnis vergessen darf",
         "告知机器可以清除结果"
     }
-    AsksToLoad { "the part is asked for", "nach dem Teil wird gefragt", "要求装件" }
+    AsksToLoad { "the cell asks for the part", "nach dem Teil wird gefragt", "要求装件" }
     LeavesPart {
-        "the grinder is seen clear of the part; then the measurement begins",
+        "the cell checks that the grinder is clear of the part; then the measurement begins",
         "geprüft wird, dass die Schleifmaschine frei ist; dann beginnt die Messung",
         "确认磨床已离开零件；然后开始测量"
     }
-    ComputesAnew { "it is computed again; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
+    ComputesAnew { "the cell computes it again; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
     // Results of runs.
     Open { "no end on record", "kein Ende im Protokoll", "无结束记录" }
     Live { "on now", "im Gang", "进行中" }
@@ -291,7 +291,7 @@ texts! {
         "选择两次运行并排比较。"
     }
     KeyNeeded {
-        "This page needs its key. It stands in the address that `regrind serve` has printed.",
+        "This page needs its key. The key is in the address that `regrind serve` printed.",
         "Diese Seite braucht ihren Schlüssel. Er steht in der Adresse, die `regrind serve` ausgegeben hat.",
         "此页面需要密钥，见 `regrind serve` 输出的地址。"
     }
@@ -301,17 +301,17 @@ texts! {
     UserName { "Name", "Name", "用户名" }
     Password { "Password", "Kennwort", "密码" }
     SignInRefused {
-        "Name and password do not belong together. Type both again.",
+        "The name or the password is wrong. Type both again.",
         "Name und Kennwort gehören nicht zusammen. Beide noch einmal eingeben.",
         "用户名与密码不符。请重新输入。"
     }
     TooManyTries {
-        "Too many tries from here. Wait a minute, then sign in.",
+        "Too many attempts from this address. Wait a minute, then sign in.",
         "Zu viele Versuche von hier. Eine Minute warten, dann anmelden.",
         "此处尝试次数过多。请等待一分钟再登录。"
     }
     WhoMakesUsers {
-        "Who keeps the computer of the cell adds users: regrind users add",
+        "The administrator of the computer of the cell adds users: regrind users add",
         "Wer den Rechner der Zelle betreut, legt Benutzer an: regrind users add",
         "由单元计算机的管理者添加用户：regrind users add"
     }

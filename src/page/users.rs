@@ -18,8 +18,8 @@ use thiserror::Error;
 
 /// First lines of the file, which explain it to a reader.
 const FIRST_LINES: &str = "\
-# Who may sign in to the page of this cell. `regrind users` keeps it. Of a password it has only what proves it, which is still for
-# nobody else: who has it may try passwords as fast as a computer can.
+# People who can sign in to the page of this cell. `regrind users` writes this file. It contains no passwords, only a hash of each.
+# Keep the file secret: with a hash, a computer can try many passwords.
 ";
 /// Maximum length of the name of a person, in characters.
 const LONGEST_NAME: usize = 64;
@@ -33,9 +33,9 @@ const MAX_BYTES: u64 = 1 << 20;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PageRole {
-    /// Can only look.
+    /// Can see the page, and can give no order.
     Viewer,
-    /// Can look, and can hold a cell whose figures are wrong.
+    /// Can see the page, and can hold a cell, for example if its figures are wrong.
     Quality,
     /// Can give all orders, but cannot continue after an alarm that only a process engineer clears.
     Operator,
@@ -98,9 +98,9 @@ impl Display for Person {
 pub enum UsersError {
     #[error("{}: the list of users cannot be read: {source}; make one: regrind users add NAME --role operator", .path.display())]
     Unreadable { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer may read it ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    #[error("{}: other users of this computer can read this list of users ({}); only its owner must be able to read it: {}", .path.display(), .open.how, .open.remedy)]
     Open { path: PathBuf, open: OpenToOthers },
-    #[error("{}: no list of users: {what}", .path.display())]
+    #[error("{}: not a list of users: {what}", .path.display())]
     Broken { path: PathBuf, what: String },
     #[error(
         "the name of a user must have 1 to {LONGEST_NAME} characters, without control characters and without characters that change the direction of the text"
@@ -108,7 +108,7 @@ pub enum UsersError {
     Name,
     #[error("the password has {found} bytes; it needs {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}")]
     Password { found: usize },
-    #[error("the password cannot be made a proof of: {0}")]
+    #[error("the password cannot be hashed: {0}")]
     Hash(String),
 }
 
@@ -145,7 +145,7 @@ impl Users {
         let found = std::fs::metadata(path).map_err(failed)?;
         let broken = |what: String| UsersError::Broken { path: path.to_owned(), what };
         if !found.is_file() || found.len() > MAX_BYTES {
-            return Err(broken("it is no small file".into()));
+            return Err(broken("it is not a file, or it is larger than 1 MiB".into()));
         }
         if let Some(open) = readable_by_others(path).map_err(failed)? {
             return Err(UsersError::Open { path: path.to_owned(), open });
@@ -158,13 +158,13 @@ impl Users {
         for (at, user) in users.iter().enumerate() {
             let wrong = |what: &str| Err(format!("user {} ({:?}): {what}", at + 1, user.name));
             if named(&user.name).is_err() {
-                return wrong("no name for a user");
+                return wrong("the name is not allowed");
             }
             if users[..at].iter().any(|other| other.name == user.name) {
                 return wrong("the name is there twice");
             }
             if PasswordHash::new(&user.proof).is_err() {
-                return wrong("its proof is none; set the password anew: regrind users add");
+                return wrong("its `proof` is not a password hash; set the password again: regrind users add");
             }
         }
         Ok(Self { users })
@@ -206,8 +206,8 @@ impl Users {
         self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
     }
 
-    /// Returns the user with this name and password; `None` if they do not match. Takes some hundredths of a second,
-    /// also for an unknown name, so that the time reveals nothing about either to an attacker.
+    /// Returns the user with this name and password; `None` if there is no such user. Takes some hundredths of a
+    /// second, also for an unknown name, so that the time does not show to an attacker which names exist.
     fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         let user = self.users.iter().find(|user| user.name == name);
         let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;

@@ -102,7 +102,7 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
     })
 }
 
-/// Returns the orders that make sense now and that the person can give.
+/// Returns the orders that are possible in the present state of the cell and that the person can give.
 fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
@@ -306,7 +306,7 @@ fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     }
 }
 
-/// Returns an alarm that needs action.
+/// Returns the HTML of an active alarm, with its consequence and its remedy.
 fn standing(alarm: &Alarm, language: Language) -> Markup {
     let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
     html! {
@@ -701,7 +701,7 @@ struct Frame<'a> {
     kind: Kind<'a>,
 }
 
-/// Subject of a page. It decides the content of the page's head.
+/// Subject of a page. It decides the links at the top of the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PageSubject {
     /// One cell and its runs.

@@ -55,8 +55,8 @@ impl PlantRun {
         })
     }
 
-    /// Checks the journal at the cell against the plant's copy: the journal must contain at least that many records,
-    /// and the last of them must have this hash.
+    /// Checks the journal at the cell against the plant's copy: the journal must contain at least `self.records`
+    /// records, and the record of that number must have the hash `self.head`.
     ///
     /// # Errors
     /// The journal was cut or rewritten after it was replicated, or cannot be read.
@@ -82,7 +82,8 @@ impl PlantRun {
     /// Fetches the records and files of the run into a new folder. [`regrind_journal::verify`] then verifies it.
     ///
     /// # Errors
-    /// The folder is in use, a record is not one that a journal writes, or the plant cannot be reached.
+    /// The folder is in use, the text of a record does not have the form that a journal writes, or the plant cannot be
+    /// reached.
     pub async fn fetch(
         &self,
         link: &DatabaseLink,
@@ -122,7 +123,10 @@ impl PlantRun {
                     return Err(broken("it does not follow the record before it: the plant lacks records").into());
                 }
                 let record = Record::from_text(text, &head, &hash);
-                records.push(record.ok_or_else(|| broken("its text in the plant is not that of a journal"))?);
+                records.push(
+                    record
+                        .ok_or_else(|| broken("its text in the plant does not have the form that a journal writes"))?,
+                );
                 head = hash;
             }
             if rows.len() < PAGE as usize {
@@ -131,11 +135,11 @@ impl PlantRun {
         }
     }
 
-    /// Verifies the plant's copy: records, order, files and signatures. If no keys are given, the keys that the plant
-    /// has for the cell count.
+    /// Verifies the plant's copy: records, order, files and signatures. If `keys` is empty, the keys that the plant has
+    /// for the cell are used.
     ///
     /// # Errors
-    /// [`JournalError::Broken`] with the first record that cannot be believed.
+    /// [`JournalError::Broken`] with the first record that fails the verification.
     pub fn prove(&self, folder: &Path, keys: &[PublicKey]) -> Result<Verified, PlantError> {
         let keys = if keys.is_empty() { self.keys.clone() } else { keys.to_vec() };
         let verified = verify_against(folder, &ExternalEvidence { anchor: None, keys })?;
@@ -143,15 +147,16 @@ impl PlantRun {
             true => Ok(verified),
             false => {
                 let [has, says] = [verified.records, self.records];
-                let what = format!("the plant has {has} records of it and counts {says}, or the last record differs");
+                let what =
+                    format!("the plant has {has} records and counts {says}, or the last record has another hash");
                 Err(PlantError::Differs { run: self.name.clone(), what })
             }
         }
     }
 }
 
-/// Returns the newest seal among the records, as the anchor next to the journal had it at that time; without a seal,
-/// the end of the records.
+/// Returns the anchor of the newest seal among the records, as `journal.anchor` had it after that seal. Without a seal,
+/// returns an anchor of the last record. `None` if there is no record, or if the seal is invalid.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
     let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal).map(Record::value) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));
@@ -166,7 +171,8 @@ fn last_sealed(records: &[Record]) -> Option<Anchor> {
     })
 }
 
-/// Reads a content by its hash; `None` if the plant does not have it.
+/// Reads the content of a file by its SHA-256, from the database or from the folder of large files; `None` if the plant
+/// does not have it.
 ///
 /// # Errors
 /// The plant cannot be reached, or the folder of large files does not exist.

@@ -21,7 +21,7 @@ pub enum PlantError {
     Unreachable { place: String, what: String },
     #[error("the database refused {what}: {why}{hint}")]
     Refused { what: &'static str, why: String, hint: String },
-    #[error("the database has the layout of Regrind {found}, and this program knows {known}; {remedy}")]
+    #[error("the database has layout {found}, and this program requires layout {known}; {remedy}")]
     Layout { found: i32, known: i32, remedy: &'static str },
     #[error(
         "the layout of the database was changed: migration {version} has another text; restore the database from its \
@@ -29,13 +29,15 @@ pub enum PlantError {
     )]
     ForeignLayout { version: i32 },
     /// The records in the plant and those at the cell disagree.
-    #[error("{run}: {what}; change neither, and compare: regrind audit verify --plant")]
+    #[error(
+        "{run}: {what}; change neither the journal nor the copy at the plant, and compare them: regrind audit verify --plant"
+    )]
     Differs { run: String, what: String },
     #[error("the plant has no run {name:?} of {cell:?}; `regrind plant runs` lists them")]
     NoRun { cell: String, name: String },
     #[error("{0}")]
     Recipe(String),
-    #[error("part {work} of the queue: {why}; take another: regrind work")]
+    #[error("part {work} of the queue: {why}; to take another part: regrind work")]
     Work { work: i64, why: String },
     #[error("{}: the folder for large files cannot be used: {source}; check that it exists, and that you have the \
              right to write in it", .path.display())]

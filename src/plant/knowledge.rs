@@ -16,7 +16,7 @@ use super::hex::digits;
 use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
-/// Maximum size of a file of learned results, the same as in the layout of the database.
+/// Maximum size of a file of learned results in bytes. The database has the same limit.
 const MAX_BYTES: u64 = 4 << 20;
 
 /// Prior knowledge of the plant for a first part of a kind.
@@ -24,9 +24,10 @@ const MAX_BYTES: u64 = 4 << 20;
 pub struct Knowledge {
     /// Results of other cells for parts of this kind.
     pub results: Vec<(CellRun, Learned)>,
-    /// Results of pairs of cells for the same kind, whichever kind it is; true if this cell is one of the pair.
+    /// Pairs of results of two cells for the same kind of part, which can be another kind than that of `results`. True
+    /// if this cell is one of the two.
     pub pairs: Vec<([Learned; 2], bool)>,
-    /// Reasons for each result that was rejected.
+    /// Reason for each result that was rejected.
     pub left_alone: Vec<String>,
 }
 
@@ -49,8 +50,8 @@ impl Knowledge {
     /// similar machines are.
     ///
     /// # Errors
-    /// The plant cannot be reached, or the role is not a cell's. A fault of one result is in the answer and is reported
-    /// to the plant.
+    /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: it
+    /// is listed in `left_alone` and reported to the plant.
     pub async fn query(
         link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
@@ -77,7 +78,7 @@ impl Knowledge {
         Ok(knowledge)
     }
 
-    /// Verifies the delivered results, and reports to the plant those that cannot be believed.
+    /// Verifies the delivered results, and returns the valid ones. Reports the invalid ones to the plant.
     async fn verify_results(
         &mut self,
         link: &DatabaseLink,
@@ -102,7 +103,8 @@ impl Knowledge {
     }
 }
 
-/// Reads a result from a row, if its content is what the row says.
+/// Reads a result from a row, and checks that its content has the hash in the row. Returns the reason if the result
+/// cannot be used.
 fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<DeliveredResult, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
@@ -123,7 +125,7 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
     Ok(DeliveredResult { kind, is_own, from, learned })
 }
 
-/// Reads a file up to the maximum size of a result, whatever size the database gives.
+/// Reads a file of at most [`MAX_BYTES`] bytes; returns an error for a longer one.
 fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     fs::File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut content)?;
@@ -133,8 +135,9 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Registers in the plant what a finished run of this cell has learned; all files of the run have arrived. Returns the
-/// reason if the plant refuses.
+/// Registers in the plant the learned result of a finished run of this cell, after all files of the run have arrived
+/// there. Returns the reason if the plant refuses the result; `None` if it is registered, or if there is no usable
+/// result.
 pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";

@@ -73,7 +73,7 @@ impl DatabaseLink {
         self.client.query(text, values).await.map_err(refused("the query"))
     }
 
-    /// Reports the state of the cell, in the run of this name.
+    /// Reports the state of the cell to the plant. `run` is the name of the active run; `None` without an active run.
     ///
     /// # Errors
     /// The database cannot be reached, or refuses the report.

@@ -56,8 +56,8 @@ impl PlantRecipe {
     /// Stores the recipe as the next version of its name; returns its hash.
     ///
     /// # Errors
-    /// The recipe exists already under this or another name, the role may not store recipes, or the plant cannot be
-    /// reached.
+    /// The recipe exists already under this or another name, the database role has no right to store recipes, or the
+    /// plant cannot be reached.
     pub async fn propose(&mut self, link: &DatabaseLink) -> Result<String, PlantError> {
         let failed = refused("the recipe");
         let newest = "SELECT coalesce(max(version), 0) FROM recipe WHERE name = $1";
@@ -100,7 +100,8 @@ impl PlantRecipe {
     /// Adds a person's signature to the recipe.
     ///
     /// # Errors
-    /// The person or the key has signed the recipe already, the role may not sign, or the plant cannot be reached.
+    /// The person or the key has signed the recipe already, the database role has no right to sign, or the plant cannot
+    /// be reached.
     pub async fn approve(&self, link: &DatabaseLink, person: &str, key: &AuditKey) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
@@ -168,7 +169,8 @@ fn words(sha256: &str, person: &str) -> String {
     format!("regrind recipe approval 1\n{sha256}\n{person}\n")
 }
 
-/// Verifies a recipe received from the plant. Returns the names of those who signed it; in words, the fault.
+/// Verifies a recipe received from the plant. Returns the recipe and the names of the approvers who signed it;
+/// otherwise the fault as a text.
 fn proven(
     recipe: PlantRecipe,
     sha256: &str,

@@ -1,9 +1,9 @@
 //! Replication of the journals of a cell to the plant. Records are sent at least once, and stored exactly once.
 //!
 //! ```text
-//!  runs/<id>/journal.sqlite --records--> ship() --+--> record      held against the chain as it arrives
-//!                  files on record --by hash----> +--> artefact    each content once
-//!                  what a glance shows ---------> +--> run, cycle
+//!  runs/<id>/journal.sqlite --records--> ship() --+--> record      the chain is verified on arrival
+//!                  recorded files --by hash-----> +--> artefact    each content is stored once
+//!                  summary of the run ----------> +--> run, cycle
 //! ```
 //!
 //! The plant alone stores how far a run is replicated. After any loss, a round therefore continues from the plant's
@@ -30,7 +30,7 @@ use super::settings::ArtefactSettings;
 /// Maximum number of records, and of bytes of text, in one batch.
 const MAX_RECORDS: usize = 1000;
 const MAX_BYTES: usize = 1 << 20;
-/// Maximum size of a content in the database.
+/// Maximum size of the content of a file in the database, in bytes.
 const MAX_CONTENT_BYTES: u64 = 256 << 20;
 
 /// Replicates the runs of a folder.
@@ -67,7 +67,7 @@ struct PlantRunState {
 }
 
 impl Replicator {
-    /// Creates a shipper for a folder of runs.
+    /// Creates a replicator for a folder of runs.
     pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
         Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), reported: HashSet::new() }
     }
@@ -80,8 +80,8 @@ impl Replicator {
     /// Sends everything that the plant does not have, the newest run first.
     ///
     /// # Errors
-    /// The plant cannot be reached, or refuses everything. A fault of one run is in the result, and the other runs
-    /// continue.
+    /// The plant cannot be reached, or refuses a request. A run that differs from its copy is not an error: it is
+    /// listed in the result, and the other runs continue.
     pub async fn round(&mut self, link: &DatabaseLink) -> Result<ReplicationResult, PlantError> {
         let mut shipped = ReplicationResult::default();
         for (name, stamp) in self.unsettled() {
@@ -235,8 +235,8 @@ impl Replicator {
     }
 }
 
-/// Writes a content to the folder of the plant, under its hash. An existing file is checked, and repaired if it
-/// differs.
+/// Writes the content of a file to the folder of large files, under its SHA-256. Replaces an existing file that has
+/// another content.
 fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
     let name = digits(sha256);
     let path = folder.join(&name[..2]).join(&name);

@@ -25,7 +25,8 @@ const LOCK: i64 = 0x5267_7264_506c_616e;
 /// version after.
 ///
 /// # Errors
-/// The role may not, a later program has laid out the database, or its layout was changed by hand.
+/// The database role has no right to change the layout, a later version of Regrind made the layout, or a person changed
+/// it.
 pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
     let failed = refused("its layout");
     let client = link.client_mut();
@@ -127,7 +128,7 @@ impl PlantRole {
 /// new password and the additional keys.
 ///
 /// # Errors
-/// The role may not make roles, or another cell's role has this name.
+/// The database role has no right to create roles, or another cell has a role of this name.
 pub async fn enrol_cell(
     link: &mut DatabaseLink,
     name: &str,
@@ -158,7 +159,7 @@ pub async fn enrol_cell(
 /// Creates a role for a person or a program, or gives an existing role a new password.
 ///
 /// # Errors
-/// The role may not make roles.
+/// The database role has no right to create roles.
 pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
     let failed = refused("to enrol the role");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
@@ -166,7 +167,8 @@ pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: Plan
     step.commit().await.map_err(&failed)
 }
 
-/// Creates the role. A role command takes no parameters, so the server itself formats name and password into its text.
+/// Creates a role in a group, or gives an existing role a new password. SQL commands for roles take no parameters, so
+/// the server itself quotes the name and the password in their text.
 async fn make_role(
     step: &tokio_postgres::Transaction<'_>,
     role: &str,
@@ -186,10 +188,11 @@ async fn make_role(
     Ok(())
 }
 
-/// Retires a cell: its role cannot sign in any more; its records stay.
+/// Retires a cell: its role cannot sign in any more, and its records stay. Returns false if there is no such cell, or
+/// if it is retired already.
 ///
 /// # Errors
-/// There is no such cell, or the role may not retire it.
+/// The database role has no right to retire a cell, or the database cannot be reached.
 pub async fn retire_cell(link: &mut DatabaseLink, name: &str) -> Result<bool, PlantError> {
     let failed = refused("to retire the cell");
     let step = link.client_mut().transaction().await.map_err(&failed)?;

@@ -1,4 +1,4 @@
-//! Where the plant is, as a person writes it.
+//! Settings of the plant file: database, folder of large files, approvers of recipes.
 
 use std::path::PathBuf;
 

@@ -43,7 +43,7 @@ impl Study {
     /// Stores the study with one job for each combination of values and seed. Returns the number of jobs.
     ///
     /// # Errors
-    /// A study of that name exists, the role may not, or the plant cannot be reached.
+    /// A study of that name exists, the database role has no right to create studies, or the plant cannot be reached.
     pub async fn begin(&self, link: &DatabaseLink, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
         let seeds: Vec<i64> = seeds.iter().map(|seed| seed.cast_signed()).collect();
         let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
@@ -64,7 +64,7 @@ impl Study {
     /// Reads the recipe of a job.
     ///
     /// # Errors
-    /// The role is not a worker's, or the plant cannot be reached.
+    /// This computer did not sign in as a worker, or the plant cannot be reached.
     pub async fn read(link: &DatabaseLink, job: &LeasedRun) -> Result<Self, PlantError> {
         let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
         let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
@@ -82,7 +82,7 @@ impl LeasedRun {
     /// Leases the next job; `None` if there is none.
     ///
     /// # Errors
-    /// The role is not a worker's, or the plant cannot be reached.
+    /// This computer did not sign in as a worker, or the plant cannot be reached.
     pub async fn lease_next(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";

@@ -35,7 +35,7 @@ pub struct Lease {
     pub number: i32,
 }
 
-/// Part that a cell has begun.
+/// Part whose run a cell has started.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StartedPart {
     /// Lease under which the part was begun.
@@ -48,7 +48,7 @@ impl Lease {
     /// Leases the part that is due first, for the duration [`LEASE`]. Returns `None` if there is no part for this cell.
     ///
     /// # Errors
-    /// The role is not a cell's, or the plant cannot be reached.
+    /// This computer did not sign in as a cell, or the plant cannot be reached.
     pub async fn acquire(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let text = "SELECT id, serial, recipe, due::text, lease FROM take_work($1)";
         let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a part"))?;
@@ -77,7 +77,7 @@ impl Lease {
         self.ask(link, "SELECT begin_work($1, $2, $3)", &[&self.work, &self.number, &run]).await
     }
 
-    /// Returns the part to the queue; no run was begun.
+    /// Returns the leased part to the queue, before a run was begun. `why` is the reason, for the plant.
     ///
     /// # Errors
     /// The lease has ended, or the plant cannot be reached.
@@ -91,10 +91,10 @@ impl Lease {
 }
 
 impl StartedPart {
-    /// Finds the parts that this cell has begun and whose runs have no end in the plant yet.
+    /// Returns the parts whose runs this cell has started, and whose end has not arrived at the plant yet.
     ///
     /// # Errors
-    /// The role is not a cell's, or the plant cannot be reached.
+    /// This computer did not sign in as a cell, or the plant cannot be reached.
     pub async fn all(link: &DatabaseLink) -> Result<Vec<Self>, PlantError> {
         let text =
             "SELECT id, serial, recipe, due::text, lease, run FROM work WHERE state = 'begun' ORDER BY begun_at, id";
@@ -112,7 +112,8 @@ impl StartedPart {
         Ok(begun.collect())
     }
 
-    /// Returns the part to the queue after its run did nothing. The cell has checked this first.
+    /// Returns the part to the queue after its run did nothing, which the caller has checked. `why` is the reason, for
+    /// the plant.
     ///
     /// # Errors
     /// The run has commanded a machine, or the plant cannot be reached.
@@ -120,10 +121,11 @@ impl StartedPart {
         answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 
-    /// Gives the part up: its run does not continue. The part goes to no other run unless a planner decides so.
+    /// Gives the part up, because its run does not continue. The part gets no other run, unless a planner queues it
+    /// again. `why` is the reason, for the plant.
     ///
     /// # Errors
-    /// This cell has not begun the part in that run, or the plant cannot be reached.
+    /// This cell has not started the part in the run [`StartedPart::run`], or the plant cannot be reached.
     pub async fn give_up(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }

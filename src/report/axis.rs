@@ -37,7 +37,7 @@ impl Ruler {
         Self { scale, range, pixels }
     }
 
-    /// Widens the range so that it begins and ends at a tick.
+    /// Widens the range so that it begins and ends at a tick. `most` is that of [`Self::ticks`].
     pub(super) fn rounded(self, most: usize) -> Self {
         let [low, high] = self.range;
         let step = match self.scale {
@@ -58,7 +58,7 @@ impl Ruler {
         self.pixels[0] + t * (self.pixels[1] - self.pixels[0])
     }
 
-    /// Returns approximately `most` ticks or fewer, at round numbers.
+    /// Returns the ticks, at round numbers; their number is about `most` or less.
     pub(super) fn ticks(&self, most: usize) -> Vec<Tick> {
         let [low, high] = self.range;
         match self.scale {

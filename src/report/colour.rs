@@ -64,16 +64,18 @@ pub(super) struct Tones {
     pub(super) tolerance: Option<f64>,
 }
 
-/// Maximum share of an arm of the diverging map for a value in tolerance: only a tint.
+/// Share of an arm of the diverging map that values in tolerance use: only a tint. An arm is the half of the map on one
+/// side of zero.
 const TINT: f64 = 0.12;
-/// Share of an arm for a value just beyond the tolerance: a step that is visible in print and with colour blindness.
+/// Share of an arm at which values beyond the tolerance begin: a step that is visible in print and with colour
+/// blindness.
 const STEP: f64 = 0.4;
 /// Minimum ratio of the limit of a colour bar to its tolerance band.
 const BEYOND: f64 = 1.25;
 
 impl Tones {
-    /// Returns symmetric tones for values up to a limit. The limit is increased if the band would otherwise fill the
-    /// bar.
+    /// Returns tones that are symmetric about zero, for values up to a limit. The limit is increased if the tolerance
+    /// band would otherwise fill the colour bar.
     pub(super) fn symmetric(limit: f64, tolerance: Option<f64>) -> Self {
         let limit = limit.max(tolerance.map_or(0.0, |t| BEYOND * t));
         // If all values are zero, they have no range of their own.

@@ -12,14 +12,14 @@ use super::run_history::RunHistory;
 use regrind_cell::Device;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns machines, wheel and probe, as far as they are on record.
+/// Returns the HTML table of the machines, the wheel and the probe. A value that is not on record is shown as missing.
 pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> String {
-    let not_told = || "not told".to_owned();
+    let not_told = || "not reported".to_owned();
     let machine = |device: Device| {
         let [name, address] = story.machines[device as usize].clone()?;
         Some(format!("{name}, {address}"))
     };
-    let wheel = story.wheel_radius_mm.map(|mm| format!("radius {mm:.4} mm, as the grinder told of its last pass"));
+    let wheel = story.wheel_radius_mm.map(|mm| format!("radius {mm:.4} mm, as the grinder reported for its last pass"));
     let radius = registration.and_then(|found| found["probe_radius_mm"].as_f64()).filter(|mm| *mm > 0.0);
     let off = story.radius_error_mm.map(|(cycle, mm)| {
         format!("; on the reference sphere in cycle {cycle} off by {:.2} \u{b5}m from what the recipe states", 1e3 * mm)
@@ -56,7 +56,8 @@ pub(super) fn last_registration(story: &RunHistory, folder: &Path) -> Result<Opt
     Ok(Some((cycle, found)))
 }
 
-/// Returns the pose of the part and its uncertainty.
+/// Returns the HTML table of the registration of a cycle, with the uncertainty of the pose and the uncertainty budget.
+/// `found` is the content of `registration.json`, `model` that of `model.json`.
 pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
     let number = |key: &str| found[key].as_f64();
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
@@ -69,7 +70,7 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
             .map(|key| sigma(key).map_or("held".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
         format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))
     };
-    let frame = model.map_or("not told".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
+    let frame = model.map_or("not on record".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
     let converged = if found["converged"] == true { "converged" } else { "not converged" };
     let points = |key: &str| number(key).map_or("-".to_owned(), |n| format!("{n:.0}"));
     let verdict = format!(
@@ -90,20 +91,21 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     if count("alternatives") > 0 {
         remarks.push(format!("{} other poses fit about as well", count("alternatives")));
     }
-    let remarks = if remarks.is_empty() { "nothing".to_owned() } else { remarks.join("; ") };
+    let remarks = if remarks.is_empty() { "none".to_owned() } else { remarks.join("; ") };
     let mut html = format!("<h2>Registration, cycle {cycle}</h2>\n<table id=\"registration\">\n");
     for (key, value) in [
         ("Fit", verdict),
-        ("The same pose is found again to", place(&found["standard_uncertainty"])),
-        ("The nominal frame is known beside the form to", frame),
-        ("To be known", remarks),
+        ("Repeatability of the pose (standard uncertainty)", place(&found["standard_uncertainty"])),
+        ("Standard uncertainty of the nominal frame, with the uncertainty of the form", frame),
+        ("Remarks", remarks),
     ] {
         let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));
     }
     html + "</table>\n" + &model.map_or(String::new(), budget)
 }
 
-/// Returns the uncertainty budget of the figures, source by source; empty if the record contains none.
+/// Returns the HTML table of the uncertainty budget of the figures, a row for each source; empty if `model.json`
+/// contains none.
 fn budget(model: &Value) -> String {
     let Some(shares) = model["budget"].as_array().filter(|shares| !shares.is_empty()) else { return String::new() };
     let um = |share: &Value, key: &str| match (share["is_stated"] == true, share[key].as_f64()) {
@@ -120,10 +122,10 @@ fn budget(model: &Value) -> String {
         format!("{:.3}", 1e3 * squares.sum::<f64>().sqrt())
     };
     format!(
-        "<h2>What the uncertainty comes from</h2>\n<table id=\"budget\">\n<tr><th>standard uncertainty by</th>\
+        "<h2>Uncertainty budget</h2>\n<table id=\"budget\">\n<tr><th>source of standard uncertainty</th>\
          <th class=\"n\">of the RMS, \u{b5}m</th><th class=\"n\">of the PV 99.8 %, \u{b5}m</th></tr>\n{}\
-         <tr><th>all together</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n\
-         <p>The squares add up. What neither the cell file nor the recipe states is taken for 0.</p>\n",
+         <tr><th>combined</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n\
+         <p>The squares add up. A source that neither the cell file nor the recipe states counts as 0.</p>\n",
         rows.collect::<String>(),
         whole("rms_mm"),
         whole("pv_99_8_mm")
@@ -133,15 +135,15 @@ fn budget(model: &Value) -> String {
 /// Returns a source of uncertainty in words, from its name in `model.json`.
 fn source_words(name: &str) -> &str {
     match name {
-        "scatter" => "scatter of the probe",
-        "form" => "form between the touches",
-        "pose" => "place of the part",
+        "scatter" => "noise of the probe",
+        "form" => "form between the measured points",
+        "pose" => "pose of the part",
         "radius" => "radius of the probe and of the reference sphere",
         "scales" => "scales of the machine",
         "squareness" => "squareness of the machine",
-        "probe" => "probe by direction",
+        "probe" => "error of the probe that depends on the direction",
         "temperature" => "temperature and expansion",
-        "datum" => "where the fixture holds the part",
+        "datum" => "position of the part in the fixture",
         other => other,
     }
 }

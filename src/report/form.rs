@@ -12,8 +12,8 @@ use super::axis::three_digits;
 use super::run_history::RunHistory;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns the figures of all cycles that have some: a row for each figure, a column for each cycle, and notes on each
-/// figure.
+/// Returns the HTML section about the form: a row for each figure, a column for each cycle with figures, and notes on
+/// each figure.
 pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
     for (number, cycle) in &story.cycles {
@@ -72,8 +72,8 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
     }
     let removed = escaped(list[0]["removed"].as_str().unwrap_or_default());
     html + &format!(
-        "</table>\n<p>Of the form of the part, the scatter of the probe taken off: the median, and between which the figure lies with 95 %. An interval that \
-         begins at 0 says what is known from above alone. Raw: the same of what was measured, with the scatter of the probe in it. Removed: {removed}.</p>\n"
+        "</table>\n<p>Figures of the form of the part without the noise of the probe: the median, and the 95 % credible interval. If an interval begins at 0, \
+         only an upper bound of the figure is known. Raw: the same figure of the measured points, which includes the noise of the probe. Removed: {removed}.</p>\n"
     )
 }
 
@@ -112,9 +112,9 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
 
 /// Returns the indications of ISO 10110-5 that the form meets.
 fn notations(cycles: &[(u32, Value)]) -> String {
-    let mut html = "<p>What is told of a figure is that of the last cycle. All along the outward normal, positive where material stands proud; figures of the \
-                    surface, not of a wavefront. ISO 10110-5, in nanometres, that the form meets in each value with 97.5 %, and that what was measured \
-                    just meets:</p>\n<ul>\n"
+    let mut html = "<p>The descriptions of the figures are those of the last cycle. All figures are along the outward normal, positive where material is proud; \
+                    they are figures of the surface, not of a wavefront. Indication of ISO 10110-5, in nanometres, that the form meets in each value with \
+                    a probability of 97.5 %; raw: the indication that the measured points just meet:</p>\n<ul>\n"
         .to_owned();
     for (number, figures) in cycles {
         let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");

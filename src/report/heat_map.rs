@@ -31,7 +31,7 @@ pub struct HeatMap {
     points: usize,
     /// Lines below the title.
     lines: Vec<String>,
-    /// Object that the figures in the last line describe, and name of the counted items.
+    /// Words for the last line: the object that PV and RMS describe, and the name of the counted samples.
     figures_of: [&'static str; 2],
     /// Maximum size of the map on the page, in pixels of the page.
     max_size: [f64; 2],
@@ -138,8 +138,8 @@ impl HeatMap {
         Self { lines, ..self }
     }
 
-    /// Declares that the samples are the nodes of a map. PV and RMS are then those of the map and not of the points
-    /// that it was made from.
+    /// Declares that the samples are the nodes of a map. The last line then says that PV and RMS are those of the map
+    /// and not of measured points.
     pub fn of_nodes(self) -> Self {
         Self { figures_of: [" of the map", "nodes"], ..self }
     }

@@ -6,9 +6,9 @@
 //!  series of (x, y) --------------> ticks ------+-> SVG
 //!  points with deviations --------> colours --------> PLY
 //!
-//!  records of a run -> told --------> words ---------> a line for each record
-//!                        +----------> story ---------> the report of the run, HTML with its maps
-//!                                       +------------> its results for other systems: QIF, Q-DAS ASCII
+//!  records of a run -> RecordContent -> words ----------> a line for each record
+//!                        +------------> RunHistory -----> the report of the run, HTML with its maps
+//!                                         +-------------> its results for other systems: QIF, Q-DAS ASCII
 //! ```
 //!
 //! A figure is a plain value until it is saved. The same figure always gives the same bytes. Frame: maps are drawn over
@@ -72,10 +72,10 @@ pub enum ReportError {
     #[error("{figure}: point {} has the {what} {value}; a logarithmic axis shows numbers above 0 only", index + 1)]
     NoLogarithm { figure: String, index: usize, what: &'static str, value: f64 },
     /// Points that all lie at one place.
-    #[error("{figure}: all {points} points share one place in x and y; a map needs an extent")]
+    #[error("{figure}: all {points} points have the same x and y; a map needs points at different positions")]
     NoExtent { figure: String, points: usize },
     /// Limit of a colour bar that is not a finite number above 0.
-    #[error("{figure}: the colour bar was to end at {limit}; give a finite number above 0")]
+    #[error("{figure}: the limit of the colour bar is {limit}; give a finite number above 0")]
     ColourLimit { figure: String, limit: f64 },
     /// Triangle with a corner index that refers to no point.
     #[error("{figure}: a triangle has the corner {corner}, and there are {points} points, counted from 0")]
@@ -85,7 +85,7 @@ pub enum ReportError {
     Encoding { figure: String, source: png::EncodingError },
     /// Run without results.
     #[error(
-        "run {run}: nothing was measured that could be registered, so there are no results to write; `regrind report` tells why"
+        "run {run}: nothing was measured that could be registered, so there are no results to write; `regrind report` shows the reason"
     )]
     NothingMeasured { run: String },
     /// Record of the run that cannot be read or does not pass verification.

@@ -53,7 +53,7 @@ pub(super) fn within_html(svg: &str) -> String {
     svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
 }
 
-/// Shortens a text that would be wider than `width`, for letters of the width `letter`.
+/// Shortens a text that would be wider than `width`, if each letter has the width `letter`, both in pixels.
 fn shortened(text: &str, width: f64, letter: f64) -> String {
     let most = (width / letter) as usize;
     if text.chars().count() <= most {
@@ -62,7 +62,7 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
     text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
 }
 
-/// Draws the maps that are on record.
+/// Returns the HTML section with the maps that are on record; empty if there are none.
 pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };
@@ -90,8 +90,8 @@ pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<S
     let _ = writeln!(html, "<figure>{}</figure>", within_html(&spread));
     let _ = writeln!(
         html,
-        "<p>Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered; PV and RMS of a map \
-         are not those that are judged.</p>"
+        "<p>Red is above the nominal surface, blue is below it, near white is zero. The maps are filtered; PV and RMS of a map \
+         are not the judged figures.</p>"
     );
     Ok(html)
 }

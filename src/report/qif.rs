@@ -87,7 +87,7 @@ fn units(xml: &mut Xml) {
 }
 
 fn resources(xml: &mut Xml, results: &Results) {
-    let [name, address] = results.cmm.clone().unwrap_or_else(|| ["not told", "not told"].map(str::to_owned));
+    let [name, address] = results.cmm.clone().unwrap_or_else(|| ["not reported", "not reported"].map(str::to_owned));
     xml.within("MeasurementResources", &[], |xml| {
         xml.within("MeasurementDevices", &[("n", "1")], |xml| {
             xml.within("MeasurementDevice", &[("id", &DEVICE.to_string())], |xml| {

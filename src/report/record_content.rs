@@ -23,11 +23,11 @@ pub(super) enum RecordContent {
     Answer(String),
     /// Confirmation by a person of the state of a machine that cannot report it itself.
     Confirmation(Device, Value),
-    /// Step that a person ordered a machine to make, to bring it home.
+    /// Step that a person ordered, by which a machine is brought home.
     Step(Device, Value),
     /// Messages of a machine.
     Remarks(Device, Vec<String>),
-    /// Remark that a user interface (a program that acts for people) put on record.
+    /// Remark of a user interface, such as the page of the cell.
     Remark(String),
     /// Report of a grinder about a pass.
     Pass(Value),

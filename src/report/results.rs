@@ -115,13 +115,13 @@ pub(super) struct Kind {
     pub(super) limit_mm: Option<f64>,
 }
 
-/// Position of a figure, or of a measurement, relative to its limit.
+/// Result of the comparison of a figure, or of all figures of a measurement, with its limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum LimitStatus {
     Within,
     Undecided,
     Beyond,
-    /// Nothing was judged: there is no limit, or the run did not reach the judgement.
+    /// Not judged: there is no limit, or the run ended before the judgement.
     NotJudged,
 }
 
@@ -149,7 +149,7 @@ impl Results {
             software: text(&begin["regrind"]),
             simulation: begin["simulation"] == true,
             accepted: story.ending.as_ref().map(|ending| matches!(ending, Ending::Accepted { .. })),
-            verdict: story.ending.as_ref().map_or("The run has not come to its end.".to_owned(), ending_words),
+            verdict: story.ending.as_ref().map_or("The run has not ended.".to_owned(), ending_words),
             decision_rule: tolerance.as_ref().map(decision_rule),
             cmm: story.machines[regrind_cell::Device::Cmm as usize].clone(),
             measured: story.cycles.iter().flat_map(all).collect(),
@@ -157,14 +157,15 @@ impl Results {
         }
     }
 
-    /// Returns the kinds of figures in their order, from the measurement with the most figures. Figures that some
+    /// Returns the kinds of the figures of the measurement that has the most figures, in their order. Kinds that some
     /// measurements lack come last.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
         let most = self.measured.iter().max_by_key(|of| of.figures.len());
         most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
     }
 
-    /// Adds the figures of an area to the last measurement of each cycle. They are read from a file of the cycle.
+    /// Adds the figures of ISO 10110-5 to the last measurement of each cycle. They are read from `figures.json` of the
+    /// cycle.
     fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
@@ -208,7 +209,7 @@ fn decision_rule(tolerance: &Tolerance) -> String {
             1e2 * tolerance.probability
         )
     } else {
-        "the figure by itself is held against its limit".to_owned()
+        "the figure is compared with its limit without its uncertainty".to_owned()
     }
 }
 
@@ -253,18 +254,18 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
     list
 }
 
-const PV: &str = "largest less least deviation from the nominal surface along its normal, all points";
+const PV: &str = "largest minus smallest deviation from the nominal surface along its normal, all points";
 const RMS: &str = "root mean square of the deviations from the nominal surface along its normal";
 
-const FORM_PV: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
-                       the probe taken off";
-const FORM_PV_998: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
-                         the probe taken off, over the aperture: the touched points and the places between them, without the outermost 0.1 % of \
-                         these at either end";
-const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, the scatter \
-                        of the probe taken off";
+const FORM_PV: &str = "largest minus smallest deviation of the form from the nominal surface along its normal, after its best fit, without the \
+                       noise of the probe";
+const FORM_PV_998: &str = "largest minus smallest deviation of the form from the nominal surface along its normal, after its best fit, without \
+                         the noise of the probe, over the aperture: the measured points and the positions between them, without the outermost \
+                         0.1 % of the positions at either end";
+const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, without \
+                        the noise of the probe";
 const PV_998: &str =
-    "largest less least deviation from the nominal surface along its normal, without the outermost 0.1 % at either end";
+    "largest minus smallest deviation along the normal of the surface, without the outermost 0.1 % at either end";
 
 fn what_of(name: &str, of_form: bool) -> &'static str {
     match (name, of_form) {
@@ -280,14 +281,14 @@ fn what_of(name: &str, of_form: bool) -> &'static str {
 /// Lengths of ISO 10110-5, with their names in `figures.json`.
 const AREAS: [(&str, &str, &str); 6] = [
     ("power", "ISO 10110-5 A", "peak to valley of the best sphere of the form"),
-    ("irregularity", "ISO 10110-5 B", "peak to valley of what piston, tilt and power leave of the form"),
+    ("irregularity", "ISO 10110-5 B", "peak to valley of the form without piston, tilt and power"),
     (
         "symmetric irregularity",
         "ISO 10110-5 C",
         "peak to valley of the part of the irregularity that is symmetric about the middle",
     ),
-    ("RMSt", "ISO 10110-5 RMSt", "root mean square of what piston and tilt leave of the form"),
-    ("RMSi", "ISO 10110-5 RMSi", "root mean square of what piston, tilt and power leave of the form"),
+    ("RMSt", "ISO 10110-5 RMSt", "root mean square of the form without piston and tilt"),
+    ("RMSi", "ISO 10110-5 RMSi", "root mean square of the form without piston, tilt and power"),
     (
         "RMSa",
         "ISO 10110-5 RMSa",
@@ -295,7 +296,8 @@ const AREAS: [(&str, &str, &str); 6] = [
     ),
 ];
 
-/// Returns the figures of an area that a file contains with their intervals: all of them, or `None` if one is missing.
+/// Returns the figures of ISO 10110-5 from `told`, the content of `figures.json`, with their intervals; `None` if one
+/// of them is missing.
 fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     const MM_OF_NM: f64 = 1e-6;
     let rows = told["form"].as_array()?;

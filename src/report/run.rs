@@ -101,14 +101,15 @@ fn verdict(story: &RunHistory) -> String {
         (Some(ending @ Ending::Accepted { .. }), _) => ("good", ending_words(ending)),
         (Some(ending), _) => ("bad", ending_words(ending)),
         (None, Some(home)) => (if home == [true, true] { "good" } else { "bad" }, home_words(home)),
-        (None, None) => ("bad", "The run has not come to its end.".to_owned()),
+        (None, None) => ("bad", "The run has not ended.".to_owned()),
     };
     let unrecorded = story.ending.is_some() && story.end.is_none();
-    let more = if unrecorded { "<p>The record of the run has not been brought to its end.</p>\n" } else { "" };
+    let more = if unrecorded { "<p>The record of the run is incomplete: its end is missing.</p>\n" } else { "" };
     format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
 }
 
-/// Returns how far the last pass came, if it did not reach its end. The rest of the part is unchanged.
+/// Returns the HTML paragraph about a last pass that did not reach its end, with the ground share of its path; empty if
+/// the pass is complete.
 fn broken_off_pass(story: &RunHistory) -> String {
     let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
     let how = match result {
@@ -121,18 +122,16 @@ fn broken_off_pass(story: &RunHistory) -> String {
     let far = match ground {
         Some([done, total]) if total > 0 => {
             format!(
-                "{:.0} % of its path had been ground as the grinder told last",
+                "{:.0} % of its path was ground, as the grinder last reported",
                 100.0 * f64::from(done) / f64::from(total)
             )
         }
-        _ => "how much of its path had been ground is not known".to_owned(),
+        _ => "the ground share of its path is not known".to_owned(),
     };
-    format!(
-        "<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part stands as it did before.</p>\n"
-    )
+    format!("<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part is unchanged.</p>\n")
 }
 
-/// Returns the judged figures of the last measurement with their limits.
+/// Returns the HTML table of the judged figures of the last measurement with their limits.
 fn judged(story: &RunHistory) -> String {
     let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_measured()) else {
         return String::new();
@@ -196,23 +195,22 @@ fn comparison(compared: &ComparedFigure, with_uncertainty: bool) -> String {
 fn decision_rule(tolerance: &Tolerance) -> String {
     let rule = if tolerance.with_uncertainty {
         format!(
-            "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only where each figure is within its limit with a \
-             probability of {:.1} % at least; it is out of tolerance for certain only where one is beyond it with that probability; between \
-             the two nothing is proven.",
+            "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only if each figure is within its limit with a \
+             probability of at least {:.1} %. It is out of tolerance only if a figure is beyond its limit with this probability. Otherwise \
+             the result is undecided.",
             1e2 * tolerance.probability
         )
     } else {
-        "Decision rule: each figure by itself is held against its limit; its uncertainty is told and not counted."
-            .to_owned()
+        "Decision rule: each figure is compared with its limit; its uncertainty is shown, but not used.".to_owned()
     };
     format!(
-        "{rule} The figures are those of the form of the part after its best fit: the scatter of the probe is taken off them, and it and the \
-         pose are in their uncertainty. Where no form shows they are known from above alone. U is half of the interval that holds the \
-         figure with 95 %. PV is the largest less the least deviation along the normal{}.",
+        "{rule} The figures are those of the form of the part after its best fit, without the noise of the probe. Their uncertainty includes \
+         the noise and the pose. If no form error is detectable, only an upper bound of a figure is known. U is half of the 95 % credible \
+         interval of the figure. PV is the largest minus the smallest deviation along the normal{}.",
         match tolerance.pv_of {
-            regrind_cell::PvPoints::All => ", of the touched points",
+            regrind_cell::PvPoints::All => ", of the measured points",
             regrind_cell::PvPoints::MostPoints =>
-                ", PV 99.8 % that of the aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end",
+                "; PV 99.8 % is that of the aperture: the measured points and the positions between them, without the outermost 0.1 % of the positions at either end",
         }
     )
 }
@@ -242,7 +240,8 @@ pub(super) fn when(utc: &str) -> String {
     format!("{} UTC", second.replacen('T', " ", 1))
 }
 
-/// Returns a row for each measurement with its verdict, and below it the reason and further remarks.
+/// Returns the HTML table of the cycles: a row for each measurement with its verdict, and below it the reason and
+/// further remarks.
 fn cycles(story: &RunHistory) -> String {
     let tolerance = story.tolerance();
     let named = |m: &Measurement| Some(tolerance.as_ref()?.compare(m.figures.as_ref()?)[0].name);
@@ -262,19 +261,19 @@ fn cycles(story: &RunHistory) -> String {
     let touches = story.end.as_ref().map(|end| end.value()["ending"]["touches"].clone()).unwrap_or_default();
     let touches = match (touches["taken"].as_u64(), touches["whole_patterns"].as_u64()) {
         (Some(taken), Some(whole)) => {
-            format!("<p>Touches were chosen: {taken} of the part; the whole pattern would have taken {whole}.</p>\n")
+            format!("<p>Adaptive measurement: {taken} touches; whole patterns would need {whole}.</p>\n")
         }
         _ => String::new(),
     };
     html + "</table>\n"
         + &touches
         + &parameters(story)
-        + "<p>Deviations are along the normal, positive where material stands proud; \u{b1} is the expanded uncertainty \
-            (k = 2). The level is the height of the surface that was wanted over the nominal one.</p>\n"
+        + "<p>Deviations are along the normal, positive where material is proud; \u{b1} is the expanded uncertainty \
+            (k = 2). The level is the height of the target surface above the nominal surface.</p>\n"
 }
 
-/// Returns which part of a correction went into parameters of the machine, and which part was left for the map; empty
-/// if the recipe compensates no parameters.
+/// Returns the HTML table of the parameters of the machine that were compensated, and the error that was left for the
+/// map; empty if the recipe compensates no parameters.
 fn parameters(story: &RunHistory) -> String {
     let row = |number: u32, of: &RecordedParameter| {
         let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
@@ -292,11 +291,11 @@ fn parameters(story: &RunHistory) -> String {
     let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
     let left: String = left
-        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} µm RMS.</p>\n", um(mm)))
+        .map(|(number, mm)| format!("<p>Error left for the map after cycle {number}: {} µm RMS.</p>\n", um(mm)))
         .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
-         <th class=\"n\">off by</th><th class=\"n\">taken back</th><th class=\"n\">told to the next pass</th>\
+         <th class=\"n\">deviation</th><th class=\"n\">compensated</th><th class=\"n\">sent to the next pass</th>\
          <th class=\"n\">removes, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
     )
 }
@@ -337,7 +336,8 @@ fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> Strin
     )
 }
 
-/// Returns the verdict of a measurement and its reason, or a replacement if it was not judged.
+/// Returns the verdict of a measurement and its reason. For a measurement without a judgement, the verdict is "not
+/// judged" or "no figures".
 fn judgement_of(measurement: &Measurement) -> (String, String) {
     let unusable = || measurement.unusable.clone().unwrap_or_default();
     let Some((last, earlier)) = measurement.judgements.split_last() else {

@@ -210,7 +210,7 @@ impl RunHistory {
             Event::Connected { device, .. } => {
                 let detail = &record.value()["detail"];
                 let [name, address] =
-                    ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not told").to_owned());
+                    ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not reported").to_owned());
                 self.machines[device as usize] = Some([name, address]);
             }
             Event::Started { device: Device::Grinder, cycle } => {
@@ -301,7 +301,7 @@ impl Order {
     pub(super) fn answer(&self) -> String {
         match (&self.refused, &self.event) {
             (Some(why), _) => format!("refused: {why}"),
-            (None, Some(_)) => "taken".to_owned(),
+            (None, Some(_)) => "accepted".to_owned(),
             // The order went to the machine; later records show the result.
             (None, None) => "on record".to_owned(),
         }

@@ -66,7 +66,8 @@ struct Frame {
     size: [f64; 2],
     /// States within the frame in addition to `AT_WORK`.
     and: &'static [&'static str],
-    /// The two states that the exit leads to: by way of the machines, or at once.
+    /// The two states that the exit leads to: the first if a machine must act before, the second if no machine has to
+    /// act.
     to: [&'static str; 2],
     label: [&'static str; 2],
 }
@@ -156,7 +157,7 @@ pub fn state_picture(rows: &[TransitionRow]) -> String {
     svg.finish()
 }
 
-/// Events that lead from one place to another, without refused events.
+/// Events that lead from one state to another, by the names of both states; refused events are omitted.
 type TransitionEvents = BTreeMap<(String, String), BTreeSet<String>>;
 
 fn ways(rows: &[TransitionRow], name: impl Fn(State) -> Option<String>) -> TransitionEvents {
@@ -174,7 +175,7 @@ fn ways(rows: &[TransitionRow], name: impl Fn(State) -> Option<String>) -> Trans
 }
 
 fn legend(svg: &mut Svg) {
-    let meanings = [(ORDER, "a person orders it"), (INK, "the way of a run"), (TROUBLE, "something went wrong")];
+    let meanings = [(ORDER, "a person orders it"), (INK, "normal course of a run"), (TROUBLE, "something went wrong")];
     for (k, (colour, meaning)) in meanings.into_iter().enumerate() {
         let x = 780.0 + 170.0 * k as f64;
         svg.arrow([x, 26.0], [x + 12.0, 26.0], [x + 24.0, 26.0], colour);
@@ -250,7 +251,7 @@ fn boxes(nodes: &[Node]) -> Vec<OccupiedRectangle> {
     nodes.iter().map(|node| (node.middle, node.half)).collect()
 }
 
-/// Converts ways to arrows between the boxes that exist.
+/// Returns an arrow for each entry of `ways` whose two states have a box.
 fn edges(nodes: &[Node], ways: &TransitionEvents) -> Vec<Edge> {
     let index = |name: &str| nodes.iter().position(|node| node.name == name);
     let known = ways
@@ -299,7 +300,8 @@ fn label_of(events: &BTreeSet<String>) -> String {
     if sorted.len() > 2 { format!("{named} +{}", sorted.len() - 2) } else { named }
 }
 
-/// Returns start, control point and end of the straightest curve between two boxes that touches no other box.
+/// Returns start, control point and end of the straightest curve between two boxes that touches no other box. `both` is
+/// true if there is also an arrow in the opposite direction.
 fn route(nodes: &[Node], edge: &Edge, both: bool) -> [[f64; 2]; 3] {
     let (from, to) = (&nodes[edge.from], &nodes[edge.to]);
     let [dx, dy] = [to.middle[0] - from.middle[0], to.middle[1] - from.middle[1]];
@@ -336,7 +338,8 @@ fn within(point: [f64; 2], middle: [f64; 2], half: [f64; 2], margin: f64) -> boo
     (0..2).all(|k| (point[k] - middle[k]).abs() < half[k] + margin)
 }
 
-/// Returns the first place along a curve, or next to it, at which a label covers nothing.
+/// Returns the first position along a curve, or next to it, at which a label covers no rectangle of `taken`. `half` is
+/// half of the width and of the height of the label.
 fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[OccupiedRectangle]) -> [f64; 2] {
     let is_free = |place: &[f64; 2]| {
         !taken.iter().any(|(middle, other)| within(*place, *middle, [other[0] + half[0], other[1] + half[1]], 1.0))

@@ -79,7 +79,8 @@ pub struct CycleSummary {
     pub reason: String,
     /// PV and RMS, each with its expanded uncertainty, as they were judged; `None` if nothing was measured.
     pub figures: Option<[[f64; 2]; 2]>,
-    /// Outliers that these figures leave out, with their places and deviations; `None` if all points count.
+    /// Outliers that these figures do not include, with their positions and deviations; `None` if all points are
+    /// included.
     pub left_out: Option<String>,
     /// PV and RMS that are expected after the correction made from this cycle; `None` if no correction was made.
     pub expected: Option<[f64; 2]>,

@@ -67,7 +67,8 @@ fn seal_words(value: &Value) -> Option<String> {
     Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
 }
 
-/// Returns a person's confirmation about a machine: its state, with which map, by which file.
+/// Returns a person's confirmation about a machine: the confirmed state, and the map and the file if they are given;
+/// `None` if no state is given.
 fn person_words(device: Device, value: &Value) -> Option<String> {
     let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
     for key in ["map", "file"] {
@@ -278,7 +279,7 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
     }
 }
 
-/// Returns in words if a measurement is usable, and if not, why.
+/// Returns in words if a measurement is usable, or the reason why it is not.
 pub(super) fn gate_words(gate: &GateResult) -> String {
     match gate {
         GateResult::Passed => "usable".to_owned(),

@@ -24,7 +24,7 @@ const MAX_BYTES: u64 = 4096;
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TrustError {
     #[error(
-        "{}: the password cannot be read: {source}; `password_file` names its file, and that of a database `regrind plant enrol` writes", .path.display()
+        "{}: the password cannot be read: {source}; name its file with `password_file`; for a database, `regrind plant enrol` creates the file", .path.display()
     )]
     Password { path: PathBuf, source: io::Error },
     #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
@@ -32,7 +32,7 @@ pub enum TrustError {
     #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
     Certificates { path: PathBuf, what: String },
     #[error(
-        "{host} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of {table}"
+        "{host} is another computer, and no certificates to authenticate it are given; name their file with `certificates` of {table}"
     )]
     Unproven { host: String, table: &'static str },
 }
@@ -72,7 +72,7 @@ pub fn read_password(path: &Path) -> Result<String, TrustError> {
     let mut text = String::new();
     File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
     if text.len() as u64 > MAX_BYTES {
-        let why = format!("it is longer than {MAX_BYTES} bytes, which no password is");
+        let why = format!("it is longer than {MAX_BYTES} bytes, too long for a password");
         return Err(unread(io::Error::new(io::ErrorKind::InvalidData, why)));
     }
     Ok(text.trim_end_matches(['\r', '\n']).to_owned())

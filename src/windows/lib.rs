@@ -1,10 +1,10 @@
 //! Calls into Windows for which no safe crate exists. On other systems this crate is empty.
 //!
 //! ```text
-//!  person   who this process belongs to
-//!  access   who may do what with a file or a pipe
-//!  files    files and folders for their owner alone, and the room that is left on a disk
-//!  pipe     a named pipe that nobody but its owner opens, from this computer only
+//!  person   user of this process
+//!  access   access rights to files and pipes
+//!  files    files and folders that only their owner can access, and the free space of a disk
+//!  pipe     named pipe that only its owner can open, from this computer only
 //! ```
 //!
 //! Each call into Windows is in its own unsafe block, with the reason why it is sound. Public functions are safe to

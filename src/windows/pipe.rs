@@ -24,10 +24,10 @@ pub fn listen(name: &str, is_first: bool) -> io::Result<NamedPipeServer> {
     unsafe { options.create_with_security_attributes_raw(name, owners_alone.attributes().cast_mut().cast()) }
 }
 
-/// Returns the number of the process at the other end.
+/// Returns the id of the process of the client.
 ///
 /// # Errors
-/// Nobody is there.
+/// Returns an error if no client is connected.
 pub fn client_process(pipe: &NamedPipeServer) -> io::Result<u32> {
     let mut process = 0;
     // SAFETY: the pipe is open, and `process` lives longer than the call.
@@ -35,10 +35,11 @@ pub fn client_process(pipe: &NamedPipeServer) -> io::Result<u32> {
     Ok(process)
 }
 
-/// Whether a pipe belongs to the user whose process this is: anybody may have made one of the name that a client looks for.
+/// Returns true if a pipe belongs to the user of this process. Another user could have created a pipe of that name
+/// first.
 ///
 /// # Errors
-/// Windows does not tell it.
+/// Returns an error if Windows does not report the owner of the pipe.
 pub fn is_of_this_user(pipe: &NamedPipeClient) -> io::Result<bool> {
     // SAFETY: the pipe stays open for as long as it is borrowed, which is longer than this.
     is_owned_here(unsafe { BorrowedHandle::borrow_raw(pipe.as_raw_handle()) })

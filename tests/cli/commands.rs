@@ -588,7 +588,7 @@ fn model_reports_form_intervals() {
     let rows = |file: &str| fs::read_to_string(bench.path(file)).unwrap().lines().count();
     assert_eq!(rows("out/here/form.csv"), rows("out/here/deviations.csv"));
     let told = text(&bench.register("nominal.csv", "measured.csv", &["--model"]).stdout);
-    assert!(told.contains("form        RMS ") && told.contains("frame       known to "), "{told}");
+    assert!(told.contains("form        RMS ") && told.contains("frame       standard uncertainty "), "{told}");
 }
 
 #[test]
@@ -607,7 +607,7 @@ fn plan_reports_time_and_slow_pass() {
     }
     assert!(!good.contains("warning"), "{good}");
     assert!(
-        good.contains("mm3 a pass; what the wheel loses by it is told where grinding.grinding_ratio is given"),
+        good.contains("mm3 a pass; the loss of the wheel is unknown; set grinding.grinding_ratio to estimate it"),
         "{good}"
     );
     bench.write("worn.toml", shipped.replace(feed, &format!("{feed}\ngrinding_ratio = 200.0")));

@@ -198,7 +198,7 @@ fn tls_sign_in_enables_role_orders() {
         tab.click(browser, "main form button");
     };
     sign_in(&mut browser, "V. Guest", "not this one");
-    tab.until(&mut browser, "document.querySelector('.no')?.innerText.includes('do not belong together')");
+    tab.until(&mut browser, "document.querySelector('.no')?.innerText.includes('or the password is wrong')");
     sign_in(&mut browser, "V. Guest", users::PASSWORD);
     tab.until(&mut browser, &banner("EXECUTE"));
     let orders = "[...document.querySelectorAll('.orders [data-order]')]";

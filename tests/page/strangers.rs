@@ -69,7 +69,7 @@ fn foreign_orders_refused_and_recorded() {
     for words in [
         "an order from the origin http://evil.example",
         "an order without a token of the page, or with one that was used",
-        "what is no order of the page",
+        "a request that is not an order of the page",
     ] {
         assert!(told.iter().any(|remark| remark.contains(words)), "{words}: {told:?}");
     }

@@ -67,7 +67,7 @@ fn users_file_commands_and_errors() {
     for (text, expected) in [
         ("[[user]]\nname = \"a\"\nrole = \"king\"\nproof = \"\"", "unknown variant `king`"),
         ("[[user]]\nname = \"a\"\nrole = \"viewer\"\nproof = \"secret\"", "user 1 (\"a\")"),
-        ("nonsense", "no list of users"),
+        ("nonsense", "not a list of users"),
     ] {
         std::fs::write(&path, text).unwrap();
         let (code, _, errors) = run(&["serve", "--users", "users.toml", "--listen", "127.0.0.1:0"], home.path());

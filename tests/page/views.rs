@@ -127,7 +127,7 @@ fn stopped_run_shows_last_alarms() {
     shown.run.end();
     let alarms = shown.page.until("the alarms of the record", |_| {
         let alarms = piece(visitor.get(&path).text(), "alarms");
-        alarms.contains("stood at the end").then_some(alarms)
+        alarms.contains("active at the end").then_some(alarms)
     });
     assert!(
         alarms.contains("radius of the probe") && alarms.contains("raised") && !alarms.contains("No alarm"),

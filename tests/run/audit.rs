@@ -179,7 +179,7 @@ fn audit_detects_missing_anchor_or_end() {
     let head: String = database.query_row("SELECT hash FROM record WHERE seq = 12", [], |row| row.get(0)).unwrap();
     drop(database);
     fs::write(folder.join("journal.anchor"), json!({ "records": 12, "head": head }).to_string()).unwrap();
-    assert!(refused(home.path(), &["audit", "verify"], 1).contains("the run broke off"));
+    assert!(refused(home.path(), &["audit", "verify"], 1).contains("the run was interrupted"));
 }
 
 #[test]
@@ -193,7 +193,7 @@ fn audit_lists_unrecorded_files() {
     fs::write(folder.join("report.html"), html.replace("0.812", "0.212")).unwrap();
     let words = printed(home.path(), &["audit", "verify"], 0);
     assert!(words.contains("not on record: cycle-2/more.csv"), "{words}");
-    assert!(words.contains("report.html is not what the record gives"), "{words}");
+    assert!(words.contains("report.html differs from the report of this record"), "{words}");
 }
 
 #[test]
@@ -326,7 +326,7 @@ fn audit_key_is_created_once() {
     let (code, said, errors) = with_key(home.path(), &path, &["audit", "key"]);
     assert_eq!((code, errors.as_str()), (0, ""));
     let public = PublicKey::from_text(&said).unwrap();
-    assert!(said.contains("made now") && said.contains(&public.fingerprint()) && said.contains("quality"), "{said}");
+    assert!(said.contains("created now") && said.contains(&public.fingerprint()) && said.contains("quality"), "{said}");
     let (_, said, _) = with_key(home.path(), &path, &["audit", "key", "--json"]);
     let value: Value = serde_json::from_str(&said).unwrap();
     assert_eq!((&value["public_key"], &value["made"]), (&json!(public), &json!(false)));
@@ -371,7 +371,7 @@ fn signed_run_verifies_with_public_key() {
         assert!(words.contains("signed      to its end") && words.contains("as given"), "{words}");
         assert!(words.contains(&public.fingerprint()), "{words}");
     }
-    assert!(printed(home.path(), &["audit", "verify"], 0).contains("only --key can tell"));
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("only --key proves"));
     let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 0)).unwrap();
     assert_eq!(value["keys"], json!([public]));
     assert_eq!(value["signed"].as_u64().unwrap() + 1, value["records"].as_u64().unwrap());
@@ -440,7 +440,7 @@ fn audit_detects_unsigned_end() {
     assert!(verify(&folder).unwrap().lacks_last_seal());
     assert!(refused(home.path(), &["audit", "verify"], 1).contains("its end is not signed"));
     let (home, _) = recorded(false);
-    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no: who wrote it had no key"));
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no: the run had no key"));
 }
 
 #[test]
@@ -618,7 +618,7 @@ fn audit_detects_removed_or_renamed_run() {
         fs::rename(from, &to).unwrap();
         let found = flaws();
         assert!(
-            found.iter().any(|flaw| flaw.contains("it stands before") || flaw.contains("it is not the run")),
+            found.iter().any(|flaw| flaw.contains("it is the run before") || flaw.contains("it differs from")),
             "{found:?}"
         );
         fs::rename(&to, from).unwrap();

@@ -78,7 +78,7 @@ fn next_part_starts_from_learned_error() {
 
     // A plan does not know which run it will start from.
     let plan = |recipe: &str| shop.give("plan", recipe).1;
-    assert!(plan(&shop.recipe).contains("begins with the correction that the last one like it left"));
+    assert!(plan(&shop.recipe).contains("starts with the correction that the last similar run learned"));
     assert!(!plan(&replaced(&shop.recipe, "learn = true", "learn = false")).contains("begins with"));
 
     // Another rule for the gain makes the learned state incompatible.

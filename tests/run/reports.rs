@@ -148,7 +148,7 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     let means = cells("means");
     assert!(means[0].starts_with("SIMULATED CMM 1, measuring machine at 127.0.0.1:"), "{means:?}");
     assert!(means[1].starts_with("SIMULATED GRINDER 1, grinder at 127.0.0.1:"), "{means:?}");
-    assert!(means[2].starts_with("radius 12.5000 mm, as the grinder told"), "{means:?}");
+    assert!(means[2].starts_with("radius 12.5000 mm, as the grinder reported"), "{means:?}");
     let found = json_in(folder, &format!("cycle-{cycles}/registration.json"));
     let radius = format!(
         "radius {:.5} mm; on the reference sphere in cycle {cycles} off by ",

@@ -1362,38 +1362,6 @@ fn transition_table_is_complete() {
     );
 }
 
-#[test]
-fn is_same_decision_ignores_texts() {
-    let raised = |id: AlarmId, what: &str| {
-        let mut alarm = id.generic_alarm();
-        alarm.what = what.to_owned();
-        (alarm.consequence, alarm.remedy) = (format!("{what}."), vec![what.to_owned()]);
-        Command::Raise(alarm)
-    };
-    let announced =
-        |cycle, verdict, reason: &str| Command::Announce(Judgement { cycle, verdict, reason: reason.to_owned() });
-    let refused = |state, why: &str| Command::Refuse { event: Box::new(Event::Deadline), state, why: why.to_owned() };
-    let aborted =
-        |confirmed, reason: &str| Command::Finish(Ending::Aborted { cycle: 1, confirmed, reason: reason.to_owned() });
-    let decisions: [&dyn Fn(&str) -> Command; 10] = [
-        &|text| raised(AlarmId::Unreachable, text),
-        &|text| raised(AlarmId::WrongDevice, text),
-        &|text| announced(1, Verdict::Accept, text),
-        &|text| announced(2, Verdict::Accept, text),
-        &|text| announced(1, Verdict::Continue, text),
-        &|text| refused(State::Held(Phase::Transfer), text),
-        &|text| refused(State::Aborting, text),
-        &|text| aborted(true, text),
-        &|text| aborted(false, text),
-        &|_| Command::Finish(Ending::Accepted { cycle: 1, reason: String::new() }),
-    ];
-    for (k, one) in decisions.iter().enumerate() {
-        for (l, other) in decisions.iter().enumerate() {
-            assert_eq!(one("a").is_same_decision(&other("b")), k == l, "{:?} and {:?}", one("a"), other("b"));
-        }
-    }
-}
-
 /// FNV-1a of the whole table.
 fn fingerprint(rows: &[TransitionRow]) -> u64 {
     let fnv = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);

@@ -42,13 +42,13 @@ fn ignores_hangup() -> bool {
     ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
 }
 
-/// Discards input that was typed before the question.
+/// Discards input that was typed at the terminal and not yet read.
 pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush)?)
 }
 
-/// Waits for Enter, at most for `patience` and only while this program has the terminal. Returns `None` if Enter did
-/// not arrive yet.
+/// Waits for Enter, at most for `patience`, which must be below 1 s. Returns true after Enter, and false at the end of
+/// the input. Returns `None` if nothing was typed in this time, or if `has_terminal` returns false.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
     let patience = Timespec { tv_sec: 0, tv_nsec: i64::from(patience.subsec_nanos()) };

@@ -45,7 +45,7 @@ impl Endings {
     }
 }
 
-/// Discards input that was typed before the question.
+/// Discards input that was typed at the terminal and not yet read.
 pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     while event::poll(Duration::ZERO)? {
         event::read()?;
@@ -53,8 +53,8 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(())
 }
 
-/// Waits for Enter, at most for `patience` and only while this program has the terminal. Returns `None` if Enter did
-/// not arrive yet.
+/// Waits for a key, at most for `patience`. Returns true if the key is Enter. Returns `None` after another key or
+/// without one, or if `has_terminal` returns false.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     if !event::poll(patience).is_ok_and(|typed| typed && has_terminal()) {
         return None;

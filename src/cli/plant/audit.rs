@@ -11,9 +11,9 @@ use super::super::control::folder_of;
 use super::super::failure::Failure;
 use super::{open, read};
 
-/// Plant's copy of a run.
+/// Result of the verification of the plant's copy of a run.
 pub(in super::super) struct Copy {
-    /// True if the run is also stored here.
+    /// True if the run is also stored on this computer.
     pub(in super::super) is_here: bool,
     pub(in super::super) told: Value,
 }
@@ -54,13 +54,13 @@ pub(in super::super) fn prove(
                 0 => "not signed".to_owned(),
                 signed => format!("signed up to record {signed} by a key that the plant knows of {}", found.cell),
             };
-            let signed = if found.keys.is_empty() && proven.signed > 0 { "signed, by a key that the plant was not told".to_owned() } else { signed };
+            let signed = if found.keys.is_empty() && proven.signed > 0 { "signed by a key that the plant does not know".to_owned() } else { signed };
             super::super::print(&format!(
                 "plant       {} records and {} files of {}, {signed}{}\n",
                 proven.records,
                 proven.artefacts,
                 found.cell,
-                if folder.is_some() { "; they stand in the journal here" } else { "" }
+                if folder.is_some() { "; the local journal contains these records" } else { "" }
             ))?;
         }
         Ok(Copy { is_here: folder.is_some(), told })

@@ -13,12 +13,12 @@ use super::super::failure::Failure;
 /// Timeout for the plant, after which a run begins without its knowledge.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Result of the query.
+/// Result of a query of the plant for learned results.
 #[derive(Default)]
 pub(in super::super) struct PlantKnowledge {
-    /// Knowledge with which the task can begin, if other cells have any.
+    /// Learned result from which the task can start; `None` if the other cells have no usable result.
     pub(in super::super) learned: Option<Learned>,
-    /// Messages about it.
+    /// Messages for the operator about results that cannot be used.
     pub(in super::super) words: Vec<String>,
 }
 
@@ -49,13 +49,14 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
     let (knowledge, alike) = match answer.recv_timeout(PATIENCE) {
         Ok(Ok(told)) => told,
         Ok(Err(error)) => return Ok(without(&error)),
-        Err(_) => return Ok(without(&format!("nothing came within {} s", PATIENCE.as_secs()))),
+        Err(_) => return Ok(without(&format!("no answer within {} s", PATIENCE.as_secs()))),
     };
     let words = knowledge.left_alone;
     Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
 }
 
-/// Returns the similarity of machines, from a stated value or from the recipes that two machines share.
+/// Returns the similarity of the machines, from the value `machines_differ` of the plant file and from the results of
+/// two cells for the same kind of part.
 fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilarity {
     let mut alike = MachineSimilarity::default();
     if let Some(share) = machines_differ {
@@ -68,8 +69,5 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilari
 }
 
 fn without(why: &str) -> PlantKnowledge {
-    PlantKnowledge {
-        learned: None,
-        words: vec![format!("the plant does not tell what other cells have learned: {why}")],
-    }
+    PlantKnowledge { learned: None, words: vec![format!("the plant sends no learned results of other cells: {why}")] }
 }

@@ -105,7 +105,7 @@ pub(super) fn init(arguments: &ToInit) -> Result<Outcome, Failure> {
         let mut link = open_any(&config).await?;
         let [before, now] = migrate(&mut link).await?;
         super::super::print(&match before == now {
-            true => format!("{}: layout {now}, as it was\n", link.place()),
+            true => format!("{}: layout {now}, unchanged\n", link.place()),
             false => format!("{}: layout {now} (it had {before})\n", link.place()),
         })?;
         Ok(Outcome::Accepted)
@@ -133,7 +133,8 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the database role of a name. It needs no quotes in SQL.
+/// Returns the name of the database role for the name of a member. It has only small letters, digits and `_`, so it
+/// needs no quotes in SQL.
 fn role_of(name: &str) -> String {
     let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '_' };
     let role: String = name.chars().map(plain).take(48).collect();
@@ -149,7 +150,7 @@ pub(super) fn retire(arguments: &ToRetire) -> Result<Outcome, Failure> {
         let mut link = open(&config).await?;
         let name = &arguments.name;
         if retire_cell(&mut link, name).await? {
-            super::super::print(&format!("{name} signs in no more; its records stay\n"))?;
+            super::super::print(&format!("{name} can no longer sign in; its records stay\n"))?;
             return Ok(Outcome::Accepted);
         }
         super::super::print(&format!("there is no cell {name}; `regrind plant cells` lists them\n"))?;

@@ -107,7 +107,8 @@ pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failu
     Ok(DatabaseLink::open(database(config)?).await?)
 }
 
-/// Signs in to the database of a plant file. Its schema must be the version of this program.
+/// Signs in to the database of a plant file. Returns an error if the layout of the database is not the one that this
+/// program knows.
 pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     let link = open_any(config).await?;
     regrind_plant::check_layout(link.client()).await?;

@@ -29,7 +29,7 @@ pub(super) struct ToQueue {
     /// Version of the recipe; by default the newest
     #[arg(long, value_name = "N")]
     version: Option<i32>,
-    /// Cell that makes them; by default the first that asks
+    /// Cell that makes the parts; by default the first cell that requests one
     #[arg(long, value_name = "NAME")]
     cell: Option<String>,
     /// Due date
@@ -47,7 +47,7 @@ Example:
 
 Exit codes: 0 removed; 1 it is started, or there is no such part; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToUnqueue {
-    /// Its number in the queue (`regrind plant work`)
+    /// Number of the part in the queue, as `regrind plant work` lists it
     #[arg(value_name = "N")]
     work: i64,
     /// Reason, for the record
@@ -97,10 +97,10 @@ pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let done = link.query("SELECT withdraw_work($1, $2)", &[work, why]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
-            super::super::print(&format!("part {work} is taken out of the queue\n"))?;
+            super::super::print(&format!("part {work} is removed from the queue\n"))?;
             return Ok(Outcome::Accepted);
         }
-        super::super::print(&format!("part {work} is begun or over, or there is none of that number\n"))?;
+        super::super::print(&format!("part {work} is already started or over, or no part has this number\n"))?;
         Ok(Outcome::NotInTolerance)
     })
 }

@@ -135,7 +135,7 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
         let inside = path.strip_prefix(folder).ok().filter(|inside| is_below(inside)).and_then(Path::to_str);
         let Some(inside) = inside else {
             let what = format!(
-                "{} names {}, which does not lie beside it or below: put it there, for the recipe goes to other computers with its files",
+                "{} names {}, which is not in the folder of the recipe or below: move it there, because the recipe is copied to other computers together with its files",
                 recipe.path().display(),
                 path.display()
             );
@@ -207,7 +207,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
             }));
             let state = match (withdrawn, signed.len()) {
                 (Some(why), _) => format!("withdrawn: {why}"),
-                (None, 0) => "signed by nobody yet".to_owned(),
+                (None, 0) => "not signed yet".to_owned(),
                 (None, _) => format!("signed by {}", signed.join(", ")),
             };
             lines += &format!("{name:<24}  {version:>3}  {at}  {}  {state}\n", &sha256[..12]);

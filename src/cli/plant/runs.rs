@@ -107,7 +107,7 @@ pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {
         let proven = run.prove(&folder, &[])?;
         let files = super::super::words::counted(proven.artefacts as usize, "file");
         super::super::print(&format!(
-            "{}: {} records of {}, {files}; proven\n",
+            "{}: {} records of {}, {files}; verified\n",
             folder.display(),
             run.records,
             run.cell

@@ -11,7 +11,7 @@ use super::super::failure::Failure;
 use super::super::serve::PageAccess;
 use super::Where;
 
-/// Default address of the page. Its port follows that of a cell's page.
+/// Default address of the page. Its port is one above that of the page of a cell.
 const ADDRESS: &str = "127.0.0.1:7374";
 
 /// Show all cells, their parts and their trends as a page in the browser
@@ -45,7 +45,9 @@ pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         match super::open(&config).await {
             Ok(_) => {}
-            Err(Failure::Plant(error)) if error.may_pass() => eprintln!("page: {error}; the page waits for it"),
+            Err(Failure::Plant(error)) if error.may_pass() => {
+                eprintln!("page: {error}; the page waits for the database")
+            }
             Err(error) => return Err(error),
         }
         let (listener, entrance) = door.open(*listen).await?;

@@ -76,7 +76,7 @@ struct ToBegin {
     plant: Where,
 }
 
-/// Make the runs of studies until none is left
+/// Make the simulated runs of studies until no job is left
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -140,12 +140,12 @@ pub(in super::super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 fn seeds(text: &str) -> Result<(u64, u64), String> {
-    let words = || "give the first and the last, such as 1..200".to_owned();
+    let words = || "give the first and the last seed, such as 1..200".to_owned();
     let (first, last) = text.split_once("..").ok_or_else(words)?;
     let number = |of: &str| of.trim().parse::<u64>().map_err(|_| words());
     match (number(first)?, number(last)?) {
         (first, last) if first <= last && last - first < MAX_JOBS as u64 => Ok((first, last)),
-        _ => Err(format!("the last is at or behind the first, and there are no more than {MAX_JOBS}")),
+        _ => Err(format!("the last seed must not be below the first, and {MAX_JOBS} seeds are the maximum")),
     }
 }
 
@@ -156,10 +156,10 @@ fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     let is_key =
         |part: &str| !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-');
     if !key.split('.').all(is_key) {
-        return Err(format!("{key:?} is no key of a recipe"));
+        return Err(format!("{key:?} cannot be a key of a recipe"));
     }
     let table: toml::Table =
-        format!("values = [{values}]").parse().map_err(|_| format!("{values:?} are no values as TOML has them"))?;
+        format!("values = [{values}]").parse().map_err(|_| format!("{values:?} are not values in TOML notation"))?;
     let values = serde_json::to_value(&table["values"]).map_err(|error| error.to_string())?;
     match values {
         Value::Array(values) if !values.is_empty() => Ok((key.to_owned(), values)),
@@ -182,9 +182,9 @@ fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     })
 }
 
-/// Returns the text of a recipe with other values.
+/// Returns the text of a recipe with the given values. Each key is dotted, such as `compensation.gain`.
 fn varied(text: &str, values: &Map<String, Value>) -> Result<String, String> {
-    let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is no TOML: {error}"))?;
+    let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is not valid TOML: {error}"))?;
     for (key, value) in values {
         let mut table = &mut recipe;
         let (tables, last) = key.rsplit_once('.').unwrap_or(("", key));
@@ -209,8 +209,10 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
     let (first, last) = arguments.seeds;
     let seeds: Vec<u64> = (first..=last).collect();
     if seeds.len() * sets.len() > MAX_JOBS {
-        let what =
-            format!("{} jobs are more than the {MAX_JOBS} of one study; take fewer seeds", seeds.len() * sets.len());
+        let what = format!(
+            "{} jobs are more than the maximum of {MAX_JOBS} in a study; use fewer seeds",
+            seeds.len() * sets.len()
+        );
         return Err(PlantError::Recipe(what).into());
     }
     let study = Study {
@@ -225,7 +227,7 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
         let sets: Vec<Value> = sets.into_iter().map(Value::Object).collect();
         let jobs = study.begin(&link, &sets, &seeds).await?;
         super::super::print(&format!(
-            "{}: {}; regrind study work makes them\n",
+            "{}: {}; to run them: regrind study work\n",
             study.name,
             super::super::words::counted(jobs, "job")
         ))?;
@@ -272,7 +274,8 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     })
 }
 
-/// Runs a job in a separate process. Returns the summary of the run, together with the truth.
+/// Runs a job in a separate process. Returns the summary of the run with the true state of the simulated part, or the
+/// reason why there is no run.
 fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
@@ -396,7 +399,7 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     Some((low + values.get(middle)?) / 2.0)
 }
 
-/// Returns the 95 % interval of a share, in per cent (Wilson 1927).
+/// Returns the 95 % interval of the share of `of` in `all`, in per cent (Wilson 1927).
 fn wilson(of: usize, all: usize) -> [f64; 2] {
     let (n, p) = (all as f64, of as f64 / all as f64);
     let middle = p + Z * Z / (2.0 * n);
@@ -411,7 +414,7 @@ fn stop(arguments: &ToStop) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let done = link.query("SELECT stop_study($1)", &[&arguments.name]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
-            super::super::print(&format!("{} gives out no more jobs\n", arguments.name))?;
+            super::super::print(&format!("{} is stopped: no further jobs are assigned\n", arguments.name))?;
             return Ok(Outcome::Accepted);
         }
         super::super::print(&format!("there is no study {:?}, or it was stopped before\n", arguments.name))?;

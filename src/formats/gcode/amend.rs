@@ -33,11 +33,11 @@ const MAX_BYTES: u64 = 1 << 30;
 /// Maximum number of pieces that one line is divided into.
 const MAX_POINTS: f64 = 2e6;
 
-/// Maximum share of a program that can lie outside the map; a larger share means that the map belongs to another
-/// program or has another unit.
+/// Maximum share of the feed length of a program that can lie outside the map; a larger share means that the map
+/// belongs to another program or has another unit.
 const MAX_SHARE_OUTSIDE_MAP: f64 = 0.95;
 
-/// An arc stays an arc if its ends are displaced equally to within this, in millimetres.
+/// Maximum difference between the displacements along an arc that is written as an arc, in millimetres.
 const MAX_WOUND_MM: f64 = 1e-3;
 /// Rounding error of three coordinates with six decimals, in millimetres.
 const ROUNDING_MM: f64 = 2e-6;
@@ -87,8 +87,8 @@ pub struct Amended {
     pub largest_mm: f64,
     /// Length of the moves at feed, in millimetres.
     pub feed_mm: f64,
-    /// Length of the moves at feed that lie outside the map, in millimetres; there the outermost values are continued
-    /// (levelled off).
+    /// Length of the moves at feed that lie outside the map, in millimetres. There the values at the border of the map
+    /// are used.
     pub beside_map_mm: f64,
     /// True if the program has neither G20 nor G21 before its first coordinate, so that millimetres were assumed and
     /// written.
@@ -105,7 +105,7 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     let bytes = read_whole(base, MAX_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
     let text = decoded(&bytes)
-        .ok_or_else(|| program("the program is not plain text", "give the program as the controller reads it"))?;
+        .ok_or_else(|| program("the program is not plain text", "give the text file that the controller reads"))?;
     let text = &*text;
     if let Some((what, remedy)) = other_control(text) {
         return Err(program(what, remedy));
@@ -144,21 +144,22 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     if done.straight + done.arcs == 0 {
         return Err(program(
             "the program has no move at feed, so there is nothing to correct",
-            "check that it is the program of the pass",
+            "check that the file is the program of the pass",
         ));
     }
     if done.beside_map_mm > MAX_SHARE_OUTSIDE_MAP * done.feed_mm {
         let over_mm = done.feed_mm - done.beside_map_mm;
         let what = format!("only {over_mm:.3} mm of {:.3} mm at feed lie over the map", done.feed_mm);
         let remedy =
-            "give the map in the program's coordinates, and the program in millimetres with points in its numbers";
+            "check that the map is in the frame of the program; check the unit and the decimal points of the program";
         return Err(GcodeError::Program { path: base.to_owned(), what, remedy });
     }
     draft.publish()?;
     Ok(done)
 }
 
-/// Returns a program as text: UTF-8, or Latin-1, which older programs use for remarks; `None` if it is neither.
+/// Returns a program as text: UTF-8, or else Latin-1, which older programs use for remarks; `None` if it has control
+/// characters and is therefore not text.
 fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
     if bytes.iter().any(|b| *b < b' ' && !b"\t\r\n\x0c".contains(b)) {
         return None;
@@ -169,7 +170,7 @@ fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
 
 /// Detects a program for a control other than LinuxCNC by its first lines; returns its kind and the remedy.
 fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
-    const AGAIN: &str = "compensate reads and writes the dialect of LinuxCNC; plan the next program by regrind plan --program and its dialect";
+    const AGAIN: &str = "regrind compensate supports only the dialect of LinuxCNC; for another control, write the program with regrind plan --program in its dialect";
     /// Number of lines that are checked; later lines do not identify the control.
     const LOOKED_AT: usize = 20;
     let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && *line != "%").take(LOOKED_AT);
@@ -179,7 +180,7 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
             let digits = number.bytes().take_while(u8::is_ascii_digit).count();
             let rest = number[digits..].trim_start();
             (digits > 0 && (rest.is_empty() || rest.starts_with('(')))
-                .then_some("it is a program of a Fanuc control: a line of it is a program number")
+                .then_some("it is a program of a Fanuc control, because one of its lines is a program number")
         })
         .or_else(|| {
             let mut lines = text.lines().take(LOOKED_AT);
@@ -191,7 +192,7 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
         .map(|what| (what, AGAIN))
 }
 
-/// Returns true if G20 or G21 occurs before the first coordinate.
+/// Returns true if G20 or G21 occurs before the first coordinate or feed, or if there is no coordinate and no feed.
 fn states_unit_first(text: &str) -> bool {
     for line in text.lines() {
         let Ok(block) = block(line) else { return true };
@@ -205,8 +206,8 @@ fn states_unit_first(text: &str) -> bool {
     true
 }
 
-/// Rejects a program that already contains the map, that belongs to another part than the map, or that contains a
-/// correction other than the base of the map.
+/// Rejects a program that already contains the map, that belongs to another part than the map, or whose correction is
+/// not the one that the map requires ([`MapBase`]).
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();
@@ -220,7 +221,7 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
         if identity_in(line, "map:") == Some(amendment.map.identity) {
             return refused(
                 "this map is already applied in the program",
-                "use the program as it is, or correct the program that it was made from",
+                "use this program without a further correction, or correct its base program",
             );
         }
         if let (Some(of_program), Some(of_map)) = (identity_in(line, "part:"), amendment.map.part)
@@ -231,13 +232,13 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
     }
     match amendment.map.base {
         MapBase::Nothing if !maps.is_empty() => refused(
-            "the program already has a correction, and this one is absolute: it replaces the other and does not add \
-             to it",
-            "correct the program without a correction, as regrind plan --program writes it",
+            "the program already contains a correction, and this map is absolute: it replaces an earlier correction \
+             and is not added to it",
+            "give the program without correction, as regrind plan --program writes it",
         ),
         MapBase::Map(identity) if !maps.contains(&identity) => refused(
             "the map was measured after a pass with another correction than the one in the program",
-            "correct the program that the part was ground with before it was measured",
+            "give the program with which the part was ground before this measurement",
         ),
         _ => Ok(()),
     }
@@ -272,7 +273,7 @@ struct Rewriter<'a> {
     done: Amended,
     /// Position of the tool in the corrected program; `None` for an axis whose position is unknown.
     actual: [Option<f64>; 3],
-    /// Words of rotary axes that are at 0; they are written with the next move.
+    /// Words of the rotary axes in the current line, all 0; they are written with its first move.
     beside: String,
 }
 
@@ -282,7 +283,7 @@ impl<'a> Rewriter<'a> {
         Self { amendment, control, text: Vec::new(), done, actual: [None; 3], beside: String::new() }
     }
 
-    /// Reads one line and writes the corrected lines.
+    /// Executes one line of the base program, and appends the corrected lines for it to the text.
     fn line(&mut self, line: &str, block: &Block) -> Result<(), Refusal> {
         self.done.lines += 1;
         if block.words.is_empty() {
@@ -319,7 +320,7 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// Writes a rapid move to its original end; only the axes that it names move.
+    /// Writes a rapid move to its end in the base program; an axis that is `None` does not move.
     fn rapid(&mut self, to: [Option<f64>; 3]) {
         self.text.extend_from_slice(b"G0");
         for k in 0..3 {
@@ -332,7 +333,8 @@ impl<'a> Rewriter<'a> {
         self.text.push(b'\n');
     }
 
-    /// Copies a move in machine coordinates, or to the reference point, unchanged.
+    /// Copies a move in machine coordinates, or to the reference point, unchanged. `by` is the number of the G word of
+    /// its motion, 0 or 1; `None` for a move to the reference point.
     fn machine(&mut self, block: &Block, by: Option<u8>) {
         if self.control.relative {
             self.text.extend_from_slice(b"G91\n");
@@ -353,7 +355,8 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Writes a corrected move at feed.
+    /// Writes the corrected moves for one move at feed of the base program. `way` returns the position in the base
+    /// program at a share of the move, from 0 to 1; `arc` is `None` for a straight move.
     fn feed(
         &mut self,
         from: Point,
@@ -398,8 +401,9 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// Returns the displacements by the map at points of a move, at equal steps that are fine enough for the map, the
-    /// arc and the tolerance.
+    /// Returns the displacements by the map at equally spaced points of a move, both ends included. The spacing is fine
+    /// enough for the map, the arc and the tolerance. `way` is that of [`Self::feed`]. `lateral` is the length over x
+    /// and y, `length` the length in space, in millimetres.
     fn shifts(
         &self,
         way: &dyn Fn(f64) -> Point,
@@ -428,12 +432,17 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Records the displacement of a move and its length outside the map; rejects a displacement above the limit.
+    /// Adds the displacement of a move, its length and its length outside the map to the summary; rejects a
+    /// displacement above the limit.
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
         if largest_mm > self.amendment.max_shift_mm {
-            let found = format!("the map would move the tool by {:.1} µm", 1e3 * largest_mm);
-            return Err((found, "check that it is the right map in the right unit, or raise --max-correction-um"));
+            let found = format!(
+                "the map would move the tool by {:.1} µm; the limit is {:.1} µm",
+                1e3 * largest_mm,
+                1e3 * self.amendment.max_shift_mm
+            );
+            return Err((found, "check the map and its unit, or raise --max-correction-um"));
         }
         self.done.largest_mm = self.done.largest_mm.max(largest_mm);
         let count = shifts.len() - 1;
@@ -507,21 +516,23 @@ impl<'a> Rewriter<'a> {
     }
 }
 
-/// Returns the displacement of a point of the program by the map, in millimetres.
+/// Returns the displacement by the map of `at`, a point of the program, in millimetres. The error is that no nominal
+/// surface is under the point.
 pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, Refusal> {
     let shift = amendment.shift;
     let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
     let centre = at + Vector::z() * along.centre_above_mm;
     ball_displacement(along.nominal, shift, &centre).ok_or_else(|| {
         let found = format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
-        let remedy = "normals cross high above a concave part: go down by G0 and begin the move at feed nearer to \
-                      the part; otherwise check that the program is in the frame of the nominal surface, and that \
-                      its point is the stated one";
+        let remedy = "above a concave part, begin the move at feed closer to the part, because its normals cross high \
+                      above it (approach by G0); otherwise check that the program is in the frame of the \
+                      nominal surface, and that its programmed point is the stated one";
         (found, remedy)
     })
 }
 
-/// Returns true for words that every move writes itself, and for line numbers, which would otherwise occur twice.
+/// Returns true for words of a line that are not copied: line numbers, and the words that each corrected move writes
+/// again.
 fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
@@ -532,7 +543,7 @@ fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     }
 }
 
-/// Returns true if a word turns the move of its line into one in machine coordinates.
+/// Returns true for G28, G30 and G53: the move of such a line goes to the reference point or is in machine coordinates.
 fn is_machine(word: &GcodeWord) -> bool {
     word.letter == b'G' && [28.0, 30.0, 53.0].contains(&word.value)
 }

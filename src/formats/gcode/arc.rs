@@ -26,7 +26,7 @@ pub(super) struct Arc {
 /// Centre of an arc, as the program gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Centre {
-    /// Position along the two axes of the plane.
+    /// Position of the centre along the two axes of the plane.
     At([f64; 2]),
     /// Radius; negative for the longer arc.
     Radius(f64),

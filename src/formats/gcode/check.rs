@@ -1,4 +1,5 @@
-//! Check of a corrected program: it is read again line by line, next to its base, and compared with base and map.
+//! Check of a corrected program: a second interpreter reads the base program and the corrected program line by line,
+//! and compares the corrected lines with the base and the map.
 //!
 //! This interpreter shares only the splitting of a line into words with the interpreter that corrects, so that each
 //! finds the mistakes of the other.
@@ -10,8 +11,7 @@ use super::number::PER_MM;
 use super::read::{Block, Refusal, block};
 use regrind_core::geometry::{Point, Vector};
 
-/// Tolerance above the last written digit, for the rounding of three coordinates and of an arc's centre, in
-/// millimetres.
+/// Tolerance for the rounding of three coordinates and of an arc's centre to the last written digit, in millimetres.
 const DIGITS_MM: f64 = 4.0 / PER_MM;
 
 /// Maximum difference between the radii at the ends of an arc, in millimetres; controls reject a larger one.
@@ -80,7 +80,7 @@ impl Movement {
 }
 
 impl Round {
-    /// Rotates the vector from centre to start, and scales it to the length at the end.
+    /// Returns the point at a share of the move, from 0 to 1. The radius changes linearly from the start to the end.
     fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.axes;
         let [p, q] = [self.from[a] - self.centre[0], self.from[b] - self.centre[1]];
@@ -102,7 +102,8 @@ impl Round {
 }
 
 impl Machine {
-    /// Reads a line.
+    /// Executes the words of a line, and returns its movement; `None` for a line without movement, or after the end of
+    /// the program.
     fn read(&mut self, block: &Block) -> Result<Option<Movement>, String> {
         if self.over {
             return Ok(None);
@@ -212,7 +213,8 @@ impl Machine {
 }
 
 impl<'a> Check<'a> {
-    /// Starts with the header of the corrected program.
+    /// Creates a check. The modal words of `header`, the first lines of the corrected program, are in force at its
+    /// start.
     pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
         let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
         for line in header.lines() {
@@ -222,14 +224,14 @@ impl<'a> Check<'a> {
         check
     }
 
-    /// Compares a line of the base with the corrected lines written for it.
+    /// Compares a line of the base with `text`, the corrected lines for it.
     ///
     /// # Errors
     /// Corrected lines that differ from base and map.
     pub(super) fn line(&mut self, line: &str, text: &[u8]) -> Result<(), Refusal> {
         self.compared(line, text).map_err(|found| {
             let found = format!("the corrected lines differ from the base and the map: {found}");
-            (found, "nothing was written; report it with the program and the map")
+            (found, "nothing was written; report this fault with the program and the map")
         })
     }
 
@@ -284,11 +286,12 @@ impl<'a> Check<'a> {
         if same && known && rest && !corrected.by_distance {
             Ok(())
         } else {
-            Err("another state of the control".into())
+            Err("the state of the control differs (unit, plane, feed or known position)".into())
         }
     }
 
-    /// Checks that the corrected moves follow the base path displaced by the map, in order and without a detour.
+    /// Checks that `found`, the corrected moves, follow the base move `way` displaced by the map, in order and without
+    /// a detour.
     fn along(&self, way: &Movement, found: &[Movement]) -> Result<(), String> {
         let allowed = self.amendment.tolerance_mm + DIGITS_MM;
         let at = |share: f64| {
@@ -302,7 +305,7 @@ impl<'a> Check<'a> {
         let found = if brings && off(found[0].at(0.0), begin) > 0.0 { &found[1..] } else { found };
         let (first, last) = (found[0].at(0.0), found[found.len() - 1].at(1.0));
         if off(last, end) > allowed {
-            return Err(format!("it ends {:.6} mm off", off(last, end)));
+            return Err(format!("the last move ends {:.6} mm from its position by the map", off(last, end)));
         }
         let samples = 2 * found.len() + 3;
         let (mut k, mut before, mut length) = (0, begin, 0.0);
@@ -323,14 +326,14 @@ impl<'a> Check<'a> {
             // A straight move down to the part can begin where the rapid move ended.
             let reaches = away(&found[k]).min(distance_to_segment(first, begin, wanted));
             if reaches > allowed {
-                return Err(format!("it is {reaches:.6} mm from the position by the map"));
+                return Err(format!("a move is {reaches:.6} mm from the position by the map"));
             }
         }
         let written: f64 = found.iter().map(Movement::length).sum();
         // The chords between the samples are shorter than an arc.
         let longest = length.max(way.length()) + off(first, begin) + 4.0 * allowed;
         if written > longest * (1.0 + 1e-6) {
-            return Err(format!("it is {:.6} mm too long", written - longest));
+            return Err(format!("the moves are {:.6} mm too long", written - longest));
         }
         Ok(())
     }
@@ -344,7 +347,7 @@ fn distance_to_segment(from: Point, to: Point, point: Point) -> f64 {
     (arm - along * share).norm()
 }
 
-/// Returns true if a line has an arc with the number of turns in P.
+/// Returns true if a P word in this line is the number of turns of an arc.
 fn is_turn(block: &Block) -> bool {
     let has = |letter: u8, of: &[f64]| block.words.iter().any(|w| w.letter == letter && of.contains(&w.value));
     block.words.iter().any(|w| matches!(w.letter, b'I' | b'J' | b'K' | b'R'))
@@ -352,7 +355,7 @@ fn is_turn(block: &Block) -> bool {
         && !has(b'G', &[4.0, 64.0])
 }
 
-/// Counts the words that neither move the tool nor number a line.
+/// Adds `by` to the count of each word of a line, except for words that move the tool and line numbers.
 fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
     for word in &block.words {
         let moves = match word.letter {

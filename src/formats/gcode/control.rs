@@ -1,7 +1,7 @@
 //! Modal state of a control while it reads a program, and the action of each line.
 //!
-//! A word without a meaning in its line is rejected. If a word makes a position unknown, that position is forgotten:
-//! another tool length makes Z unknown, another zero makes all axes unknown.
+//! A word without a meaning in its line is rejected. Some words make the position of an axis unknown: another tool
+//! length that of Z, another zero (work coordinate system) that of all axes.
 
 use super::arc::{Arc, Centre, Plane};
 use super::number::MAX_COORDINATE_MM;
@@ -12,7 +12,7 @@ pub(super) const INCH_MM: f64 = 25.4;
 pub(super) const AXES: [u8; 3] = *b"XYZ";
 const TURNING: [u8; 3] = *b"ABC";
 
-/// Groups of G words of which one line can have only one, as ten times the number of the word.
+/// Groups of G words, each word as ten times its number. A line can have only one word of a group.
 const GROUPS: [&[i64]; 12] = [
     &[0, 10, 20, 30],
     &[40, 280, 300, 530],
@@ -27,7 +27,7 @@ const GROUPS: [&[i64]; 12] = [
     &[610, 611, 640],
     &[960, 970],
 ];
-/// The same groups for M words.
+/// Groups of M words, each word as its number. A line can have only one word of a group.
 const M_GROUPS: [&[i64]; 4] = [&[0, 1, 2, 30, 60], &[3, 4, 5, 19], &[6], &[48, 49]];
 
 /// Action of a line, lengths in millimetres.
@@ -64,14 +64,14 @@ pub(super) struct Control {
     upright: [bool; 3],
 }
 
-/// Requests of the words of a line.
+/// Effects that the words of a line request.
 #[derive(Default)]
 struct BlockRequests {
     motion: Option<u8>,
     dwell: bool,
     machine: bool,
     reference: bool,
-    /// Letters among P, Q, R, H and D that a word of the line uses.
+    /// Letters, such as P or H, that another word of the line uses as its parameter.
     takes: Vec<u8>,
     /// Axes whose position becomes unknown before the line moves.
     forgets: [bool; 3],
@@ -139,7 +139,8 @@ impl Control {
         Ok(Act::Feed { from, to, arc })
     }
 
-    /// Applies the modal words of a line; rejects words that move the tool in another way.
+    /// Applies the modal words of a line and returns the effects that the line requests; rejects words that move the
+    /// tool in a way that the program does not show.
     fn states(&mut self, block: &Block) -> Result<BlockRequests, Refusal> {
         let mut asked = BlockRequests::default();
         let is_move = |word: &&GcodeWord| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
@@ -194,7 +195,7 @@ impl Control {
             930 => {
                 let remedy = "let the CAM system write feeds per minute (G94)";
                 return Err((
-                    format!("{} gives the time of a move, which divided lines do not keep", word.text),
+                    format!("{} gives the time of a move, but the correction divides moves", word.text),
                     remedy,
                 ));
             }
@@ -203,7 +204,7 @@ impl Control {
                 return Err((format!("{} lets the controller move the path by a radius", word.text), remedy));
             }
             730 | 760 | 810..=890 => {
-                let remedy = "let the CAM system write the moves of the cycle out";
+                let remedy = "let the CAM system write single moves in place of the cycle";
                 return Err((format!("{} is a canned cycle", word.text), remedy));
             }
             _ => {
@@ -236,7 +237,7 @@ impl Control {
             v if v.fract() == 0.0 && (matches!(v as i64, 50..=53)) => asked.takes.push(b'P'),
             v if v.fract() == 0.0 && (matches!(v as i64, 0..=9 | 48 | 49 | 60)) => {}
             _ => {
-                let found = format!("{} is a subprogram, a state of the controller, or the machine's own", word.text);
+                let found = format!("{} can call a subprogram or a function of the machine", word.text);
                 return Err((found, "remove it, or write out what it does"));
             }
         }
@@ -246,7 +247,8 @@ impl Control {
     /// Processes the rotary axes, which turn the part or the tool: they can only move to 0, where a map over x and y is
     /// valid.
     ///
-    /// Returns the word of the first rotary axis, and whether one of the axes can turn now.
+    /// Returns the word of the first rotary axis of the line, with true if one of its rotary axes can turn in this
+    /// line; `None` if the line names no rotary axis.
     fn turning<'w>(
         &mut self,
         block: &'w Block,
@@ -283,7 +285,8 @@ impl Control {
         Ok(Act::Machine { by: self.motion.filter(|_| asked.machine) })
     }
 
-    /// Returns the position to which the program moves.
+    /// Returns the end position of a move, in millimetres; `None` for an axis whose position is unknown. `named` holds
+    /// the values of X, Y and Z in the line.
     fn target(&self, named: [Option<f64>; 3]) -> Result<[Option<f64>; 3], Refusal> {
         let mut target = self.at;
         for k in 0..3 {
@@ -344,7 +347,7 @@ pub(super) fn all(of: [Option<f64>; 3]) -> Option<Point> {
     Some(Point::new(of[0]?, of[1]?, of[2]?))
 }
 
-/// Returns ten times the number of a word, if it has at most one decimal.
+/// Returns ten times the number of a word; `None` if the number has more than one decimal.
 pub(super) fn tenths(word: &GcodeWord) -> Option<i64> {
     let tenths = (word.value * 10.0).round();
     ((word.value * 10.0 - tenths).abs() <= 1e-6).then_some(tenths as i64)
@@ -386,7 +389,7 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Rejects words that no other word in their line uses.
+/// Rejects words that have no meaning in their line, such as I without an arc or P without a dwell.
 fn check_uses(block: &Block, asked: &BlockRequests, moves: bool, is_arc: bool) -> Result<(), Refusal> {
     for word in &block.words {
         let used = match word.letter {

@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use regrind_core::compensation::path::{ArcOptions, PathMode, RotaryAxis};
 
-/// The dialect of LinuxCNC, which a cell has that says nothing.
+/// Name of the dialect of LinuxCNC, which is the default of a cell.
 pub const LINUXCNC: &str = "linuxcnc";
 
 /// Format of the programs of a kind of control.
@@ -104,7 +104,7 @@ pub struct Blocks {
     /// Step from each number to the next.
     #[schemars(range(min = 1, max = 1000))]
     pub step: u32,
-    /// Largest number; the first number follows it.
+    /// Largest number; after it the numbers begin again with the first one.
     #[schemars(range(min = 1, max = 999999999))]
     pub last: u32,
     /// Whether comments and the lines before them also have numbers.
@@ -158,7 +158,7 @@ pub struct Words {
     /// Text that begins a straight move at feed.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G1 ")]
     pub line: String,
-    /// Whether these texts begin every block; otherwise they stay in force.
+    /// Whether `rapid` and `line` begin every block; if not, only where the motion changes or a track begins.
     pub each_block: bool,
     /// Words of the three axes.
     #[schemars(inner(length(min = 1, max = 4)))]
@@ -202,7 +202,7 @@ pub enum CentreWords {
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ArcWords {
-    /// Text that begins a clockwise arc, seen against the axis across its plane.
+    /// Text that begins a clockwise arc, seen from the positive end of the axis normal to its plane.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G2 ")]
     pub clockwise: String,
     /// Text after the coordinates of the arc.
@@ -278,7 +278,7 @@ pub struct PathModeText {
     /// Lines before the moves.
     #[schemars(length(min = 1, max = 16), inner(length(min = 1, max = 200)), extend("x-required" = true))]
     pub begin: Vec<String>,
-    /// Lines after them.
+    /// Lines after the moves.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub end: Vec<String>,
 }
@@ -299,10 +299,10 @@ pub struct Tilting {
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Turning {
-    /// Lines before the moves, after those of the path mode; none if the control does so anyway.
+    /// Lines before the moves, after those of the path mode; empty if the control needs no lines.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub begin: Vec<String>,
-    /// Lines after them.
+    /// Lines after the moves.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub end: Vec<String>,
 }
@@ -358,7 +358,7 @@ pub enum DialectError {
     )]
     Mode { dialect: String, mode: &'static str, key: &'static str },
     #[error(
-        "the dialect `{dialect}` cannot state how far the control may round corners: a setting of the control does; \
+        "the dialect `{dialect}` cannot state how far the control may round corners; a setting of the control determines it: \
          write that setting as grinder.program.controller_tolerance_um into the cell file"
     )]
     ToleranceUnknown { dialect: String },
@@ -410,7 +410,7 @@ pub enum DialectError {
     Slides { dialect: String },
     #[error(
         "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} \
-         has none left; extend the range"
+         has no number in this range; extend the range"
     )]
     Number { dialect: String, least: u32, most: u32, cycle: u16 },
 }
@@ -606,7 +606,7 @@ impl Dialect {
         faults
     }
 
-    /// Returns all fixed words and lines with their keys.
+    /// Returns all fixed words and lines of the dialect with their keys.
     fn lines(&self) -> impl Iterator<Item = (String, &String)> {
         let of = |key: &'static str, lines: &'static str| move |(k, line)| (format!("{key}{lines}[{k}]"), line);
         let frame = &self.program;
@@ -780,7 +780,8 @@ impl ArcWords {
 pub(super) const NAME: &str = "{name}";
 pub(super) const NUMBER: &str = "{number}";
 const TOLERANCE: &str = "{tolerance_mm}";
-/// Words for inches, for incremental positions, and for feeds by time or by revolution.
+/// Words that are rejected in the lines of a dialect: for inches, for incremental positions, and for feeds by time or
+/// by revolution.
 const OTHER: [&str; 9] = ["G20", "G70", "G700", "G91", "G93", "G95", "G96", "G961", "INCH"];
 
 #[cfg(test)]

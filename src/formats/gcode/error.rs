@@ -14,7 +14,7 @@ use crate::FormatError;
 pub enum GcodeError {
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{axis} of move {number} is {value_mm} mm; do not use the path: report it with the files that led to it")]
+    #[error("{axis} of move {number} is {value_mm} mm; do not use this path; report the fault with the input files")]
     NotFinite { axis: char, value_mm: f64, number: u64 },
     #[error(transparent)]
     Dialect(#[from] DialectError),
@@ -28,7 +28,7 @@ pub enum GcodeError {
          raise grinding.feed_mm_min"
     )]
     Slow { feed_mm_min: f64, decimals: u8, number: u64 },
-    #[error("the path has {found} moves instead of the expected {expected}; report it with the files that led to it")]
+    #[error("the path has {found} moves instead of the expected {expected}; report the fault with the input files")]
     Count { found: u64, expected: u64 },
     #[error("{path}, line {line}: {what}; {remedy}")]
     Line { path: PathBuf, line: u64, what: String, remedy: &'static str },
@@ -37,7 +37,7 @@ pub enum GcodeError {
 }
 
 impl GcodeError {
-    /// Returns the error with its move number increased by the moves that came before.
+    /// Returns the error with its move number increased by `moves`, the number of moves before this track.
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },

@@ -181,13 +181,15 @@ fn columns(header: &str) -> Option<MapKind> {
     }
 }
 
-/// Reads the node of a row; the value of an invalid node can be any text.
+/// Returns x, y and the value of a row; `None` if one of them is not a number. The value of an invalid node can be any
+/// text and becomes NaN.
 fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
     Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(f64::NAN))?))
 }
 
-/// Returns the grid of the nodes, and the index of the point at each node of the grid.
+/// Returns the grid of the nodes, and the index of the point at each node of the grid; `None` if the points do not form
+/// a complete grid.
 fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     let order = recognise_grid(points)?;
     if order.point_indices.contains(&NO_POINT) {
@@ -221,7 +223,7 @@ fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     }
 }
 
-/// Returns the identity that follows a name in a comment.
+/// Returns the SHA-256 after `name` in a comment such as `map: sha256 5f3c...`; `None` if there is none.
 pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
     let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
     let mut bytes = [0; 32];

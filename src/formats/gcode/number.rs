@@ -1,6 +1,6 @@
 //! Numbers of a program: a sign, digits, a point, six decimals. No exponent, because LinuxCNC reads it as an E word.
 
-/// Number of decimals that are written: the last one is a nanometre.
+/// Number of units of the last written decimal in a millimetre: six decimals, so that the last one is a nanometre.
 pub(super) const PER_MM: f64 = 1e6;
 /// Largest coordinate that is written, in millimetres.
 pub(super) const MAX_COORDINATE_MM: f64 = 1e9;
@@ -41,7 +41,7 @@ pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
     text.extend_from_slice(&digits[at..]);
 }
 
-/// Appends a number with the given number of decimals; the value counts units of the last decimal.
+/// Appends the number `count` / 10^`decimals` with all its decimals.
 #[inline]
 pub(super) fn push_decimals(text: &mut Vec<u8>, count: i64, decimals: u8) {
     if decimals == 6 {
@@ -77,7 +77,7 @@ const PAIRS: [[u8; 2]; 100] = {
     pairs
 };
 
-/// Returns a number without trailing zeros, as headers and feeds use it.
+/// Returns a number rounded to six decimals, without trailing zeros, for headers and feeds.
 pub(super) fn short(value: f64) -> String {
     let mut text = Vec::new();
     push_fixed(&mut text, rounded(value));

@@ -75,7 +75,7 @@ fn expression() -> Refusal {
     ("the line has a variable or an expression; only the controller knows its value".into(), remedy)
 }
 
-/// Reads the word that begins at a byte, and returns it with its end.
+/// Returns the word that begins at the byte `at`, and the index of the byte after the word.
 fn word(line: &str, at: usize) -> Result<(GcodeWord<'_>, usize), Refusal> {
     let bytes = line.as_bytes();
     let letter = bytes[at].to_ascii_uppercase();

@@ -27,11 +27,11 @@ pub struct ProgramHeader {
     pub part: String,
     /// Number of the pass, from 1.
     pub cycle: u16,
-    /// SHA-256 of the source of the nominal surface, over which the path was made.
+    /// SHA-256 of the source of the nominal surface for which the path was computed.
     pub base_identity: [u8; 32],
     /// Identity of the correction that is in the path.
     pub map_identity: [u8; 32],
-    /// True if that correction is 0 everywhere.
+    /// True if the correction in the path is 0 everywhere.
     pub uncorrected: bool,
     /// Height of the target surface above the nominal one, in millimetres.
     pub level_mm: f64,
@@ -188,7 +188,7 @@ impl<'a> Lines<'a> {
         Ok(lines)
     }
 
-    /// Resets the modal state: nothing is in force any more.
+    /// Resets the modal state, so that the next block states its motion, position and feed.
     fn begin(&mut self) {
         (self.last, self.turned, self.feed) = ([NOTHING; 3], NOTHING, NOTHING);
         (self.motion, self.plane) = (None, None);
@@ -235,9 +235,9 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Returns the feed in the form that the control uses: the feed of the wheel's centre if the control keeps that
-    /// centre in place, or the inverse of the time in minutes if the program moves the slides. An inverse time is valid
-    /// for its own block only.
+    /// Returns the feed in the form that the control uses. If the control keeps the wheel's centre, this is the feed of
+    /// the centre, in mm/min. If the program moves the slides, it is the inverse of the time of the block, in 1/min,
+    /// and is valid for this block only. `centre_mm` is the length of the move of the centre.
     fn feed_of(&mut self, feed_mm_min: f64, centre_mm: f64) -> f64 {
         if !self.moves_slides() {
             return feed_mm_min;
@@ -250,7 +250,8 @@ impl<'a> Lines<'a> {
         self.rotary.is_some_and(|rotary| rotary.pivot_mm.is_some())
     }
 
-    /// Writes the words of a move: those that changed, or all known ones if none changed.
+    /// Writes the block of a rapid or straight move: the words that changed, or all known words if none changed. `None`
+    /// leaves an axis, the tilt or the feed unchanged.
     #[inline]
     fn block(
         &mut self,
@@ -337,7 +338,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the centre along the axes of a plane, in the order of the axes.
+    /// Writes the coordinates of the centre along the two axes of a plane, with their words from `letters`, in the
+    /// order x, y, z. `first` is true until a word of the block is written.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
         for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
@@ -346,7 +348,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the word of the motion, if that motion is not in force.
+    /// Writes `words`, the text that begins a motion, unless this motion is in force and the dialect does not repeat it
+    /// in each block.
     #[inline]
     fn begins(&mut self, motion: Motion, words: &str) {
         if self.dialect.words.each_block || self.motion != Some(motion) {
@@ -355,7 +358,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes a word and a position.
+    /// Writes a coordinate: its word, and `value` in units of the last written digit.
     #[inline]
     fn place(&mut self, word: &str, value: i64, first: &mut bool) {
         self.between(first);
@@ -367,7 +370,7 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, value, numbers.decimals);
     }
 
-    /// Writes a feed, if it is not in force.
+    /// Writes a feed, given in units of the last written digit, unless it is in force.
     #[inline]
     fn feed(&mut self, feed: i64, first: &mut bool) {
         if feed != self.feed {
@@ -408,7 +411,7 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, turned, numbers.angle_decimals);
     }
 
-    /// Returns an angle on the scale of the axis, in units of the last written digit.
+    /// Returns the reading of the rotary axis for a tilt of the wheel, in units of the last written digit.
     fn rounded_turn(&self, tilt_rad: f64) -> Result<i64, GcodeError> {
         let Some(rotary) = self.rotary.filter(|_| tilt_rad.is_finite()) else {
             return Err(GcodeError::NotFinite { axis: 'A', value_mm: tilt_rad, number: self.count });
@@ -496,7 +499,7 @@ impl<'a> Frame<'a> {
         })
     }
 
-    /// Appends a line; returns whether it has a number.
+    /// Appends a line, with a block number if `has_number` is true.
     fn line(&self, text: &mut Vec<u8>, line: &str, has_number: bool, numbered: &mut u64) {
         // A percent sign is not a block and has no number.
         if has_number && line != "%" {
@@ -561,7 +564,7 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// Returns the content of the header, one comment each.
+/// Returns the texts of the header, one for each comment. `lines` is the number of lines of the program.
 fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());

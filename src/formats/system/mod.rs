@@ -14,10 +14,10 @@ use windows as here;
 
 pub(super) use here::{create_owners, is_socket, link_to, open_to_read, sync_folder};
 
-/// Fact that users other than the owner can read a file.
+/// Permission by which users other than the owner can read a file, and the command that removes it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OpenToOthers {
-    /// Permission that allows them to read it.
+    /// Name of the permission.
     pub how: String,
     /// Command that removes the permission.
     pub remedy: String,

@@ -12,7 +12,7 @@ pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// Compares full paths: a hard link, which is a second name of the same file, is not detected.
+/// Returns true if two paths are the same full path. A hard link, which is a second name of a file, is not detected.
 pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
     Ok(one.canonicalize()? == other.canonicalize()?)
 }
@@ -32,23 +32,22 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Returns true if the entry at a path is a socket. There are none: programs communicate by pipes, which are not in a
-/// folder.
+/// Returns false for every existing path: on Windows programs communicate by pipes, which are not in a folder.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     fs::symlink_metadata(path).map(|_| false)
 }
 
-/// A port has only the name that the system gives it.
+/// Returns an error: on Windows a port has only the name that the system gives it.
 pub(crate) fn link_to(_: &Path, _: &Path) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// The file system keeps a journal of names; a program cannot flush a folder.
+/// Does nothing: on Windows the file system keeps a journal of names, and a program cannot flush a folder.
 pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// User identifiers are not numbers on this system.
+/// Returns `None`: on Windows user identifiers are not numbers.
 pub(super) fn user_name(_: u32) -> Option<String> {
     None
 }

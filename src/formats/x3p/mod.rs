@@ -281,7 +281,8 @@ impl<'a> Container<'a> {
         }
     }
 
-    /// Verifies the checksum of `main.xml` in an entry; a missing entry, or one without a checksum, is ignored.
+    /// Compares the MD5 checksum of `main.xml` with the one in the entry `seal`. A missing entry, or an entry without a
+    /// checksum, is ignored.
     fn check_sealed(&mut self, seal: &str, xml: &[u8]) -> Result<(), FormatError> {
         if self.find(seal).is_none() {
             return Ok(());

@@ -16,11 +16,11 @@ use regrind_core::geometry::Grid;
 /// Statements of a file about the origin of its map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapRecord {
-    /// Time when the map was made, as in `2026-03-01T12:00:00Z`.
+    /// Time when the map was computed or measured, as in `2026-03-01T12:00:00Z`.
     pub date: String,
-    /// Person or program that made it.
+    /// Person or program that created the map.
     pub creator: String,
-    /// Instrument or program with which it was made.
+    /// Instrument or program with which the map was created.
     pub instrument: String,
     /// Further remarks, in one or several lines.
     pub comment: String,

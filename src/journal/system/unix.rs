@@ -93,9 +93,9 @@ pub(crate) fn is_own_file(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
 }
 
-/// Returns the place for locks. Prefers a place where root has created the folder. Otherwise returns the first existing
-/// place that every user can write, and where nobody can remove the files of others. Returns `None` if no place
-/// qualifies.
+/// Returns the parent of the lock folder named `folder`, one of [`PLACES`]. Prefers a parent in which root has created
+/// this folder. Otherwise returns the first existing parent that every user can write, and where nobody can remove the
+/// files of others. Returns `None` if no parent qualifies.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
     // A folder that root has created, as the package does, comes before any other.
     let by_root =

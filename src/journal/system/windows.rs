@@ -76,8 +76,8 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     regrind_windows::free_bytes(folder)
 }
 
-/// Returns the place for files that belong to no single user, where each user can create files and read those of
-/// others.
+/// Returns the parent of the lock folder: `%ProgramData%`, where each user can create files and read those of others.
+/// Returns `None` if it does not exist.
 pub(crate) fn place_of_locks(_: &str) -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }

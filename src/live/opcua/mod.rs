@@ -69,7 +69,7 @@ impl UaServer {
     /// Serves the state of the cell until its source closes.
     ///
     /// # Errors
-    /// The parts of the server do not fit together.
+    /// The OPC UA server cannot be built, or ends with an error.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let Some(listener) = self.listener().await else { return Ok(()) };
         let address = listener.local_addr().unwrap_or(self.listen);
@@ -142,7 +142,7 @@ impl UaServer {
     }
 }
 
-/// Writes each new state to the nodes, until the source closes.
+/// Writes each new status to the nodes and sends its events to the clients, until the source closes.
 async fn show(told: &mut watch::Receiver<CellStatus>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
     let mut before: Option<CellStatus> = None;

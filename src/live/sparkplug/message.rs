@@ -11,7 +11,8 @@ use crate::figures::{Figure, FigureKind, FigureValue};
 /// Values of the figures, in their order.
 pub(super) type Values = Vec<Option<FigureValue>>;
 
-/// Encodes a birth: all figures with kinds and units. Its sequence number is 0.
+/// Encodes a birth: all figures with kinds and units. Its sequence number is 0. `connection` is the number of the
+/// connection (bdSeq).
 pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
     let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
     let mut metrics = vec![number_of(connection), rebirth];
@@ -34,10 +35,10 @@ pub(super) fn death(connection: u8) -> Vec<u8> {
     encoded(vec![number_of(connection)], None)
 }
 
-/// Reads the requests of a command: true if it requests a rebirth; and all other requests, in words.
+/// Decodes a command of a host. Returns true if it requests a rebirth, and the texts of all other requests.
 pub(super) fn read_requests(payload: &[u8]) -> (bool, Vec<String>) {
     let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
-        return (false, vec!["what is no command of Sparkplug B".into()]);
+        return (false, vec!["a message that is not a Sparkplug B command".into()]);
     };
     let wants_birth = |metric: &Metric| {
         metric.name.as_deref() == Some(NODE_CONTROL_REBIRTH) && metric.value == Some(Value::BooleanValue(true))
@@ -94,7 +95,7 @@ fn plain(name: &str, kind: DataType) -> Metric {
     metric
 }
 
-/// Returns the unit and the description, under the names that hosts look for.
+/// Returns the properties of the metric of a figure: `readOnly`, `documentation` and, if it has a unit, `engUnit`.
 fn properties(figure: &Figure) -> PropertySet {
     let text = |text: &str| {
         let value = Some(property_value::Value::StringValue(text.to_owned()));

@@ -34,9 +34,9 @@ const MIN_RETRY_DELAY: Duration = Duration::from_millis(500);
 const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// Minimum time between two births, however many hosts request one.
 const BETWEEN_BIRTHS: Duration = Duration::from_secs(1);
-/// Time before a message that the broker did not accept is sent again.
+/// Time after which a message is sent again that did not fit into the queue of the client.
 const OFFERED_AGAIN: Duration = Duration::from_secs(1);
-/// Timeout of the farewell.
+/// Timeout for the death message and the disconnection at the end.
 const FAREWELL: Duration = Duration::from_secs(2);
 /// Maximum number of messages queued for the network.
 const WAITING: usize = 16;
@@ -108,7 +108,7 @@ impl Node {
     /// Publishes the state of the cell until its source closes, whether or not the broker can be reached.
     ///
     /// # Errors
-    /// The number of the connection cannot be written.
+    /// The number of the connection (bdSeq) cannot be written to its file.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let mut wait = MIN_RETRY_DELAY;
         let mut connection = self.bd_seq.next()?;
@@ -188,7 +188,7 @@ struct Session<'a> {
     /// Values published last; `None` before the birth.
     values: Option<Values>,
     sequence: u8,
-    /// Time at which a birth, or a message that the broker did not accept, is due.
+    /// Time at which a deferred birth or message is due: one that was too early, or that did not fit into the queue.
     due: Option<Instant>,
     /// Time of the last birth.
     began: Instant,
@@ -203,7 +203,7 @@ impl Session<'_> {
         let stood = self.stood;
         let lost = |why: String| Err(SessionEnd::Lost { why, stood });
         match event {
-            None => lost("the connection has gone".into()),
+            None => lost("the connection was closed".into()),
             Some(Err(error)) => lost(in_words(&error)),
             Some(Ok(Event::Incoming(Packet::ConnAck(_)))) => {
                 let topics = [&self.node.topics.command, &self.node.topics.device_commands];
@@ -214,7 +214,8 @@ impl Session<'_> {
             Some(Ok(Event::Incoming(Packet::SubAck(ack)))) => {
                 let refused = ack.return_codes.contains(&SubscribeReasonCode::Failure);
                 if refused {
-                    let why = "it lets nobody ask for a birth: the node may not subscribe to its commands".to_owned();
+                    let why = "no host can request a birth: the broker does not let the node subscribe to its commands"
+                        .to_owned();
                     self.node.notes.retrying(&self.node.broker.place, why);
                 } else {
                     self.node.notes.connected(&self.node.broker.place);
@@ -256,7 +257,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Does the deferred work.
+    /// Publishes the deferred birth, or the changed values if the birth was published before.
     fn catch_up(&mut self) -> Result<(), SessionEnd> {
         self.due = None;
         match self.values {
@@ -266,7 +267,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Handles a command of a host. A host may request a birth, and nothing else.
+    /// Handles a command of a host. A host may request a birth; every other request is refused and reported.
     fn handle_command(&mut self, publish: &Publish) {
         let by = format!("somebody at the broker {}", self.node.broker.place);
         let (wants_birth, others) = message::read_requests(&publish.payload);

@@ -21,11 +21,11 @@ pub use present::Tls;
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TlsError {
-    #[error("{}: no certificate in PEM can be read from it: {what}", .path.display())]
+    #[error("{}: no certificate in PEM can be read from this file: {what}", .path.display())]
     Certificate { path: PathBuf, what: String },
-    #[error("{}: no private key in PEM can be read from it: {what}", .path.display())]
+    #[error("{}: no private key in PEM can be read from this file: {what}", .path.display())]
     Key { path: PathBuf, what: String },
-    #[error("{}: other users of this computer may read the key ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    #[error("{}: other users of this computer can read the key ({}); only its owner must be able to read it: {}", .path.display(), .open.how, .open.remedy)]
     KeyIsOpen { path: PathBuf, open: OpenToOthers },
     #[error("the certificate {} and the key {} cannot be used: {what}", .certificate.display(), .key.display())]
     Unfit { certificate: PathBuf, key: PathBuf, what: String },

@@ -65,7 +65,7 @@ impl DisplayState {
         }
     }
 
-    /// Returns a shape, in addition to the colour.
+    /// Returns the SVG path of a symbol that shows the state in addition to the colour.
     fn shape(self) -> &'static str {
         match self {
             Self::Runs => "M6 3 L21 12 L6 21 Z",
@@ -139,7 +139,11 @@ pub(super) fn tally(cells: &[CellSummary]) -> String {
     let of = |look: DisplayState| (cells.iter().filter(|cell| cell.display_state() == look).count(), look);
     let told = DisplayState::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
     let told: Vec<String> = told.map(|(count, look)| format!("{count} {}", look.words())).collect();
-    if told.is_empty() { "no cell is enrolled yet: regrind plant enrol".to_owned() } else { told.join(" · ") }
+    if told.is_empty() {
+        "no cell is enrolled yet; to enrol one: regrind plant enrol".to_owned()
+    } else {
+        told.join(" · ")
+    }
 }
 
 /// Draws a card for each cell.

@@ -58,14 +58,14 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
             (form)
             p .quiet { (selection.words()) ", of each cell the newest " (PARTS) " at most." }
             @if selection.recipe().is_empty() {
-                p .no { "Parts of several recipes are compared: a cell may differ by what it was given to make. Choose a recipe." }
+                p .no { "Parts of several recipes are compared: a difference between cells can come from their recipes. Choose a recipe." }
             }
             @if cells.is_empty() { p { "No cell has made such a part." } } @else { div .wide { (table(&cells, &chances, &selection)) } }
             @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { "Further cells" } } }
             p .quiet {
                 "Whether a cell differs: its PV against those of all other cells that are shown, by the rank sum of Mann and Whitney (two-sided, " (ENOUGH) " parts at least \
-                 on either side), corrected by Holm for how many cells are looked at; below " (format!("{:.0} %", 100.0 * CHANCE)) " it is told to be more than chance. \
-                 That takes each part for one draw: what drifts within a cell looks like a difference too. The box holds the middle half, its line is the median, \
+                 on either side), corrected for the number of cells (Holm); below " (format!("{:.0} %", 100.0 * CHANCE)) " a difference is reported as more than chance. \
+                 The test assumes independent parts: a drift within a cell looks like a difference too. The box holds the middle half, its line is the median, \
                  the whiskers reach to the least and the largest."
             }
         }
@@ -73,7 +73,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
     Ok(PageContent { title: "Cells".into(), again_s: None, main })
 }
 
-/// Reads the parts of one cell more than the page shows.
+/// Reads the newest parts of each cell. Skips the first `after` cells, and reads one cell more than the page shows.
 async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
     let (condition, values) = selection.condition();
     let n = values.len();
@@ -124,7 +124,8 @@ fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     holm(&found)
 }
 
-/// Returns a quantile of sorted values, interpolated between the two nearest values.
+/// Returns the quantile at `share` (0 to 1) of sorted values, interpolated between the two nearest values; `None`
+/// without values.
 fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     let at = share * (sorted.len().checked_sub(1)?) as f64;
     let (below, above) = (at.floor() as usize, at.ceil() as usize);
@@ -158,7 +159,7 @@ fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Mark
 fn significance(chance: Option<f64>) -> Markup {
     html! {
         @match chance {
-            None => { span .quiet { "too few to tell" } }
+            None => { span .quiet { "too few parts" } }
             Some(chance) if chance < CHANCE => { strong { "more than chance" } " (" (probability(chance)) ")" }
             Some(chance) => { "no more than chance (" (probability(chance)) ")" }
         }

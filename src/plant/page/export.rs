@@ -128,7 +128,7 @@ async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Pag
     let parts = parts(&link, &selection, MAX_PARTS).await?;
     if parts.is_empty() {
         return Err(PageError::NotHere(
-            "nothing was measured of such parts; choose others on the page of the trend".into(),
+            "no part of this selection was measured; change the selection on the page `Trend`".into(),
         ));
     }
     let figure = |value: &Value| [1e-3 * value.um, 1e-3 * value.u_um.unwrap_or(f64::NAN)];

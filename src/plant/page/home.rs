@@ -54,9 +54,9 @@ async fn made(plant: &Shared, asked: &HomeQuery) -> Result<PageContent, PageErro
             (counted.render(simulated))
             h2 #queue { "Queue" }
             (queue)
-            h2 #incidents { "What should not have been" }
+            h2 #incidents { "Incidents" }
             (incidents)
-            p .quiet { "This page looks and gives no orders. It is asked for again every " (AGAIN_S) " s. Days are those of UTC." }
+            p .quiet { "This page only shows the cells; it gives no orders. The browser reloads it every " (AGAIN_S) " s. Days are those of UTC." }
         }
     };
     Ok(PageContent { title: "Plant".into(), again_s: Some(AGAIN_S), main })
@@ -112,7 +112,7 @@ impl Counted {
                 div { (yields("Recipe", "recipe", &self.recipes)) (yields("Cell", "cell", &self.cells)) }
             }
             p .quiet {
-                "First-pass yield: accepted at the first measurement, of all that ended; the interval of 95 % is Wilson's. Only "
+                "First-pass yield: share of the ended parts that were accepted at the first measurement, with its 95 % interval (Wilson). Only "
                 @if simulated { "simulated" } @else { "real" } " parts are counted: " a href=(format!("/?parts={other}")) { "show " (other) " ones" } "."
             }
         }
@@ -133,7 +133,7 @@ fn yields(what: &str, kind: &str, counts: &[(String, Count)]) -> Markup {
         }
     };
     html! {
-        @if counts.is_empty() { p .quiet { "Nothing ended." } }
+        @if counts.is_empty() { p .quiet { "No part has ended." } }
         @else if counts.len() > OPEN { details { summary { "By " (kind) ": " (counts.len()) } div .wide { (table) } } }
         @else { div .wide { (table) } }
     }
@@ -163,7 +163,7 @@ async fn queue(link: &DatabaseLink) -> Result<Markup, PlantError> {
         }
     };
     Ok(html! {
-        @if rows.is_empty() { p .quiet { "Nothing waits to be made." } } @else {
+        @if rows.is_empty() { p .quiet { "The queue is empty." } } @else {
             div .wide { table {
                 tr { th { "Part" } th { "Recipe" } th { "For" } th { "Due" } th { "State" } }
                 @for row in &rows { (line(row)) }
@@ -178,7 +178,7 @@ async fn incidents(link: &DatabaseLink) -> Result<Markup, PlantError> {
         ORDER BY at DESC LIMIT $1";
     let rows = link.query(text, &[&INCIDENTS]).await?;
     Ok(html! {
-        @if rows.is_empty() { p .quiet { "Nothing: no broken chain, no refusal." } } @else {
+        @if rows.is_empty() { p .quiet { "No incident: no broken chain, no refusal." } } @else {
             div .wide { table {
                 tr { th { "When" } th { "By" } th { "Run" } th { "What" } th { "In words" } }
                 @for row in &rows {

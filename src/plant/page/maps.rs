@@ -41,7 +41,7 @@ struct Map {
     simulation: bool,
     pv_um: Option<f64>,
     rms_um: Option<f64>,
-    /// Samples (x, y, error), in mm, mm and µm; in words, why there are none.
+    /// Samples (x, y, error), in mm, mm and µm; otherwise a text why there are none.
     samples: Result<Vec<[f64; 3]>, String>,
 }
 
@@ -124,11 +124,11 @@ async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageErro
         simulation: row.get::<_, Option<bool>>(3) == Some(true),
         pv_um: row.get(4),
         rms_um: row.get(5),
-        samples: Err("the plant knows of none".into()),
+        samples: Err("the plant has no such map".into()),
     })
 }
 
-/// Reads a map from the files of a run; in words, why there is none.
+/// Reads a map from the files of a run. The inner `Err` is a text why there is no map.
 async fn samples(
     plant: &Shared,
     link: &DatabaseLink,
@@ -136,7 +136,7 @@ async fn samples(
     name: &str,
 ) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {
     let rows = link.query("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
-    let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
+    let [row] = &rows[..] else { return Ok(Err("its file is not on record, or several files have its name".into())) };
     let sha256: Vec<u8> = row.get(0);
     let Some(content) = content(link, plant.artefacts.as_ref(), &sha256).await? else {
         return Ok(Err("its file has not arrived yet".into()));
@@ -146,7 +146,7 @@ async fn samples(
     }
     let name = name.to_owned();
     let parsed = spawn_blocking(move || {
-        let text = String::from_utf8(content).map_err(|_| "its file is no text".to_owned())?;
+        let text = String::from_utf8(content).map_err(|_| "its file is not text".to_owned())?;
         let nodes = parse_error_map(Path::new(&name), &text).map_err(|error| error.to_string())?;
         Ok(nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect())
     });
@@ -170,8 +170,8 @@ fn side_by_side(maps: &[Map]) -> Markup {
             }
         }
         p .quiet {
-            "One scale for all: " (format!("± {limit:.2}")) " µm. Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered: PV and RMS of a map are not \
-             those that are judged. Each file is what its hash on record says."
+            "One scale for all: " (format!("± {limit:.2}")) " µm. Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered: PV and RMS of a map differ from the \
+             figures that are judged. Each file has the hash on record."
         }
     }
 }

@@ -2,8 +2,8 @@
 //! nothing.
 //!
 //! ```text
-//!  browser --GET--> door of regrind-page --> a question each page --> pool --> views of migrations/, as a reader
-//!                                        --> proofs: a run brought back, proven, and its report made of it
+//!  browser --GET--> sign-in (regrind-page) --> queries of a page --> pool --> views of migrations/, as a reader
+//!                                          --> proofs: fetch a run, verify it, and make its report
 //! ```
 //!
 //! All figures of the page are in the views, which Grafana reads too. Texts from a cell are shown as text, never as
@@ -105,7 +105,7 @@ struct PageContent {
 enum PageError {
     /// The database cannot be reached, or refuses.
     Plant(Box<PlantError>),
-    /// There is nothing of that name.
+    /// The requested object does not exist.
     NotHere(String),
     /// The request is invalid.
     Nonsense(String),
@@ -128,7 +128,7 @@ async fn page(session: &Session, making: impl Future<Output = Result<PageContent
 /// Runs a future within the time limit.
 async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result<T, PageError> {
     let late = || {
-        let what = format!("nothing came within {} s", PATIENCE.as_secs());
+        let what = format!("no answer within {} s", PATIENCE.as_secs());
         PageError::from(PlantError::Unreachable { place: "the other end".into(), what })
     };
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
@@ -137,21 +137,27 @@ async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result
 /// Renders the reason why there is no page. If the reason can pass, the browser retries.
 fn unmade(session: &Session, why: &PageError) -> Response {
     let (status, again_s, title, words) = match why {
-        PageError::Plant(error) if error.may_pass() => {
-            (StatusCode::SERVICE_UNAVAILABLE, Some(AGAIN_S), "The database of the plant is away", error.to_string())
-        }
-        PageError::Plant(error) => {
-            (StatusCode::INTERNAL_SERVER_ERROR, None, "The database of the plant says no", error.to_string())
-        }
-        PageError::NotHere(what) => (StatusCode::NOT_FOUND, None, "Not here", what.clone()),
-        PageError::Nonsense(what) => (StatusCode::BAD_REQUEST, None, "That cannot be asked", what.clone()),
+        PageError::Plant(error) if error.may_pass() => (
+            StatusCode::SERVICE_UNAVAILABLE,
+            Some(AGAIN_S),
+            "The database of the plant cannot be reached",
+            error.to_string(),
+        ),
+        PageError::Plant(error) => (
+            StatusCode::INTERNAL_SERVER_ERROR,
+            None,
+            "The database of the plant refused the request",
+            error.to_string(),
+        ),
+        PageError::NotHere(what) => (StatusCode::NOT_FOUND, None, "Not found", what.clone()),
+        PageError::Nonsense(what) => (StatusCode::BAD_REQUEST, None, "Invalid request", what.clone()),
     };
     let main = html! {
         main .list .plant {
             h1 { (title) }
             p role="alert" { (words::shown(&words)) }
             @if again_s.is_some() {
-                p { "Cells grind, hold and accept without it; their records wait at the cells. What the cells do now is not known here. "
+                p { "Cells grind, hold and accept without the database; their records wait at the cells. The present state of the cells is not known here. "
                     "This page tries again by itself every " (AGAIN_S) " s." }
             }
         }

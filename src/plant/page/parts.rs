@@ -15,7 +15,8 @@ use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of parts on a page.
 const MAX_ROWS: usize = 100;
-/// Upper bound of all texts with a given beginning: the last character of Unicode.
+/// Last character of Unicode. A beginning with this character appended is an upper bound of all texts with that
+/// beginning.
 const LAST: char = char::MAX;
 
 #[derive(Debug, Default, Deserialize)]
@@ -45,7 +46,7 @@ async fn made(plant: &Shared, asked: &PartsQuery) -> Result<PageContent, PageErr
             form .filter method="get" action="/parts" {
                 label { "Serial number begins with " input name="serial" value=(serial) autofocus; } button { "Search" }
             }
-            @if rows.is_empty() { p { "No part's serial number begins so. Capital and small letters are told apart." } } @else {
+            @if rows.is_empty() { p { "No serial number begins with this text. Capital and small letters are different." } } @else {
                 form method="get" action="/maps" {
                     div .wide { (table(&rows[..rows.len().min(MAX_ROWS)])) }
                     p { "Tick two to four: " button { "Maps side by side" } }

@@ -29,11 +29,11 @@ const ANSWER: &str = "SET statement_timeout = '60s'";
 pub(super) struct Proof {
     /// Time of the proof, UTC.
     pub(super) at: String,
-    /// Result of the verification; in words, why the copy cannot be believed.
+    /// Result of the verification; otherwise a text that says why the copy is not trustworthy.
     pub(super) found: Result<Verified, String>,
     /// Number of keys that the plant has for the cell.
     pub(super) keys: usize,
-    /// Report of the run and its QIF results; in words, why there are none.
+    /// Report of the run, and its results as QIF and as DFQ; otherwise a text why there are none.
     pub(super) report: Result<String, String>,
     pub(super) qif: Result<String, String>,
     pub(super) dfq: Result<String, String>,
@@ -85,7 +85,7 @@ pub(super) async fn proven(
     if let Some(known) = plant.proofs.known(id, head) {
         return Ok(known);
     }
-    let gone = || PlantError::Unreachable { place: "the other end".into(), what: "the page is being ended".into() };
+    let gone = || PlantError::Unreachable { place: "the other end".into(), what: "the page is closing".into() };
     let _turn = plant.proofs.turn.acquire().await.map_err(|_| gone())?;
     // Another request may have made the proof while this one waited for the lock.
     if let Some(known) = plant.proofs.known(id, head) {
@@ -121,7 +121,8 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
             found,
         }
     });
-    let failed = |_| PlantError::Unreachable { place: "this computer".into(), what: "the proof was broken off".into() };
+    let failed =
+        |_| PlantError::Unreachable { place: "this computer".into(), what: "the verification was interrupted".into() };
     made.await.map_err(failed)
 }
 

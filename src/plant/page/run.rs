@@ -58,10 +58,10 @@ impl Run {
 
 /// Parses the id of a run in an address.
 fn number(id: &str) -> Result<i32, PageError> {
-    id.parse().map_err(|_| PageError::NotHere("runs go by their numbers here, as in /runs/17".into()))
+    id.parse().map_err(|_| PageError::NotHere("give the number of a run, as in /runs/17".into()))
 }
 
-/// A run by the names that a cell knows it by.
+/// Query of `/run`: the name of a cell, and the name of one of its runs.
 #[derive(Debug, Deserialize)]
 pub(super) struct Named {
     cell: String,
@@ -77,7 +77,7 @@ pub(super) async fn by_name(
         let link = plant.lease().await?;
         let [cell, name] = [cell, name].map(|text| text.replace('\0', ""));
         let rows = link.query("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
-        let missing = || PageError::NotHere(format!("the plant has nothing of the run {name} of {cell} yet"));
+        let missing = || PageError::NotHere(format!("the plant has no record of the run {name} of {cell} yet"));
         rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
     };
     match super::within(found).await {
@@ -147,23 +147,23 @@ fn about(run: &Run) -> Markup {
             dt { "Alarms" } dd { (run.row.get::<_, Option<i32>>(18).map_or("not told".to_owned(), |n| n.to_string())) }
             dt { "Run" } dd .id { (shown(&run.name)) }
         }
-        p .quiet { "As the cell told it; what its record says stands in the report." }
+        p .quiet { "As reported by the cell; the report shows the content of the record." }
     }
 }
 
 /// Describes the proof in words.
 fn proof_text(proof: Option<&Proof>) -> Markup {
     let Some(proof) = proof else {
-        return html! { p role="status" { "It is being brought together and proven; this page shows what comes of it by itself." } };
+        return html! { p role="status" { "The copy is being fetched and verified; this page then shows the result by itself." } };
     };
     html! {
         @match &proof.found {
             Ok(found) => {
-                p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " files that are what was written"
+                p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
                     @if found.signed == 0 { "; not signed" }
-                    @else if proof.keys == 0 { "; signed up to record " (found.signed) ", by a key that the plant was not told" }
+                    @else if proof.keys == 0 { "; signed up to record " (found.signed) " by a key that the plant does not know" }
                     @else { "; signed up to record " (found.signed) " by a key that the plant knows of the cell" }
-                    @if found.closed { "." } @else { ". The run has no end on record: it goes on, or it was cut before that arrived." }
+                    @if found.closed { "." } @else { ". The run has no recorded end: it is still active, or its record was cut before the end arrived." }
                 }
             }
             Err(why) => {
@@ -195,7 +195,7 @@ async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
     let rows = link.query(text, &[&id]).await?;
     let limits = rows.last().map(|row| [row.get::<_, Option<f64>>(8), row.get(9)]);
     Ok(html! {
-        @if rows.is_empty() { p .quiet { "No cycle was told of yet." } } @else {
+        @if rows.is_empty() { p .quiet { "No cycle is reported yet." } } @else {
             div .wide { table {
                 tr { th .n { "Cycle" } th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th .n { "expected PV" } th { "Judged" } }
                 @for row in &rows {
@@ -212,7 +212,7 @@ async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
                     tr .limit { td .n { "allowed" } td .n { (um(pv, 2)) } td {} td .n { (um(rms, 3)) } td {} td {} td {} }
                 }
             } }
-            p .quiet { "U: expanded uncertainty, k = 2. Expected: what the correction made from the cycle was expected to leave." }
+            p .quiet { "U: expanded uncertainty, k = 2. Expected: PV that was predicted to remain after the correction from this cycle." }
         }
     })
 }
@@ -225,7 +225,7 @@ async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }
 
-/// Returns the proof of a run, however long it takes.
+/// Returns a run and its proof. Waits until the proof is made.
 async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), PageError> {
     let run = {
         let link = plant.lease().await?;
@@ -296,7 +296,7 @@ pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response 
         .into_response()
 }
 
-/// Returns the answer for a copy that cannot be believed, from which no document is made.
+/// Returns the response (status 422) for a document that cannot be made from the plant's copy, with the reason.
 fn not_made(session: &Session, why: &str) -> Response {
     let mut response = unmade(session, &PageError::NotHere(why.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;

@@ -92,7 +92,8 @@ impl Selection {
         &self.names[0]
     }
 
-    /// Returns the query of an address for this selection. The query means the same tomorrow, except for the days.
+    /// Returns the query of an address for this selection. It states both days and all filters, so it still selects the
+    /// same parts when the defaults change.
     pub(super) fn query(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|((kind, _), name)| *kind == "recipe" || !name.is_empty());
         let mut query: Vec<String> = named.map(|((kind, _), name)| format!("{kind}={}", encoded(name))).collect();

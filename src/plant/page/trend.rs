@@ -42,7 +42,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
             (form)
             p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MAX_PARTS { ", the newest" } "." }
             @if selection.recipe().is_empty() {
-                p .no { "Parts of several recipes are in one chart: limits of such a chart tell nothing. Choose a recipe." }
+                p .no { "Parts of several recipes are in one chart, so its control limits have no meaning. Choose a recipe." }
             }
             (charts(&parts))
             p {
@@ -86,15 +86,15 @@ fn charts(parts: &[Part]) -> Markup {
     let pv: Vec<Value> = parts.iter().map(|part| part.pv.clone()).collect();
     let rms: Vec<Value> = parts.iter().filter_map(|part| part.rms.clone()).collect();
     html! {
-        @if pv.len() < 2 { p { "There is too little to draw: two parts at least are needed." } }
+        @if pv.len() < 2 { p { "There are too few parts for a chart: at least two are needed." } }
         @else if pv.len() < ENOUGH {
-            p .no { "Limits of " (pv.len()) " parts are preliminary: below " (ENOUGH) " they move a good deal with every further part." }
+            p .no { "Limits of " (pv.len()) " parts are preliminary: below " (ENOUGH) " they change much with each further part." }
         }
         (figure("PV", "pv", &pv))
         (figure("RMS", "rms", &rms))
         p .quiet {
-            "Limits: mean ± 2.660 times the mean moving range; of the range 3.267 times its mean, of all parts that are drawn. A point that is out of them is a triangle. \
-             Where the lower limit would lie below 0 there is none. The dotted line is what the recipe allows; it does not move the limits."
+            "Limits: mean ± 2.660 times the mean moving range; limit of the range: 3.267 times its mean; from all parts of the chart. A triangle marks a point outside the limits. \
+             There is no lower limit if it would be below 0. The dotted line is the tolerance of the recipe; it has no effect on the limits."
         }
     }
 }

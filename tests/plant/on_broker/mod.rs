@@ -130,7 +130,9 @@ fn sparkplug_values_and_refused_commands() {
     told.host.does(&json!({ "name": "Status/StateCurrent", "type": "UINT32", "value": 2 }));
     told.host.does(&json!({ "name": "Hold", "type": "BOOLEAN", "value": true, "device": "cell" }));
     told.host.does(&json!({ "raw": "ff00ff" }));
-    for refused in ["NCMD: Status/StateCurrent = 2", "DCMD: Hold = true", "NCMD: what is no command of Sparkplug B"] {
+    for refused in
+        ["NCMD: Status/StateCurrent = 2", "DCMD: Hold = true", "NCMD: a message that is not a Sparkplug B command"]
+    {
         teller.line(refused, |line| line.contains("\"refused\"") && line.contains(refused));
         let station = until_recorded(&mut running, &folder, refused);
         assert!(station.contains("somebody at the broker 127.0.0.1"), "{station}");
@@ -285,7 +287,7 @@ fn broker_certificate_is_verified() {
     let readable = |mode| fs::set_permissions(home.path().join("password"), fs::Permissions::from_mode(mode)).unwrap();
 
     plant("broker = \"plant.example\"\n");
-    refused("plant.example is another computer, and nothing says by which certificates it proves itself");
+    refused("plant.example is another computer, and no certificates to authenticate it are given");
     plant("broker = \"localhost\"\ncertificates = \"its.pem\"\n");
     readable(0o644);
     refused("other users of this computer may read the password");

@@ -48,7 +48,7 @@ fn plant_restored_from_backup() {
         fs::write(plant.path(file), text.replace(&from, &to)).unwrap();
     }
     plant.postgres.kill();
-    assert!(plant.does(&["plant", "init", "--plant", "owner.toml"]).contains("as it was"));
+    assert!(plant.does(&["plant", "init", "--plant", "owner.toml"]).contains("unchanged"));
     plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);

@@ -68,7 +68,7 @@ fn plant_guide_walked_through() {
     let shown = [
         "layout",
         "cell-4 signs in as cell_4",
-        "they stand in the journal here",
+        "the local journal contains these records",
         "SN-0001",
         "to be signed by two people",
     ];

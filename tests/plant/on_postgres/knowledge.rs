@@ -55,7 +55,7 @@ fn second_cell_starts_from_learned_error() {
     let (mut plant, taught_by) = taught();
     // The similarity of the machines is unknown. In that case the learned form has no weight, and does no harm.
     let (alone, said) = made(&plant, "cell-2", "2");
-    assert!(said.contains(&format!("form knowledge from cell-1 (run {taught_by})")), "{said}");
+    assert!(said.contains(&format!("form statistics that cell-1 (run {taught_by}) learned")), "{said}");
     assert!(said.contains("unknown") && said.contains("machines_differ"), "{said}");
     fs::rename(plant.path("cell-2"), plant.path("aside")).unwrap();
     let alone = plant.path("aside").join(alone.file_name().unwrap());
@@ -85,7 +85,7 @@ fn second_cell_starts_from_learned_error() {
     fs::rename(plant.path("cell-2"), plant.path("aside-2")).unwrap();
     plant.postgres.kill();
     let (_, said) = made(&plant, "cell-2", "2");
-    assert!(said.contains("the plant does not tell what other cells have learned"), "{said}");
+    assert!(said.contains("the plant sends no learned results of other cells"), "{said}");
     assert!(said.contains("begins without knowledge"), "{said}");
 }
 

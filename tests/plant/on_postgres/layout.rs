@@ -7,14 +7,14 @@ use crate::Plant;
 fn unknown_database_layout_refused() {
     let plant = Plant::new();
     let init = ["plant", "init", "--plant", "owner.toml"];
-    assert!(plant.does(&init).contains("as it was"));
+    assert!(plant.does(&init).contains("unchanged"));
     plant.cell("cell-1", &[]);
     let ship = ["ship", "--once", "--plant", "cell-1.toml"];
     plant.sql("INSERT INTO migration (version, sha256) VALUES (99, 'x')");
     for arguments in [&init, &ship] {
         let (_, told) = plant.ends(arguments, 2);
         assert!(
-            told.contains("the layout of Regrind 99")
+            told.contains("the database has layout 99")
                 && told.contains("use the version of Regrind that made this layout"),
             "{told}"
         );
@@ -49,7 +49,7 @@ fn connection_errors_name_remedy() {
     wrong(("user = ", "usher = "), 2, "usher");
     wrong(("[database]", "[database]\nname = \"other\""), 2, "check name, user and password");
     let socket = format!("host = \"{}\"", plant.postgres.socket().display());
-    wrong((&socket, "host = \"plant.example\""), 2, "nothing says by which certificates it proves itself");
+    wrong((&socket, "host = \"plant.example\""), 2, "no certificates to authenticate it are given");
     wrong((&socket, "host = \"/nowhere\""), 3, "cannot be reached");
     std::fs::write(plant.path("cell-1.toml"), &file).unwrap();
     std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o644))

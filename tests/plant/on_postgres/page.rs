@@ -248,7 +248,7 @@ fn trend_control_limits_and_export() {
     let said = words(&shown.text("/trend?at=first&cell=cell-1&recipe=mirror"));
     assert!(said.contains("mean 60.810 µm, limits 55.815 and 65.805 µm"), "{said}");
     let said = words(&shown.text("/trend?recipe=lens"));
-    assert!(said.contains(": 1 part.") && said.contains("too little to draw"), "{said}");
+    assert!(said.contains(": 1 part.") && said.contains("too few parts for a chart"), "{said}");
     let said = words(&shown.text("/trend?recipe="));
     assert!(said.contains("Parts of several recipes"), "{said}");
     for (name, value) in
@@ -448,7 +448,7 @@ fn until_proven(shown: &ServedPage, path: &str) -> String {
     let began = Instant::now();
     loop {
         let html = shown.text(path);
-        if !html.contains("being brought together") {
+        if !html.contains("being fetched and verified") {
             return html;
         }
         assert!(began.elapsed() < PATIENCE, "never: {html}");
@@ -471,7 +471,7 @@ fn page_recovers_from_lost_database() {
             let said = words(&answer.text());
             assert_eq!(answer.status, 503, "{path}: {said}");
             assert!(
-                said.contains("The database of the plant is away") && said.contains("not known here"),
+                said.contains("The database of the plant cannot be reached") && said.contains("not known here"),
                 "{path}: {said}"
             );
             assert!(answer.text().contains("http-equiv=\"refresh\" content=\"5\""), "{path}");

@@ -81,7 +81,7 @@ fn run_replicated_verified_and_fetched() {
 
     // The copy is evidence alone, and together with the journal of the cell.
     let both = plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
-    assert!(both.contains("they stand in the journal here") && both.contains("sound       "), "{both}");
+    assert!(both.contains("the local journal contains these records") && both.contains("sound       "), "{both}");
     let told: Value =
         serde_json::from_str(&plant.does(&["audit", "verify", "--plant", "cell-1.toml", "--json"])).unwrap();
     assert!(

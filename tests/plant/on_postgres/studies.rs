@@ -86,7 +86,7 @@ fn study_runs_match_their_seeds() {
         "{told}"
     );
     assert!(lines[2].contains("100.0 % (34.2 to 100.0)") && lines[2].contains("0 of 2"), "{told}");
-    assert!(plant.does(&["study", "stop", "limits", "--plant", "planner.toml"]).contains("no more jobs"));
+    assert!(plant.does(&["study", "stop", "limits", "--plant", "planner.toml"]).contains("no further jobs"));
     plant.ends(&["study", "stop", "limits", "--plant", "planner.toml"], 1);
     plant.ends(&["study", "show", "none", "--plant", "planner.toml"], 1);
 }

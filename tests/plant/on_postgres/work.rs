@@ -62,7 +62,8 @@ fn queue_runs_parts_by_due_date() {
     // By serial number on the command line, by typed input, and by wrong typed input.
     let said = plant.does(&["work", "--plant", "cell-1.toml", "--part", "SN-0", "--once"]);
     assert!(said.contains("by version 1 of small, signed by Ada and Bob, due 2026-12-01"), "{said}");
-    for (typed, does, ends) in [("SN-2", "it is given back", 1), ("", "it is given back", 1), ("SN-1", "record in", 0)]
+    for (typed, does, ends) in
+        [("SN-2", "the part is given back", 1), ("", "the part is given back", 1), ("SN-1", "record in", 0)]
     {
         let mut command = regrind(&["work", "--plant", "cell-1.toml", "--once"], plant.home.path());
         command.stdin(Stdio::piped());
@@ -197,7 +198,7 @@ fn expired_lease_is_refused() {
     // The cell died before the run began: it takes no more parts until a person has checked.
     let make = ["work", "--plant", "cell-2.toml", "--part", "SN-1", "--once"];
     let (_, told) = plant.ends(&make, 1);
-    assert!(told.contains("SN-1 was begun in run run-1, of which there is no record in runs"), "{told}");
+    assert!(told.contains("SN-1 was begun in run run-1, which has no record in runs"), "{told}");
     plant.ends(&["work", "--plant", "cell-1.toml", "--give-back", "SN-1"], 1);
     plant.does(&["work", "--plant", "cell-2.toml", "--give-back", "SN-1"]);
     plant.does(&make);
@@ -247,7 +248,7 @@ fn dead_run_does_not_block_queue() {
     // No request was sent to a machine: the part is unchanged.
     begun_and_died(&plant, "run-1", 0);
     let (_, told) = plant.ends(&make, 1);
-    assert!(told.contains("nothing was asked of a machine") && told.contains("--give-back SN-1"), "{told}");
+    assert!(told.contains("sent no request to a machine") && told.contains("--give-back SN-1"), "{told}");
     plant.does(&back);
     assert_eq!(work(&plant)[0]["state"], "open");
     // A request was sent: the part belongs to this run for good. A planner decides whether it is made again.
