@@ -32,7 +32,7 @@ its record.
 
 A run whose program has ended without an end in its record (a crash, a power failure) is resumed in this terminal. The
 record is verified and replayed without any command, the machines are asked for the state of their jobs, and the cell
-goes to Held, \"the program was started again\". Then inspect the machines, and give the same command in another
+goes to Held, \"The program was restarted during the run\". Then inspect the machines, and give the same command in another
 terminal: the run continues. If the folder shows that records were lost (the log of the database or journal.anchor is
 missing or damaged), the run resumes only with --despite-loss, which confirms that you have inspected both machines.
 Otherwise bring the machines to idle with `regrind recover`.

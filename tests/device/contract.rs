@@ -295,7 +295,7 @@ async fn modbus_page_frames_match_wire() {
 }
 
 /// Prints the long frames of one job, in the format of the page (`REGRIND_VECTORS=1 cargo test --test device
-/// the_frames_of_the_page -- --nocapture`).
+/// modbus_page_frames_match_wire -- --nocapture`).
 fn print_vectors(order: &str, sent: &[Vec<u8>]) {
     let word = |frame: &[u8], at: usize| u16::from_be_bytes([frame[at], frame[at + 1]]);
     let is_write = |frame: &&Vec<u8>, address: u16, registers: u16| {
