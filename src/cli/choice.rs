@@ -74,7 +74,7 @@ mod tests {
     fn possible_values_match_enum() {
         let words = words::<Loss>();
         assert_eq!(words.iter().map(PossibleValue::get_name).collect::<Vec<_>>(), ["none", "huber", "tukey"]);
-        assert!(words.iter().all(|word| word.get_help().is_some_and(|help| help.to_string().starts_with("As "))));
+        assert!(words.iter().all(|word| word.get_help().is_some_and(|help| !help.to_string().is_empty())));
         assert_eq!(super::words::<Coordinate>().len(), 6);
         assert_eq!(read::<Loss>("huber"), Ok(Loss::Huber));
         assert_eq!(read::<ProbeSide>("opposite"), Ok(ProbeSide::Below), "another name of the same");

@@ -176,7 +176,7 @@ fn wrong_passwords_are_throttled() {
     let came_in = told.lines().filter(|line| line.starts_with("page: engineer (engineer) signed in at the page, from"));
     assert_eq!(came_in.count(), 1, "{told}");
     assert!(told.contains("page: refused a wrong name or password, operator, from"), "{told}");
-    assert!(told.contains("page: more was refused within the same minute"), "{told}");
+    assert!(told.contains("page: further refusals within this minute are counted"), "{told}");
 }
 
 #[test]
