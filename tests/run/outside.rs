@@ -296,7 +296,7 @@ fn init_prompts_at_terminal() {
     keys.write_all(b"shop\nseven\n2\nlens 7\n").unwrap();
     let code = running.end().0;
     let said = running.output_lines.join("\n");
-    assert!(code == 0 && said.contains("made shop:"), "{said}");
+    assert!(code == 0 && said.contains("created shop:"), "{said}");
     let texts =
         ["recipe.toml", "cell.toml"].map(|file| fs::read_to_string(home.path().join("shop").join(file)).unwrap());
     assert!(texts[0].contains("name = \"lens 7\"") && texts[1].contains("modbus-tcp"), "{texts:?}");

@@ -261,7 +261,7 @@ fn report_of_stopped_run() {
     assert_eq!(page.verdict(), (format!("STOPPED: {}", ending["reason"].as_str().unwrap()), false));
     let orders = page.rows("orders");
     let stop = orders.last().unwrap();
-    assert!(stop[1].starts_with("Ada at ") && stop[2] == "stop, SIGTERM" && stop[3] == "taken", "{orders:?}");
+    assert!(stop[1].starts_with("Ada at ") && stop[2] == "stop, SIGTERM" && stop[3] == "accepted", "{orders:?}");
     let cycles = page.cycles();
     assert!(cycles.len() == 1 && cycles[0].join("|").contains("not measured"), "{cycles:?}");
     // The amount ground is the last value that the grinder reported.
@@ -291,7 +291,7 @@ fn report_of_aborted_run() {
     let orders = page.rows("orders");
     let [.., resume, abort] = orders.as_slice() else { panic!("{orders:?}") };
     assert!(resume[2] == "resume, too early" && resume[3].starts_with("refused: "), "{orders:?}");
-    assert!(abort[2] == "abort, smoke" && abort[3] == "taken", "{orders:?}");
+    assert!(abort[2] == "abort, smoke" && abort[3] == "accepted", "{orders:?}");
 }
 
 /// Record that this test writes as a drive writes it: events, commands with an answer as intents, and all others as
