@@ -259,7 +259,7 @@ fn dead_run_does_not_block_queue() {
         "{told}"
     );
     let (_, told) = plant.ends(&back, 1);
-    assert!(told.contains("run run-2 of SN-1 is here"), "{told}");
+    assert!(told.contains("run run-2 of SN-1 has a record here"), "{told}");
     let said = plant.asked_by("cell-1", "SELECT give_back_work(1, 'run-2', 'why')").unwrap();
     assert!(said.contains("something was asked of a machine"), "{said}");
     plant.does(&up);
