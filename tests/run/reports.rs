@@ -268,7 +268,7 @@ fn report_of_stopped_run() {
     let mut told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
     let last = told.rfind(|event| event["device"] == "grinder").expect("a pass that moves tells how far it is");
     let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
-    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of its path had been ground")), "{last}");
+    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of its path was ground")), "{last}");
 }
 
 #[test]
