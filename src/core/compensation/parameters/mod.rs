@@ -1,6 +1,7 @@
 //! Parameters of the machine estimated from the deviations: wheel radius, setting of the wheel, tilt of the part,
 //! wear along the path.
 //!
+//! ```text
 //!  contacts --columns--> motions | slides | parameters --GLS--> value +- U --tolerance--> compensated --> next pass
 //!                           (nuisance)     (with a field)                     \-- beyond it: a person decides
 //! ```
