@@ -1,6 +1,7 @@
 //! Tool path of the wheel over the target surface: tracks over the part, positions of the wheel's centre along the
 //! tracks, and the checks that a path must pass before a program is written from it.
 //!
+//! ```text
 //!  Nominal --nominal_height_field--> HeightField --+
 //!                                                  +-- TargetSurface --ToolPath--> Moves --> program
 //!  Correction --correction_spline--> HeightField --+       Wheel -------/     \--> PathSummary, checked against limits
