@@ -246,7 +246,7 @@ fn form_in_words(form: &Form) -> String {
     let few = match form.is_underdetermined {
         true => format!(
             "warning     {} degrees of freedom are too few to separate the form from the noise, 20 are enough: the upper limits assume that the whole \
-             deviation is form; measure more points\n",
+             deviation is form, and they include the form that the pose can have absorbed; measure more points\n",
             form.degrees_of_freedom
         ),
         false => String::new(),

@@ -54,7 +54,8 @@ pub struct Form {
     /// Number of points from which the field is estimated, minus the number of fixed effects.
     pub degrees_of_freedom: f64,
     /// True if the degrees of freedom are too few to separate the form from the noise, and the noise of the probe is
-    /// unknown. The upper bounds then assume that the deviations are entirely form.
+    /// unknown. The upper bounds then assume that the deviations are entirely form, and include the form that the pose
+    /// absorbed.
     pub is_underdetermined: bool,
 }
 
@@ -617,6 +618,18 @@ fn best_fit_covariance(
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
 
+/// Returns a matrix B for which B z, with standard normal numbers z, is a sample of the motion by which the best fit
+/// follows the form of the part.
+///
+/// B B' = A+ K A+', with the symbols of [`best_fit_covariance`].
+fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatrix<f64> {
+    let rows = &observed.fixed_effects;
+    let weights = rows * inverse_of_products(rows);
+    let (covered, _) = posterior.mean_covariance(&posterior.fields.sums(&weights));
+    let SymmetricEigen { eigenvalues, eigenvectors } = covered.symmetric_eigen();
+    eigenvectors * DMatrix::from_diagonal(&eigenvalues.map(|value| value.max(0.0).sqrt()))
+}
+
 /// Returns (H'H)^-1 of the effects H.
 fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
     let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
@@ -627,7 +640,7 @@ fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
 pub(super) struct SampledForms {
     /// Samples of the posterior, and samples of fields with the second variance factor, which bound the extremes.
     pub(super) forms: [DMatrix<f64>; 2],
-    /// Samples that count the measured deviations entirely as form. None unless the points are too few to separate form
+    /// Samples that count the measured deviations entirely as form, with the form that the pose absorbed. None unless the points are too few to separate form
     /// from noise, and the noise of the probe is unknown.
     all_form: Option<DMatrix<f64>>,
     pub(super) places: Vec<[f64; 2]>,
@@ -769,6 +782,15 @@ impl SampledForms {
                 let scatter_mm = self.noise_mm[c];
                 form.iter_mut().zip(found).for_each(|(value, of)| *value = larger * of + scatter_mm * normals.next());
             }
+            // The pose takes most of a wide form away from so few points. The best fit removes only the noise here, so
+            // the form that the pose absorbed is added after it.
+            let mut all = without_best_fit(all, &self.effects);
+            let factor = absorbed_form_factor(observed, posterior);
+            for (c, mut form) in all.column_iter_mut().enumerate() {
+                let mut normals = NormalGenerator::new(9, c as u64);
+                let numbers = DVector::from_fn(factor.ncols(), |_, _| normals.next());
+                form += &self.effects * (&factor * numbers);
+            }
             self.all_form = Some(all);
         }
         let Self { forms, noise_mm: scatter_mm, truncated_mm: narrow_mm, .. } = &mut self;
@@ -886,9 +908,6 @@ impl SampledForms {
             taken
         };
         let taken = self.forms.each_mut().map(fit);
-        self.all_form.iter_mut().for_each(|all| {
-            fit(all);
-        });
         if let Some(IntermediateForms { forms, effects, .. }) = &mut self.intermediate {
             for (forms, taken) in forms.iter_mut().zip(&taken) {
                 // The points determine every motion that the registration was free to make, so the factor is

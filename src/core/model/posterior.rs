@@ -50,7 +50,7 @@ pub(super) type NoisePrior = Option<[f64; 2]>;
 
 /// Field hypotheses with their probabilities.
 pub(super) struct Posterior<'f> {
-    fields: &'f FieldHypotheses,
+    pub(super) fields: &'f FieldHypotheses,
     observed: &'f Observations,
     probe: NoisePrior,
     /// Projections U' of the deviations and of the random effects, for each node.
