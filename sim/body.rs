@@ -91,35 +91,38 @@ pub trait Physics: Send {
     fn kind(&self) -> Kind;
     /// Returns the name and serial number of the machine, at most 32 ASCII characters.
     fn name(&self) -> String;
-    /// Checks a payload that has just arrived, before it comes into force.
+    /// Checks a payload after its arrival, before the machine uses it. `kind` is its number in docs/modbus.md: 1 plan,
+    /// 2 map, 3 pass.
     ///
     /// # Errors
-    /// The payload is broken, of another part, or beyond the machine's limits.
+    /// The payload is broken, of another part, or beyond the limits of the machine.
     fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal>;
-    /// Prepares a job with the payloads in force.
+    /// Prepares a job and its cycle with the `payloads` in force, and returns the progress before the start.
     ///
     /// # Errors
     /// A payload is missing, or the payloads do not fit together.
     fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal>;
-    /// Begins the prepared job.
+    /// Begins to carry out the prepared job.
     fn begin(&mut self);
-    /// Advances by some seconds of the machine's own time.
+    /// Advances the running job by `seconds` of simulated time, and returns its progress.
     fn advance(&mut self, seconds: f64) -> Progress;
-    /// Moves clear of the part; the job can then continue with `advance` or end with `outcome`.
+    /// Moves the wheel or the probe clear of the part. The job can then continue with [`Physics::advance`] or end with
+    /// [`Physics::end_job`].
     fn retract(&mut self);
-    /// Returns true if [`Physics::partial_result`] is supported.
+    /// Returns true if [`Physics::partial_result`] can return a result.
     fn has_partial_result(&self) -> bool {
         false
     }
-    /// Returns the part of the result that will not change any more while the job runs; `None` if the machine gives its
-    /// result only at the end.
+    /// Returns the part of the result that will not change any more while the job runs. Returns `None` if the machine
+    /// gives a result only after the end of the job.
     fn partial_result(&self) -> Option<ResultData> {
         None
     }
     /// Ends the job as complete (1), stopped (2), aborted (3) or failed (4), and returns its result.
     fn end_job(&mut self, result: u16) -> ResultData;
-    /// Returns the interlock bits of docs/modbus.md, including bit 1, clear of the part.
+    /// Returns the interlock bits of the machine, as docs/modbus.md numbers them. Bit 1 means that the wheel or the
+    /// probe is clear of the part.
     fn interlocks(&self) -> u16;
-    /// Returns the temperature in the status block, in °C.
+    /// Returns the temperature in °C that the machine reports in its status block.
     fn temperature_c(&self) -> f64;
 }

@@ -31,12 +31,16 @@ use crate::{Rng, Vec3};
 pub const COUNT_MM: f64 = 1e-6;
 
 impl CmmSpec {
-    /// Returns the ratio of the part's size to its size on the drawing.
+    /// Returns the thermal expansion of the part as a ratio: its size at its temperature, divided by its size on the
+    /// drawing.
     fn growth(&self) -> f64 {
         1.0 + self.cte_per_k * (self.part_temperature_c - REFERENCE_C)
     }
 
-    /// Refuses a plan that moves the probe beyond its travel.
+    /// Checks that the probe can reach every position of a plan.
+    ///
+    /// # Errors
+    /// A position is outside the travel of the machine.
     fn check_travel(&self, plan: &Plan) -> Result<(), Refusal> {
         let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
         let travel_mm = highest + plan.safe_height_mm;
@@ -61,8 +65,8 @@ impl CmmSpec {
     }
 }
 
-/// Returns the path of the centre of a ball with radius `radius_mm` to a target. The machine controls its motion with
-/// the stated radius of the plan.
+/// Returns the path of the probe's centre to a target. `radius_mm` is the true radius of the probe ball. Begin and end
+/// of the path use the radius that the plan states, because the machine knows only that one.
 fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
@@ -123,8 +127,8 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns the time in s at which the touch of each target is finished, travel included. The first targets take
-    /// longer if the plan requires it.
+    /// Returns, for each target of a plan, the time in s from the start of the job to the end of its touch, travel
+    /// included. If the plan has a careful start, its first targets take longer.
     fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
         let (slowly, speed_mm_s) = plan.careful;
         let each_s = |k: usize| {
@@ -147,7 +151,7 @@ impl Run {
         self.records.len() == self.plan.targets.len()
     }
 
-    /// Returns the points measured so far as a result of the machine.
+    /// Returns the points measured so far, as the result data that the machine sends.
     fn to_result(&self, state: &WorldState) -> ResultData {
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
         let scale = spec.scaled_points.then_some(COUNT_MM);
@@ -164,7 +168,8 @@ impl Run {
         }
     }
 
-    /// Touches one target.
+    /// Touches one target and returns its record, with the noise, outliers and faults of the machine. If there was no
+    /// contact, the status in the record gives the reason.
     fn measure(&mut self, state: &WorldState, target: &Target) -> PointRecord {
         let spec = &state.spec.cmm;
         let shift = self.disturbance(spec);
@@ -187,7 +192,7 @@ impl Run {
         }
     }
 
-    /// Computes the contact in the machine's frame.
+    /// Computes where the probe ball touches a target, in the machine's frame and without noise.
     fn contact(&self, state: &WorldState, target: &Target) -> Contact {
         let spec = &state.spec.cmm;
         let in_machine = approach_to(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
@@ -216,8 +221,8 @@ impl Run {
         }
     }
 
-    /// Draws the noise and the outlier of a touch. The number of drawn random numbers does not depend on whether the
-    /// touch is an outlier.
+    /// Draws the error of one touch, in mm: Gaussian noise and sometimes an outlier. Every call draws the same number
+    /// of random numbers, with and without an outlier.
     fn disturbance(&mut self, spec: &CmmSpec) -> Vec3 {
         let normal = |rng: &mut Rng| -> f64 { StandardNormal.sample(rng) };
         let noise: Vec3 = std::array::from_fn(|_| 1e-3 * spec.noise_um * normal(&mut self.noise));
@@ -236,7 +241,8 @@ fn untouched(target: &Target, status: Status) -> PointRecord {
     PointRecord { index: target.index, status, quality: 100, position_mm: [0.0; 3] }
 }
 
-/// Returns the position that this machine, with its faults, reports for a centre.
+/// Returns the position that the machine reports when the ball's centre is at `centre_mm`. Configured faults can change
+/// it to the contact point (at the distance `stated_radius_mm` from the centre), to inches, or to a mirrored y.
 fn reported(faults: &WorldFaults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
     let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
     let unit = if faults.inches { 25.4 } else { 1.0 };
@@ -295,8 +301,9 @@ impl TouchProbe {
         locked(&self.world).spec.cmm.seconds_per_point
     }
 
-    /// Touches the part at a point, along its normal. The last argument is the probe radius, the approach and the
-    /// search distance in mm. The first touch after the part was away begins a new measurement.
+    /// Touches the part at `point_mm` along `normal`. The array holds the probe radius, the approach distance and the
+    /// search distance, in mm. If the part has left the CMM since the last touch, this touch begins a new measurement.
+    /// If the grinder has the part, the result is unexpected contact.
     pub fn touch(
         &mut self,
         point_mm: Vec3,
@@ -337,7 +344,7 @@ impl TouchProbe {
         }
     }
 
-    /// Moves the probe clear of the part, so that the other machine can take the part.
+    /// Moves the probe clear of the part, so that the grinder can take the part.
     pub fn release_part(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }
@@ -470,7 +477,7 @@ impl Physics for Cmm {
 }
 
 impl Drop for Cmm {
-    /// Releases the part.
+    /// Releases the part, so that the grinder can take it.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }

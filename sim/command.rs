@@ -69,7 +69,7 @@ impl Command {
         Self::Release,
     ];
 
-    /// Returns the command with a number.
+    /// Returns the command with this number in docs/modbus.md, or `None` if there is none.
     pub fn from_number(number: u16) -> Option<Self> {
         Self::ALL.get(usize::from(number).checked_sub(1)?).copied()
     }
@@ -134,7 +134,7 @@ pub struct CommandFrame {
 }
 
 impl CommandFrame {
-    /// Returns the 20 registers.
+    /// Encodes the command, with its CRC, as the 20 registers of the command block in docs/modbus.md.
     pub fn registers(&self, order: WordOrder) -> Vec<u16> {
         let mut words = RegisterBlock::new(order, 20)
             .u32(0, self.sequence)
@@ -152,8 +152,8 @@ impl CommandFrame {
         words
     }
 
-    /// Reads the 20 registers. Returns `None` if the CRC is wrong, the two copies of the sequence number differ, or the
-    /// sequence number is 0.
+    /// Decodes the 20 registers of the command block. Returns `None` if the CRC is wrong, the two copies of the
+    /// sequence number differ, or the sequence number is 0.
     pub fn read(order: WordOrder, words: &[u16; 20]) -> Option<Self> {
         let u32_at = |at: usize| order.to_u32([words[at], words[at + 1]]);
         let sound = words[16] == crc16(&bytes_of(&words[..16])) && u32_at(0) == u32_at(18) && u32_at(0) != 0;

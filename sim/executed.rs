@@ -111,7 +111,8 @@ impl Wheel {
         })
     }
 
-    /// Moves the wheel: position of its centre in the frame of the part, and time by the controller's clock.
+    /// Moves the wheel's centre to `place_mm`, in the frame of the part, at the time `seconds` of the controller's
+    /// clock. The first call, and the first one after an unknown position, only sets the start position.
     pub fn move_to(&mut self, place_mm: Vec3, seconds: f64) {
         let Some((from_mm, then)) = self.last.replace((place_mm, seconds)) else { return };
         if from_mm == place_mm {
@@ -125,22 +126,23 @@ impl Wheel {
         }
     }
 
-    /// Handles an unknown position, for example before homing or after power-off: the wheel counts as lifted off the
-    /// part.
+    /// Marks the position of the wheel as unknown, for example before homing or after power-off. The wheel then counts
+    /// as lifted off the part.
     pub fn set_position_unknown(&mut self) {
         self.last = None;
         let world = Arc::clone(&self.world);
         self.lift_off(&mut locked(&world));
     }
 
-    /// Handles a lost part of the path: the state of the part is then unknown.
+    /// Handles a gap in the reported path. The state of the part is unknown from then on, and the wheel counts as
+    /// lifted off.
     pub fn path_lost(&mut self) {
         self.set_position_unknown();
         locked(&self.world).part_unknown = true;
     }
 
-    /// Grinds the waiting track as a track without a successor. Does nothing while the wheel is at the part, because
-    /// its present track is the successor.
+    /// Grinds the waiting track: the last complete track, whose width depends on the next track. Treats it as the last
+    /// track of the pass. Does nothing while the wheel is at the part, because the present track is then the next one.
     pub fn finish_waiting_track(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
@@ -149,7 +151,9 @@ impl Wheel {
         }
     }
 
-    /// Projects the wheel's centre onto the part. Returns `None` if the wheel is not near the part.
+    /// Projects the wheel's centre onto the nominal surface, with the lag and the radius error of the grinder.
+    /// `from_mm` and `place_mm` are the previous and the present commanded position, `then` and `seconds` their times
+    /// in s. Returns `None` if the wheel is not near the part or the projection fails.
     fn project(
         &mut self,
         state: &mut WorldState,
@@ -227,7 +231,8 @@ impl Wheel {
         state.executed_passes.push(ExecutedPass::default());
     }
 
-    /// Ends the track after the wheel has lifted off or turned back, and grinds the track before it.
+    /// Ends the present track after the wheel has lifted off or turned back. Grinds the waiting track, which is the
+    /// track before, and makes the present track the waiting one.
     fn end_track(&mut self, state: &mut WorldState) {
         let feet = std::mem::take(&mut self.projections);
         let [half_x, half_y] = state.part.aperture.half_mm();
@@ -243,7 +248,8 @@ impl Wheel {
         }
     }
 
-    /// Grinds the strip of the waiting track, which reaches half way to the next track at y = `next_mm`.
+    /// Grinds a strip along the waiting track. The strip reaches half way to the next track, which is at y = `next_mm`;
+    /// `None` if there is no next track.
     fn grind_waiting(&mut self, state: &mut WorldState, next_mm: Option<f64>) {
         let Some(track) = self.waiting_track.take() else { return };
         let Some(mut pass) = self.pass.take() else { return };
@@ -274,7 +280,8 @@ impl Wheel {
     }
 }
 
-/// Returns the curvature of the grooves that a wheel leaves over the whole part, if it leaves any.
+/// Returns, for every node of the part, the curvature in 1/mm of the grooves that a wheel of radius `radius_mm` leaves.
+/// Returns `None` if the specification has no grooves (`scallops` is false).
 fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     spec.grinder.scallops.then(|| {
         let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
@@ -283,8 +290,8 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     })
 }
 
-/// Updates the grooves, which lie at the tracks of this pass. Where this pass has not ground, the grooves of the
-/// previous pass keep their height.
+/// Places the grooves of the part at the tracks of this pass. `half_mm` is half the distance between two tracks;
+/// without it, nothing changes. Where this pass has not ground, the grooves keep their previous height.
 fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
@@ -302,8 +309,9 @@ fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_
     state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
 }
 
-/// Grinds the nodes in the strip of a track. On each side in `beside`, where there is no other track, also grinds the
-/// nodes that the curve of the wheel reaches.
+/// Grinds the nodes along a track within the limits `strip` of y. `beside` lists the open sides, -1 or 1 along y, that
+/// have no neighbouring track. On these sides the wheel also grinds beyond the strip, as far as its curved profile
+/// reaches.
 fn grind(
     state: &mut WorldState,
     pass: &mut PassState,
@@ -344,8 +352,8 @@ fn grind(
     }
 }
 
-/// Returns the nodes of a track within a strip of y: the index of each node, its position, and the height in mm that
-/// the wheel would leave at the track's own y.
+/// Returns the nodes along a track within the limits `strip` of y. Each has its index, its position (x, y), and the
+/// height in mm that the wheel leaves at this x on the centre line of the track.
 fn nodes_in_strip(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
     let mut nodes = Vec::new();
     for pair in track.projections.windows(2) {

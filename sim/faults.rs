@@ -20,19 +20,20 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         Self(Arc::default())
     }
 
-    /// Adds a fault at a place. The first `skip` matches of the place pass without the fault.
+    /// Adds a fault that happens once, at `place`, for example at a command. The first `skip` occurrences of the place
+    /// pass without the fault.
     pub fn add(&self, place: impl Into<Place>, skip: u32, fault: Fault) {
         self.rules().push(Rule { place: place.into(), skip, fault });
     }
 
-    /// Drops the pending faults.
+    /// Removes all faults that have not happened yet.
     pub fn clear(&self) {
         self.rules().clear();
     }
 
-    /// Returns the fault that happens now at a place for which `is_meant` returns true, and removes it from the pending
-    /// faults. If several faults are due, only the first happens and the others stay pending. Returns `None` if none is
-    /// due.
+    /// Returns the fault that happens now, and removes it from the list. `is_meant` returns true for the places that
+    /// match the present event. If several faults are due, only the first happens, and the others stay in the list.
+    /// Returns `None` if no fault is due.
     pub(crate) fn next_at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

@@ -18,16 +18,17 @@ struct BallSample {
     height_mm: f64,
 }
 
-/// Returns, for every node of a part, the height in mm over the nominal surface that a ball of this radius leaves; NaN
-/// where the ball does not come. `track_mm` is the spacing of the tracks.
+/// Returns, for every node of a part, the height in mm over the nominal surface that a ball of radius `radius_mm`
+/// leaves when it follows a program. The height is NaN where the ball does not come. `track_mm` is the distance between
+/// neighbouring tracks.
 pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
     let reach_mm = (1.6 * track_mm).max(2.0 * SAMPLE_SPACING_MM);
     let cells = SampleIndex::new(touches(part, program, radius_mm), reach_mm);
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
-/// Returns a position on the part unchanged. For a position outside, returns the last position on the part in the
-/// direction of its middle, because the wheel has lifted off outside and the height at the edge is used there.
+/// Returns a position on the part unchanged. For a position outside, returns the last position on the part on the line
+/// to its middle: the wheel has lifted off outside, so the height at the edge is used there.
 fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     let at = |share: f64| at_mm.map(|v| share * v);
     let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
@@ -54,7 +55,8 @@ fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<BallSample> {
     found
 }
 
-/// Projects the centre of the ball onto the nominal surface.
+/// Projects the centre of the ball onto the nominal surface, and returns the position and height of its contact.
+/// Returns `None` if the ball is not near the surface or the projection fails.
 fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<BallSample> {
     let (at_mm, over_mm) = project_onto(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
     let height_mm = over_mm - radius_mm;
@@ -80,8 +82,9 @@ impl SampleIndex {
         at_mm.map(|v| (v / self.reach_mm).floor() as i64)
     }
 
-    /// Returns the height at a position, from a plane fitted to the contacts around it. The weight of a contact falls
-    /// to 0 at the reach.
+    /// Returns the height in mm at a position, from a plane fitted by weighted least squares to the contacts around it.
+    /// The weight of a contact falls to 0 at the distance `reach_mm`. Returns NaN if there are no contacts within this
+    /// distance.
     fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
         let [i, j] = self.cell(at_mm);
         // Normal equations of h = c0 + c1 u + c2 v.

@@ -17,8 +17,8 @@ pub struct FormError {
 }
 
 impl FormError {
-    /// Draws an error with a given correlation length and a given peak to valley over the rectangle centred on the
-    /// origin.
+    /// Draws a random form error from a seed. `pv_mm` is its peak-to-valley value over the rectangle `width_mm` by
+    /// `depth_mm` that is centred on the origin.
     pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
         let mut rng = crate::rng(seed);
         let sigma = 2f64.sqrt() / correlation_length_mm;
@@ -36,9 +36,9 @@ impl FormError {
         error
     }
 
-    /// Draws an error with a given correlation length and RMS (over the infinite plane) from a generator.
+    /// Draws a random form error from a random generator. `rms_mm` is its root mean square over the infinite plane.
     ///
-    /// A wave of amplitude a has the mean square a^2/2.
+    /// The error is a sum of waves, and a wave of amplitude a has the mean square a^2/2.
     pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
         let sigma = 2f64.sqrt() / correlation_length_mm;
         let amplitude = rms_mm * (2.0 / 96.0f64).sqrt();
@@ -61,7 +61,8 @@ impl FormError {
         self.waves.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).cos()).sum()
     }
 
-    /// Adds the error to values on a grid, row by row, x fastest.
+    /// Adds the error to the values at the nodes of a grid, row by row, x fastest. `first_mm` is the position of the
+    /// first node, `step_mm` the spacing along x and y, and `columns` the number of nodes in a row.
     ///
     /// From node to node, the phase of a wave advances by the same angle, so each value is a rotation of the one
     /// before: no cosine is computed within a row. Rounding errors accumulate to about 1e-14 of the amplitude over a

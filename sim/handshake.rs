@@ -125,7 +125,9 @@ impl Handshake {
         }
     }
 
-    /// Reads the command block after its last register was written.
+    /// Decodes the command block after its last register was written, and carries out its command if it is new. Ignores
+    /// a broken block and a repeated sequence number. A lower sequence number is ignored too, except for CLAIM and
+    /// ABORT.
     pub(crate) fn read_command(&mut self, words: &[u16; 20]) {
         let Some(frame) = CommandFrame::read(self.order, words) else { return self.note(HandshakeEvent::Broken) };
         let (sequence, command) = (frame.sequence, Command::from_number(frame.command));
@@ -144,18 +146,18 @@ impl Handshake {
         }
     }
 
-    /// Returns true if a client owns the machine.
+    /// Returns true if the client with the id `owner` owns the machine. The id 0 is never an owner.
     pub(crate) fn is_owned_by(&self, owner: u32) -> bool {
         owner != 0 && owner == self.owner
     }
 
-    /// Handles a new beat of the owner.
+    /// Handles a new heartbeat of the client that owns the machine.
     pub(crate) fn beat(&mut self) {
         self.beat_monitor.record(self.now);
         self.hear();
     }
 
-    /// Restarts the measurement of the owner's silence.
+    /// Restarts the clock that measures how long the owner has been silent.
     fn hear(&mut self) {
         self.silent = Duration::ZERO;
     }
@@ -230,7 +232,8 @@ impl Handshake {
         }
     }
 
-    /// Returns the CRC-32 over the identities in force, `None` if a payload is missing.
+    /// Returns the digest of the payloads in force: the CRC-32 over their identities. Returns `None` if a payload that
+    /// this machine needs is missing.
     fn digest(&self) -> Option<u32> {
         let needed: &[usize] = match self.body.kind() {
             Kind::Cmm => &[0],
@@ -243,7 +246,8 @@ impl Handshake {
         Some(hasher.finalize())
     }
 
-    /// Carries out an accepted command. Its sequence number and its answer are already stored.
+    /// Carries out an accepted command. `frame` contains its arguments. Its sequence number and its answer are already
+    /// stored.
     fn act(&mut self, command: Command, frame: &CommandFrame) {
         match command {
             Command::Claim => {
@@ -293,7 +297,8 @@ impl Handshake {
         self.retract(State::Holding);
     }
 
-    /// Moves clear of the part and enters `acting`, a transitional state that lasts some time.
+    /// Moves the wheel or the probe clear of the part, and enters the state `acting`, for example STOPPING. That state
+    /// ends by itself after some time.
     fn retract(&mut self, acting: State) {
         self.token = 0;
         self.acting_left = self.acting;
@@ -301,7 +306,8 @@ impl Handshake {
         self.body.retract();
     }
 
-    /// Reports a fault, ends a running job as failed, and waits for CLEAR.
+    /// Enters FAULTED with the fault number `fault` of docs/modbus.md until CLEAR, and ends a running job with the
+    /// result failed.
     pub(crate) fn fail(&mut self, fault: u16) {
         self.token = 0;
         self.show(fault);
@@ -328,7 +334,8 @@ impl Handshake {
         }
     }
 
-    /// Ends a running job with this result. Returns false if the result data cannot be encoded, otherwise true.
+    /// Ends a running job with the result number `result` of docs/modbus.md. Returns true if its result data can be
+    /// encoded or no job runs, otherwise false.
     fn end(&mut self, result: u16) -> bool {
         if !std::mem::take(&mut self.running) {
             return true;
@@ -344,19 +351,21 @@ impl Handshake {
         self.outbox.is_some()
     }
 
-    /// Returns the origin of the result of the job that runs or has just ended.
+    /// Returns what identifies the result of the running or last job: the job, the cycle, the `done` number and the
+    /// identity of the plan or map.
     fn origin(&self) -> Origin {
         let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
         let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
         Origin { job: self.job.job, cycle: self.job.cycle, done: self.done, identity }
     }
 
-    /// Returns true if full pages of a result are available while its job still runs.
+    /// Returns true if a client can read full pages of a result while the job still runs.
     pub(crate) fn gives_ahead(&self) -> bool {
         self.gives_ahead && self.body.has_partial_result()
     }
 
-    /// Returns the present outbox, if it has content.
+    /// Returns the outbox that a client can read now: the result of a complete job, or the partial result of a running
+    /// or held job. Returns `None` if there is no result to read.
     pub(crate) fn outbox(&self) -> Option<Cow<'_, Outbox>> {
         match self.state {
             State::Complete => self.outbox.as_ref().map(Cow::Borrowed),
@@ -376,7 +385,7 @@ impl Handshake {
         }
     }
 
-    /// Lets real time pass, at most a few hundredths of a second.
+    /// Advances the machine by the real time `elapsed`, which must be at most a few hundredths of a second.
     pub(crate) fn advance_time(&mut self, elapsed: Duration) {
         self.now += elapsed;
         self.silent = self.silent.saturating_add(elapsed);
@@ -465,7 +474,7 @@ impl Handshake {
         }
     }
 
-    /// Turns the key at the panel; a moving machine holds.
+    /// Turns the key switch at the panel to `mode`. If this changes the mode, a running job holds.
     pub(crate) fn turn_key(&mut self, mode: Mode) {
         if self.mode != mode {
             self.mode = mode;
@@ -476,7 +485,7 @@ impl Handshake {
         }
     }
 
-    /// Presses the button at the panel that continues a held job.
+    /// Presses the start button at the panel. A held job continues if the interlocks allow motion.
     pub(crate) fn press_start(&mut self) {
         if self.state == State::Held && self.running && self.is_safe(interlock::MOVING) {
             (self.fault, self.silent) = (0, Duration::ZERO);
@@ -484,7 +493,8 @@ impl Handshake {
         }
     }
 
-    /// Starts an uncommanded motion, or returns the machine to its state before.
+    /// Starts a motion without a command if `strays` is true and the machine is idle. If `strays` is false, ends such a
+    /// motion: the machine is idle again.
     pub(crate) fn stray(&mut self, strays: bool) {
         if strays && self.state == State::Idle {
             self.note(HandshakeEvent::Strayed);
@@ -496,13 +506,14 @@ impl Handshake {
         }
     }
 
-    /// Changes the identities in force after the next payload has come into force and a client has read the slots.
+    /// Requests a fault that happens once: after the next payload has come into force and a client has read the slots,
+    /// the machine changes the identities of its payloads in force.
     pub(crate) fn spoil(&mut self) {
         self.spoils = true;
     }
 
-    /// Handles a read of the slots in force by a client: changes the identities in force if [`Self::spoil`] requested
-    /// it.
+    /// Handles a read of the slots in force by a client. Changes the identities in force if the fault of
+    /// [`Self::spoil`] is due.
     pub(crate) fn slots_were_read(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;
@@ -515,8 +526,8 @@ impl Handshake {
         }
     }
 
-    /// Restarts the application: it forgets everything except the jobs that it began, and an interrupted motion is a
-    /// fault.
+    /// Restarts the program of the machine with another boot id. It keeps only the list of the jobs that it began. If
+    /// the restart interrupts a job, the machine enters FAULTED.
     pub(crate) fn reboot(&mut self) {
         let cut_off = self.lose_memory();
         self.note(HandshakeEvent::Rebooted { boot_id: self.boot_id });
@@ -527,8 +538,8 @@ impl Handshake {
         }
     }
 
-    /// Takes another boot id, and clears the memory except the jobs that the machine has begun. Returns true if a
-    /// motion was interrupted.
+    /// Takes another boot id, and clears the memory except the list of the jobs that the machine began. Returns true if
+    /// this interrupted a job.
     fn lose_memory(&mut self) -> bool {
         let cut_off = std::mem::take(&mut self.running);
         if cut_off {
@@ -550,8 +561,7 @@ impl Handshake {
         cut_off
     }
 
-    /// Restarts an application that keeps its boot id and forgets its jobs: it is idle, as if it had never been
-    /// commanded.
+    /// Restarts the program of the machine without a trace: it keeps its boot id, forgets all jobs and is idle.
     pub(crate) fn forget(&mut self) {
         let boot_id = self.boot_id;
         self.lose_memory();
@@ -566,7 +576,10 @@ impl Handshake {
         self.log.push(self.now, what);
     }
 
-    /// Puts a payload into force; otherwise returns the answer that refuses it.
+    /// Checks a payload and puts it into force.
+    ///
+    /// # Errors
+    /// Returns the number of the answer with which the machine refuses the payload.
     pub(crate) fn put_in_force(&mut self, arrived: Arrived) -> Result<(), u16> {
         let (kind, identity) = (arrived.kind, arrived.identity);
         let slot = Slot::new(self.order, arrived);
@@ -582,12 +595,12 @@ impl Handshake {
         Ok(())
     }
 
-    /// Returns true if the payloads must not be changed.
+    /// Returns true if a job runs or is held, so that the payloads must not be changed.
     pub(crate) fn is_moving(&self) -> bool {
         matches!(self.state, State::Execute | State::Holding | State::Held)
     }
 
-    /// Returns the status block, without its snapshot number and the beats.
+    /// Returns the 48 registers of the status block. The snapshot numbers and the heartbeats in it are still 0.
     pub(crate) fn image(&self) -> Vec<u16> {
         let temperature = (self.body.temperature_c() * 100.0).round().clamp(-32768.0, 32767.0) as i16;
         RegisterBlock::new(self.order, 48)

@@ -26,7 +26,9 @@ pub struct Head {
 }
 
 impl Head {
-    /// Returns the centre of the wheel, for positions of the slides in mm and an angle on the scale in degrees.
+    /// Returns the centre of the wheel in mm. `slides_mm` is the position of the slides, `scale_deg` the angle in
+    /// degrees that the scale of the head shows. Without a pivot, the control itself keeps the centre, so it is at
+    /// `slides_mm`.
     pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
         let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
         let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();
@@ -37,15 +39,15 @@ impl Head {
         std::array::from_fn(|k| pivot[k] - arm[k])
     }
 
-    /// Returns the centre of the wheel on a move, after the fraction `share` of it, from 0 to 1. The head turns in
-    /// proportion to the travel of the slides.
+    /// Returns the centre of the wheel in mm on the move from `from` to `to`, after the fraction `share` of the move,
+    /// from 0 to 1. The angle of the head changes in proportion to the travel of the slides.
     pub fn centre_on_move_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> Vec3 {
         let slides = to.position_at(from.at_mm, share);
         let ends = from.rotary_deg.or(to.rotary_deg).zip(to.rotary_deg);
         ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
     }
 
-    /// Returns the reason why this head cannot execute a program.
+    /// Returns the reason why this head cannot execute a program, or `None` if it can.
     pub(crate) fn refusal_reason(&self, program: &Program) -> Option<String> {
         let letter = program.axis?;
         if letter != self.letter {

@@ -75,7 +75,7 @@ pub type Vec3 = [f64; 3];
 /// Random generator of the whole crate: portable across machines and releases.
 pub type Rng = rand::rngs::ChaCha8Rng;
 
-/// Returns the generator for a seed.
+/// Creates the random number generator for a seed.
 pub fn rng(seed: u64) -> Rng {
     use rand::SeedableRng;
     Rng::seed_from_u64(seed)

@@ -76,7 +76,8 @@ impl RegisterLayout {
         ]
     }
 
-    /// Returns the block that contains an address, and the offset in it.
+    /// Returns the block that contains the register `address`, the offset of the register in the block, and the length
+    /// of the block. Returns `None` if no block contains it.
     pub(crate) fn find(&self, address: usize) -> Option<(Block, usize, usize)> {
         self.blocks().into_iter().find_map(|(block, first, length)| {
             let offset = address.checked_sub(first.into())?;

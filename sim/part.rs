@@ -164,7 +164,7 @@ pub struct Coefficient {
 }
 
 impl ShapeSpec {
-    /// Builds the surface.
+    /// Creates the nominal surface that this specification describes.
     pub fn build(&self) -> Box<dyn Shape> {
         match self.clone() {
             Self::FreeForm {} => Box::new(FreeForm::default()),
@@ -209,7 +209,7 @@ impl Aperture {
         }
     }
 
-    /// Returns true if (x, y) is inside.
+    /// Returns true if the position (x, y) is inside the aperture.
     pub fn contains(&self, x: f64, y: f64) -> bool {
         match *self {
             Self::Rectangle { half_x_mm, half_y_mm } => x.abs() <= half_x_mm && y.abs() <= half_y_mm,
@@ -230,7 +230,8 @@ pub struct HeightGrid {
 }
 
 impl HeightGrid {
-    /// Creates a grid over a rectangle about the origin, with one height at all nodes.
+    /// Creates a grid over a rectangle about the origin, whose half width and half depth are `half_mm`. All nodes have
+    /// the height `height_mm`.
     pub fn new(half_mm: [f64; 2], height_mm: f64) -> Self {
         let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
         let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
@@ -240,14 +241,14 @@ impl HeightGrid {
         Self { first_mm, step_mm, columns, rows, heights_mm: vec![height_mm; columns * rows] }
     }
 
-    /// Returns the positions (x, y) of the nodes, in the order of the heights.
+    /// Returns the positions (x, y) of the nodes, in the order of `heights_mm`.
     pub fn nodes(&self) -> impl Iterator<Item = [f64; 2]> + '_ {
         (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
     }
 
-    /// Returns the nodes between two limits in x and two limits in y, each with its index. The two limits can be in
-    /// either order. A node on the lower limit is included, a node on the upper limit is not, so that each node of
-    /// adjacent rectangles is in exactly one of them.
+    /// Returns the nodes within two limits of x and two limits of y, each with its index in `heights_mm`. The two
+    /// limits can be in either order. A node on the lower limit is included, a node on the upper limit is not, so that
+    /// each node of adjacent rectangles is in exactly one of them.
     pub(crate) fn within(&self, x_mm: [f64; 2], y_mm: [f64; 2]) -> impl Iterator<Item = (usize, [f64; 2])> + '_ {
         let from = |k: usize, place: f64| ((place - self.first_mm[k]) / self.step_mm[k]).ceil().max(0.0) as usize;
         let range =
@@ -260,17 +261,17 @@ impl HeightGrid {
         [self.first_mm[0] + i as f64 * self.step_mm[0], self.first_mm[1] + j as f64 * self.step_mm[1]]
     }
 
-    /// Adds a random form to values at the nodes, in millimetres.
+    /// Adds a random form error to `values_mm`, which has one value in mm for each node.
     pub fn add(&self, form: &FormError, values_mm: &mut [f64]) {
         form.add_to_grid(self.first_mm, self.step_mm, self.columns, values_mm);
     }
 
-    /// Returns the area of a cell in square millimetres.
+    /// Returns the area of a grid cell in mm².
     pub fn cell_mm2(&self) -> f64 {
         self.step_mm[0] * self.step_mm[1]
     }
 
-    /// Returns the height at (x, y) in millimetres, and its gradient.
+    /// Returns the height at (x, y) in mm and its gradient, by cubic interpolation between the nodes.
     pub fn at(&self, x: f64, y: f64) -> (f64, [f64; 2]) {
         let (i, wx, dx) = weights(x, self.first_mm[0], self.step_mm[0], self.columns);
         let (j, wy, dy) = weights(y, self.first_mm[1], self.step_mm[1], self.rows);
@@ -290,8 +291,9 @@ impl HeightGrid {
     }
 }
 
-/// Returns the index of the first of the four nodes around the coordinate `t`, the weights of the four nodes, and the
-/// derivatives of the weights.
+/// Returns the weights of cubic (Catmull-Rom) interpolation at the coordinate `t`: the index of the first of the four
+/// nodes around it, the weights of the four nodes, and the derivatives of the weights. `first` is the coordinate of the
+/// first node, `step` the spacing and `nodes` the number of nodes.
 ///
 /// Beyond the innermost cells, the coordinate is clamped to the border, and the derivatives are 0.
 fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f64; 4]) {
@@ -325,9 +327,9 @@ pub struct Grooves {
 }
 
 impl Grooves {
-    /// Returns the curvature of a wheel across tracks along x, minus the curvature of the part at (x, y), in 1/mm. It
-    /// is the curvature of the gap between wheel and part over y, where the gap is minimal along the track. Returns 0
-    /// where the wheel leaves no groove.
+    /// Returns the curvature in 1/mm, across the tracks, of the gap between wheel and part at (x, y): the curvature of
+    /// the wheel minus that of the part. The tracks are along x, and the gap is taken at its minimum along the track.
+    /// Returns 0 where the wheel leaves no groove.
     pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
         let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -346,7 +348,8 @@ impl Grooves {
         self.first_mm + number * self.spacing_mm
     }
 
-    /// Returns the height of the groove of a track at (x, y), and its gradient.
+    /// Returns the height in mm at (x, y) above the bottom of the groove of track number `track`, and the gradient of
+    /// this height.
     fn at(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (b, [bx, by]) = self.bend.at(x, y);
         let d = y - self.track_mm(track);
@@ -405,7 +408,8 @@ pub struct Part {
 }
 
 impl Part {
-    /// Returns the part with its blank: stock and a form error drawn from a seed.
+    /// Creates the blank of a part: the nominal surface with stock and with a random form error, which is drawn from a
+    /// seed.
     pub fn blank(spec: &PartSpec, seed: u64) -> Self {
         let mut height = HeightGrid::new(spec.aperture.half_mm(), spec.stock_um * 1e-3);
         let [half_x, half_y] = spec.aperture.half_mm();
@@ -426,7 +430,8 @@ impl Part {
         self.height_and_gradient(x, y, self.nearest_track(y)).0
     }
 
-    /// Returns the height of the ridges over the bottom of the grooves at (x, y), in mm.
+    /// Returns the height in mm of the ridges between the grooves, over the bottom of the grooves, near (x, y). Returns
+    /// 0 if the part has no grooves.
     pub fn ridge_mm(&self, x: f64, y: f64) -> f64 {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.bend.at(x, y).0 * grooves.spacing_mm.powi(2) / 8.0)
     }
@@ -435,7 +440,8 @@ impl Part {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.nearest(y))
     }
 
-    /// Returns the height and its gradient at (x, y), in the groove of track number `track`.
+    /// Returns the height in mm over the nominal surface at (x, y), and its gradient, with the groove of track number
+    /// `track`.
     fn height_and_gradient(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (h, slope) = self.height.at(x, y);
         let Some(grooves) = &self.grooves else { return (h, slope) };
@@ -443,15 +449,15 @@ impl Part {
         (h + over, [slope[0] + by[0], slope[1] + by[1]])
     }
 
-    /// Returns the point of the real surface over (x, y) of the nominal, and the unit normal of the real surface at
-    /// that point.
+    /// Returns the point of the real surface over the nominal position (x, y), and the unit normal of the real surface
+    /// at that point.
     pub fn surface(&self, x: f64, y: f64) -> (Vec3, Vec3) {
         let (point, tx, ty) = self.tangents(x, y, self.nearest_track(y));
         (point, unit_normal(tx, ty))
     }
 
-    /// Returns the point of the surface and its derivatives by x and y, in the groove of track number `track`, as if
-    /// this groove had no border.
+    /// Returns the point of the real surface at (x, y), and its derivatives with respect to x and to y. The groove of
+    /// track number `track` is continued beyond its borders.
     fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
         let (h, [hx, hy]) = self.height_and_gradient(x, y, track);
@@ -469,7 +475,8 @@ impl Part {
         ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], tx, ty)
     }
 
-    /// Moves a ball along its path until it touches.
+    /// Moves a ball along the path `way` until it touches the part. The contact is unexpected if the ball touches
+    /// before its path begins.
     ///
     /// A touch whose contact lies beyond the aperture is a miss, because the side and the rim of the part are not
     /// modelled.
@@ -489,16 +496,16 @@ impl Part {
         }
     }
 
-    /// Returns the distance of a centre from the real surface at the bottom of the grooves, minus the radius, to first
-    /// order, in mm.
+    /// Returns the distance in mm, to first order, between a ball and the real surface at the bottom of the grooves.
+    /// `c` is the centre of the ball. The distance is negative if the ball is inside the material.
     fn gap(&self, c: Vec3, radius_mm: f64) -> f64 {
         let [p, q] = self.shape.gradient(c[0], c[1]);
         let vertical = c[2] - self.shape.height(c[0], c[1]);
         vertical / (1.0 + p * p + q * q).sqrt() - self.height.at(c[0], c[1]).0 - radius_mm
     }
 
-    /// Moves the ball along its path in steps of its distance from the surface, until it is near contact. Returns its
-    /// position on the path, in mm from the target; `None` if the ball does not come near contact.
+    /// Moves the ball along the path `way` in steps of its distance from the surface, until it is near contact. Returns
+    /// its position on the path, in mm from the target. Returns `None` if the ball does not come near contact.
     fn near_contact(&self, way: &Approach) -> Option<f64> {
         let mut t = way.from_mm;
         for _ in 0..100 {
@@ -514,8 +521,8 @@ impl Part {
         Some(t)
     }
 
-    /// Returns the contact (x, y) and the position on the path, by an iteration that begins at `t`; `None` if it finds
-    /// no contact.
+    /// Computes the contact of the ball by an iteration that begins at the position `t` on the path `way`. Returns (x,
+    /// y) of the contact and the position on the path in mm. Returns `None` if the iteration finds no contact.
     fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
         let centre = way.centre(t);
         let [p, q] = self.shape.gradient(centre[0], centre[1]);
@@ -544,7 +551,11 @@ impl Part {
         None
     }
 
-    /// Solves |r - c| = R and (r - c) . r_x = 0 along the ridge at y, with c = p + t d, from a start nearby.
+    /// Computes the contact of the ball with the ridge at `y` by Newton's method, from the start `[x, t]`. Returns (x,
+    /// y) of the contact and the position t on the path in mm. Returns `None` if the iteration does not converge.
+    ///
+    /// Solves |r - c| = R and (r - c) . r_x = 0. Here r is the point of the ridge, r_x its derivative with respect to
+    /// x, R the radius of the ball and c = p + t d its centre on the path.
     fn contact_on_ridge(&self, way: &Approach, [mut x, mut t]: [f64; 2], y: f64) -> Option<([f64; 2], f64)> {
         let track = self.nearest_track(y);
         let mut last = f64::INFINITY;
@@ -573,8 +584,12 @@ impl Part {
         (last < 1e-10).then_some(([x, y], t))
     }
 
-    /// Solves r + R m = p + t d in the groove of a track from a start nearby; `None` if the iteration does not
-    /// converge.
+    /// Computes the contact of the ball with the groove of track number `track` by Newton's method, from the start
+    /// `from` = (x, y, t). Returns (x, y) of the contact and the position t on the path in mm. Returns `None` if the
+    /// iteration does not converge.
+    ///
+    /// Solves r + R m = p + t d. Here r is the point of the surface, m its unit normal, R the radius of the ball and p
+    /// + t d its centre on the path.
     fn contact_in(&self, way: &Approach, from: Vec3, track: f64) -> Option<([f64; 2], f64)> {
         let offset = |x: f64, y: f64| -> Vec3 {
             let (r, tx, ty) = self.tangents(x, y, track);
@@ -629,7 +644,7 @@ fn solve([a, b, c]: [Vec3; 3], right: Vec3) -> Option<Vec3> {
     x.iter().all(|value| value.is_finite()).then_some(x)
 }
 
-/// Returns the position of a ball's centre in contact with a sphere, coming from the outside.
+/// Computes the contact of a ball that moves along the path `way` with a sphere, from the outside.
 pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> Contact {
     let from_centre: Vec3 = std::array::from_fn(|i| way.point_mm[i] - centre_mm[i]);
     let along = dot(from_centre, way.direction);

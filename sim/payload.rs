@@ -226,7 +226,9 @@ impl Target {
         let feature = match reader.u16()? {
             1 => Feature::Part,
             2 => Feature::ReferenceSphere,
-            other => return Err(broken(format!("target {index} is on {other}, known are 1 and 2"))),
+            other => {
+                return Err(broken(format!("target {index} is on {other}; 1 is the part, 2 the reference sphere")));
+            }
         };
         reader.zeros::<2>("what")?;
         let (point_mm, normal) = (reader.vector("point of a target")?, reader.vector::<3>("normal of a target")?);
@@ -241,7 +243,7 @@ impl Target {
 }
 
 impl Plan {
-    /// Reads a plan.
+    /// Decodes a measuring plan.
     ///
     /// # Errors
     /// The bytes are not a plan, or a value is not possible for a probe.
@@ -272,7 +274,7 @@ impl Plan {
         Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful, targets })
     }
 
-    /// Writes a plan.
+    /// Encodes the measuring plan.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 0];
         bytes.extend((self.targets.len() as u32).to_be_bytes());
@@ -293,11 +295,11 @@ impl Plan {
 }
 
 impl Map {
-    /// Reads a map.
+    /// Decodes a correction map.
     ///
     /// # Errors
-    /// The bytes are not a map, its size is beyond the machine's memory, or the declared largest value is not that of
-    /// the nodes.
+    /// The bytes are not a map, the map has more nodes than the machine can store, or its header states another largest
+    /// absolute value than its nodes have.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         let mut reader = Reader { rest: bytes };
         reader.format()?;
@@ -331,7 +333,7 @@ impl Map {
         Ok(map)
     }
 
-    /// Writes a map.
+    /// Encodes the correction map.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 1];
         bytes.extend(self.columns.to_be_bytes());
@@ -346,7 +348,7 @@ impl Map {
         bytes
     }
 
-    /// Returns the largest absolute value in millimetres.
+    /// Returns the largest absolute value of all nodes, in mm.
     pub fn max_abs_mm(&self) -> f64 {
         self.values_mm.iter().fold(0.0, |most, value| value.abs().max(most))
     }
@@ -366,10 +368,10 @@ impl Map {
 }
 
 impl Pass {
-    /// Reads a pass.
+    /// Decodes the settings of a pass.
     ///
     /// # Errors
-    /// The bytes are not a pass, or a value is not possible for a grinder.
+    /// The bytes are not such settings, or a value is not possible for a grinder.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         exact(bytes, 128, 0, 0)?;
         let mut reader = Reader { rest: bytes };
@@ -404,7 +406,7 @@ impl Pass {
         Err(broken(format!("the part's extent is x {x0} to {x1}, y {y0} to {y1} mm")))
     }
 
-    /// Writes a pass.
+    /// Encodes the settings of the pass.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1];
         bytes.extend(self.spark_out.to_be_bytes());
@@ -419,7 +421,8 @@ impl Pass {
     }
 }
 
-/// Writes the records of points: format 1 as floats, format 2 as counts of a scale.
+/// Encodes the records of points. Without `scale_mm`, the coordinates are floats (format 1). With it, they are whole
+/// multiples of `scale_mm` (format 2).
 pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(32 * records.len());
     for record in records {
@@ -437,10 +440,10 @@ pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> 
     bytes
 }
 
-/// Reads the records of points, for tests and truth queries.
+/// Decodes records of points, for tests and truth queries. `scale_mm` is as in [`encode_points`].
 ///
 /// # Errors
-/// The bytes are not such records.
+/// The length is not a multiple of the length of a record, or a value is invalid.
 pub fn decode_points(bytes: &[u8], scale_mm: Option<f64>) -> Result<Vec<PointRecord>, Refusal> {
     let size = if scale_mm.is_some() { 20 } else { 32 };
     exact(bytes, 0, (bytes.len() / size) as u64, size as u64)?;
@@ -471,7 +474,7 @@ fn point(reader: &mut Reader, scale_mm: Option<f64>) -> Result<PointRecord, Refu
 }
 
 impl PassRecord {
-    /// Writes the record.
+    /// Encodes the pass record.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(64);
         bytes.extend(self.job.to_be_bytes());
@@ -490,10 +493,10 @@ impl PassRecord {
         bytes
     }
 
-    /// Reads the record, for tests.
+    /// Decodes a pass record, for tests.
     ///
     /// # Errors
-    /// The bytes are not a record.
+    /// The bytes are not a pass record.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         exact(bytes, 64, 0, 0)?;
         let mut reader = Reader { rest: bytes };

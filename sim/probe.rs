@@ -69,9 +69,8 @@ fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
 /// Returns the centre of a ball that touches the ground surface at its point S + e n over (x, y). S is the nominal
 /// point, n the nominal unit normal and e the form error.
 ///
-/// The ground surface is S + e n. The ball touches along the normal of that surface, not along the nominal one. With
-/// the nominal normal n and the surface gradient of e the offset is exact, so the second-order term of the paper's eq.
-/// (6) is in the data.
+/// The ball touches along the normal of the ground surface, not along n. The offset is computed exactly from n and the
+/// gradient of e, so the second-order term of the paper's eq. (6) is in the data.
 pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f64) -> Vec3 {
     let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
     let [p, q] = shape.gradient(x, y);

@@ -52,7 +52,8 @@ pub const OVERTRAVEL_MM: f64 = 1.5;
 const ROUGHING_FEED: f64 = 10.0;
 
 impl GrinderSpec {
-    /// Returns the systematic error at (x, y) of a part, without the effect of the wheel's radius, in µm.
+    /// Returns the systematic error of the grinder at (x, y) of a part, in µm: setting, tilt, straightness and screw
+    /// errors. The error of the wheel's radius is not included.
     fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
         let [half_x, half_y] = part.aperture.half_mm();
         let [p, q] = part.shape.gradient(x, y);
@@ -78,12 +79,14 @@ impl GrinderSpec {
     }
 }
 
-/// Replaces a non-finite value by 0. The formula can have no value at the corners of a round part's grid.
+/// Returns the value, or 0 if it is infinite or NaN. The formulas of the surface can give such values at the corners of
+/// the grid of a round part.
 pub(crate) fn finite_or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
-/// Returns the systematic error at every node, in mm, with waviness and without the effect of the wheel's radius.
+/// Returns the systematic error of the grinder at every node, in mm, with waviness. The error of the wheel's radius is
+/// not included.
 pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
     let (seed, spec) = (spec.seed, &spec.grinder);
     let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
@@ -144,7 +147,7 @@ impl Run {
         1.0 - (1.0 - self.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp()
     }
 
-    /// Grinds every node whose time has come.
+    /// Grinds every node that the wheel has reached up to the present time of the job.
     fn grind(&mut self, state: &mut WorldState) {
         while let Some(stroke) = self.strokes.get(self.stroke).copied() {
             while let Some(&(place, node)) = self.order.get(self.next) {
@@ -174,7 +177,7 @@ impl Run {
         }
     }
 
-    /// Returns the length of the travelled path, in mm.
+    /// Returns the length of the path that the wheel has travelled so far, in mm.
     fn path_mm(&self) -> f64 {
         let time = self.elapsed_s.min(self.total_s);
         self.strokes.iter().map(|s| ((time - s.begin_s).max(0.0) * s.feed_mm_s).min(self.stroke_mm)).sum()
@@ -207,8 +210,9 @@ impl Run {
     }
 }
 
-/// Moves the wheel over a node where a stiff machine would leave the height `cmd_mm`. Returns true if the wheel removed
-/// material. `bend` is the curvature of the groove that the wheel leaves, if it leaves grooves.
+/// Grinds one node. `cmd_mm` is the height that an infinitely stiff machine would leave; of the excess over it, the
+/// share `error_copying` remains. `bend` is the curvature in 1/mm of the groove that the wheel leaves, `None` if it
+/// leaves no grooves. Returns true if the wheel removed material.
 pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
     let h = &mut state.part.height.heights_mm[node];
     if state.spec.faults.no_part || *h <= cmd_mm {
@@ -222,7 +226,7 @@ pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option
     true
 }
 
-/// Falsifies a record as the fault requires.
+/// Returns a pass record that is falsified as `misreported` requires.
 fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     match misreported {
         Misreported::Nothing | Misreported::Duration => record,
@@ -234,8 +238,8 @@ fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     }
 }
 
-/// Returns the indices of the nodes on the path of the wheel, each with its position along the path in mm, and the
-/// length of the path in mm.
+/// Returns the nodes on the raster path of the wheel, in their order: the position of each along the path in mm, and
+/// its index. Also returns the length of the path in mm.
 fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
     let [x0, x1, y0, y1] = grown(pass.extent_mm);
     let (length, spacing) = (x1 - x0, pass.track_spacing_mm);
@@ -256,7 +260,9 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
     [x0 - OVERTRAVEL_MM, x1 + OVERTRAVEL_MM, y0 - OVERTRAVEL_MM, y1 + OVERTRAVEL_MM]
 }
 
-/// Returns, for every node, the height in mm that the machine aims at, without wear and growth.
+/// Returns, for every node, the height in mm over the nominal surface that the pass aims at, with the errors of the
+/// grinder that do not change with time (so without wear and thermal growth). Follows the program if there is one,
+/// otherwise the map.
 fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
@@ -285,12 +291,13 @@ fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program
     steered
 }
 
-/// Returns the true radius of the wheel in a pass, in mm.
+/// Returns the true radius of the wheel in mm. If no earlier pass has fixed it, this is the radius that the pass
+/// states, plus the error in the specification.
 fn true_radius_mm(state: &WorldState, pass: &Pass) -> f64 {
     state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
 }
 
-/// Returns the grooves that the wheel leaves over the whole part.
+/// Returns the grooves that the wheel would leave over the whole part in this pass.
 fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     let wheel_radius_mm = true_radius_mm(state, pass);
     let part = &state.part;
@@ -299,7 +306,8 @@ fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
-/// Returns the displacement in mm that this machine, with its faults, uses at (x, y) of the map.
+/// Returns the displacement in mm that this machine uses at (x, y). Configured faults can mirror, double, ignore or
+/// invert the map.
 fn displaced(state: &WorldState, map: &Map, x: f64, y: f64) -> f64 {
     let faults = &state.spec.faults;
     let (x, y) = match faults.map_mirrored {
@@ -326,7 +334,11 @@ pub struct Programs {
 }
 
 impl Programs {
-    /// Finds and reads the program whose comment names the map with this identity.
+    /// Finds and parses the program whose comment names the map with this identity.
+    ///
+    /// # Errors
+    /// Returns a text if the folder cannot be read, if it has no such program, or if the machine cannot execute the
+    /// program.
     fn read_for_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
         let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
         let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
@@ -337,7 +349,7 @@ impl Programs {
         };
         let texts = files.flatten().filter_map(|file| std::fs::read_to_string(file.path()).ok());
         let text = texts.filter(is_of_map).max_by_key(String::len);
-        let text = text.ok_or_else(|| format!("{} holds no program of the map {map}", self.folder.display()))?;
+        let text = text.ok_or_else(|| format!("{} has no program for the map {map}", self.folder.display()))?;
         self.control.read(&text)?.with_head(self.head)
     }
 }
@@ -355,14 +367,17 @@ impl Grinder {
         Self { world, programs: None, ready: None, running: None }
     }
 
-    /// Makes the grinder follow programs in a folder, instead of the map alone.
+    /// Makes the grinder follow the programs in a folder. Without this call it follows the map itself.
     #[must_use]
     pub fn by_programs(mut self, programs: Programs) -> Self {
         self.programs = Some(programs);
         self
     }
 
-    /// Refuses a pass beyond the reach or the limits of this machine.
+    /// Checks a pass against the limits of this machine.
+    ///
+    /// # Errors
+    /// The feed, the travel or the number of tracks is above its limit.
     fn check_pass(state: &WorldState, pass: &Pass) -> Result<(), Refusal> {
         let spec = &state.spec.grinder;
         if pass.feed_mm_min > spec.feed_most_mm_min {
@@ -404,7 +419,8 @@ impl Grinder {
     }
 }
 
-/// Returns the strokes of a pass, and their total duration.
+/// Returns the strokes of a pass and their total duration in s: `roughing` roughing strokes, one finishing stroke, then
+/// the spark-out strokes. `stroke_mm` is the length of the path of one stroke.
 fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     let feed_mm_s = pass.feed_mm_min / 60.0;
     let above = (1..=roughing).rev().map(|k| Some(f64::from(k) * pass.depth_of_cut_mm));
@@ -420,7 +436,10 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     (strokes, begin_s)
 }
 
-/// Prepares a pass for the part in its present state.
+/// Prepares a pass: computes the heights, the path and the strokes from the present state of the part.
+///
+/// # Errors
+/// The pass needs more strokes than the machine allows.
 fn run(
     state: &WorldState,
     (job, cycle): (u32, u16),
@@ -465,7 +484,7 @@ fn run(
     })
 }
 
-/// Returns the progress in thousandths of the path.
+/// Returns the progress of a job in thousandths of its duration.
 fn progress(run: &Run) -> Progress {
     let finished = run.finished();
     let done = if finished { 1000 } else { ((1000.0 * run.elapsed_s / run.total_s) as u32).min(999) };
@@ -623,7 +642,7 @@ impl Physics for Grinder {
 }
 
 impl Drop for Grinder {
-    /// Releases the part.
+    /// Releases the part, so that the CMM can take it.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Grinder);
     }

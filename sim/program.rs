@@ -42,11 +42,12 @@ pub struct CircularArc {
 }
 
 impl CircularArc {
-    /// Computes the arc from one position to another. `takes_mm` is the maximum difference of the radii at both ends
-    /// that the control accepts, in mm.
+    /// Computes the arc from one position to another. `axes` are the indices of the two axes of its plane, then of the
+    /// third axis; `centre_mm` is its centre in that plane. `takes_mm` is the maximum difference of the radii at both
+    /// ends that the control accepts, in mm.
     ///
     /// # Errors
-    /// The radii at the beginning and at the end differ by more than a control accepts, or the arc has no length.
+    /// The radii at both ends differ by more than `takes_mm`, or the arc has no length.
     pub fn new(
         axes: [usize; 3],
         [from, to]: [[f64; 3]; 2],
@@ -85,7 +86,7 @@ impl CircularArc {
         (from[self.axes[0]] - self.centre_mm[0]).hypot(from[self.axes[1]] - self.centre_mm[1])
     }
 
-    /// Returns the number of chords whose distance from the arc is at most `within_mm`.
+    /// Returns the number of chords that replace the arc from `from` with a deviation of at most `within_mm`, in mm.
     fn chords(&self, from: [f64; 3], within_mm: f64) -> usize {
         let each = (8.0 * within_mm / self.radius_mm(from)).sqrt();
         (self.sweep_rad.abs() / each).ceil().clamp(1.0, 1e6) as usize
@@ -126,8 +127,8 @@ impl Waypoint {
         }
     }
 
-    /// Returns the end points of straight moves that replace this move. Their distance from the move is at most
-    /// `within_mm`.
+    /// Returns the end points of straight moves that replace this move, with a deviation of at most `within_mm`. The
+    /// move begins at `from_mm`.
     pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
         let count = self.arc.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
         let inner = (1..count).map(|k| self.position_at(from_mm, k as f64 / count as f64));
@@ -155,10 +156,10 @@ pub struct Program {
 }
 
 impl Program {
-    /// Assigns the program to a machine with this head, if it has one.
+    /// Sets the head of the machine that executes the program; `None` for a machine without a rotary axis.
     ///
     /// # Errors
-    /// The machine cannot execute the program.
+    /// Returns the reason why this machine cannot execute the program.
     pub fn with_head(mut self, head: Option<Head>) -> Result<Self, String> {
         let why = match (self.axis, head) {
             (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
@@ -192,7 +193,7 @@ impl Program {
 }
 
 impl Control {
-    /// Returns the control of a dialect by its name.
+    /// Returns the control of a dialect, for example `fanuc`, or `None` for an unknown dialect.
     pub fn named(dialect: &str) -> Option<Self> {
         let known = [
             ("linuxcnc", Self::Linuxcnc),
@@ -203,10 +204,11 @@ impl Control {
         known.into_iter().find(|(name, _)| *name == dialect).map(|(_, control)| control)
     }
 
-    /// Reads a program.
+    /// Parses a program as this control would.
     ///
     /// # Errors
-    /// The control would stop, or the program would not do what it seems to; the message gives the line.
+    /// Returns the first line at which the control would stop or would not do what the program seems to say, with the
+    /// reason.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
         reader.program.by_kinematics = self == Self::Linuxcnc;
@@ -289,12 +291,15 @@ impl Reader {
             return Err("the program has no end".into());
         }
         if self.control == Control::Fanuc && self.percents != 2 {
-            return Err("a tape begins and ends with a percent sign".into());
+            return Err("the program must begin and end with a percent sign".into());
         }
         Ok(self.program)
     }
 
-    /// Reads a block of letters and numbers.
+    /// Reads a block, that is a line of words, each of which is a letter and a number.
+    ///
+    /// # Errors
+    /// Returns the reason why the block is not allowed in the program of a pass.
     fn block(&mut self, line: &str) -> Result<(), String> {
         if line == "%" {
             self.percents += 1;
@@ -350,7 +355,11 @@ impl Reader {
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
 
-    /// Handles a G word, given in tenths. Returns the word if it sets the path mode, otherwise `None`.
+    /// Handles a G word, given as its number times 10 (640 for G64). Returns this number if the word sets the path
+    /// mode, otherwise `None`.
+    ///
+    /// # Errors
+    /// The word is not allowed in the program of a pass.
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
             (_, 0 | 10 | 20 | 30) => self.motion = Some((tenths / 10) as u8),
@@ -369,12 +378,13 @@ impl Reader {
             (Control::Linuxcnc, 610 | 611 | 640)
             | (Control::Fanuc, 51 | 610 | 640)
             | (Control::Sinumerik, 600 | 6010 | 6420 | 640) => return Ok(Some(tenths)),
-            _ => return Err(format!("G{} is not what a pass needs", tenths as f64 / 10.0)),
+            _ => return Err(format!("G{} is not allowed in the program of a pass", tenths as f64 / 10.0)),
         }
         Ok(None)
     }
 
-    /// Handles the word of a path mode. A mode that rounds corners without a limit does not count as exact.
+    /// Handles the G word `smooth`, as its number times 10, that sets the path mode, and its parameter `level`. The
+    /// path counts as exact only if the mode limits how far corners are rounded. Without a word, nothing changes.
     fn exactness(&mut self, smooth: Option<i64>, level: Option<f64>) -> Result<(), String> {
         let tolerance = self.program.tolerance_mm.is_some_and(|mm| mm > 0.0);
         self.exact = match (self.control, smooth) {
@@ -431,7 +441,11 @@ impl Reader {
         Ok(())
     }
 
-    /// Turns a rotary axis. A program may turn only one axis, and only in one direction from beginning to end.
+    /// Turns a rotary axis to the angle `to_deg`. A program may turn only one axis, and it must use tool centre point
+    /// control either in all turns or in none.
+    ///
+    /// # Errors
+    /// Returns the reason why this turn is not allowed.
     fn tilt(&mut self, axis: char, to_deg: f64) -> Result<(), String> {
         let first = self.program.axis.is_none();
         if *self.program.axis.get_or_insert(axis) != axis {
@@ -450,7 +464,11 @@ impl Reader {
         Ok(())
     }
 
-    /// Computes the arc of a block. Its centre, and both of its ends, must be given along the axes of the plane.
+    /// Computes the arc of a block. `ends` are the positions where it begins and ends, and `told` are the coordinates
+    /// in the block.
+    ///
+    /// # Errors
+    /// No plane is selected, the end or the centre is not given along both axes of the plane, or there is no such arc.
     fn read_arc(
         &self,
         ends: [[f64; 3]; 2],
@@ -485,7 +503,10 @@ impl Reader {
         CircularArc::new(axes, ends, centre_mm, clockwise, takes_mm)
     }
 
-    /// Reads a line of Klartext, with its number.
+    /// Reads a line of Klartext, the language of Heidenhain controls. Each line begins with its number.
+    ///
+    /// # Errors
+    /// Returns the reason why the line is not allowed in the program of a pass.
     fn klartext(&mut self, line: &str) -> Result<(), String> {
         let (number, rest) = line.split_once(' ').unwrap_or((line, ""));
         if number.parse() != Ok(self.lines) {
@@ -535,7 +556,8 @@ impl Reader {
         }
     }
 
-    /// Reads the arguments of a CC: two axes, which are the plane of the circles about it.
+    /// Reads the centre of a circle (CC) with the coordinates `rest`. It must have two axes, which select the plane of
+    /// the following arcs.
     fn read_centre(&mut self, rest: &str) -> Result<(), String> {
         self.centre.clear();
         for word in rest.split_whitespace() {
@@ -556,7 +578,8 @@ impl Reader {
         Ok(())
     }
 
-    /// Reads the arguments of an L, or of a C, which has only a DR for its direction.
+    /// Reads the target `rest` of a straight move (L) or of an arc (C). `motion` is the motion mode of the move; `None`
+    /// for an arc, whose word DR+ or DR- gives the direction.
     fn straight(&mut self, rest: &str, motion: Option<u8>) -> Result<(), String> {
         let mut to = BTreeMap::new();
         self.motion = motion;

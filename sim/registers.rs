@@ -83,10 +83,10 @@ impl SimulatedMachine {
         machine
     }
 
-    /// Reads some registers.
+    /// Reads `count` registers from `address` on.
     ///
     /// # Errors
-    /// The address is outside the blocks, or the count is 0 or more than 125.
+    /// A register is in no block, or the count is 0 or more than 125.
     pub fn read(&mut self, address: u16, count: u16) -> Result<Vec<u16>, Exception> {
         if !(1..=125).contains(&count) {
             return Err(Exception::Value);
@@ -102,7 +102,8 @@ impl SimulatedMachine {
         Ok(self.to_line_order(registers))
     }
 
-    /// Swaps the bytes of registers between the machine's order and the order on the line.
+    /// Converts registers between the machine's byte order and the byte order on the line. Swaps the two bytes of each
+    /// register if they differ.
     fn to_line_order(&self, mut registers: Vec<u16>) -> Vec<u16> {
         if self.options.swaps_bytes {
             registers.iter_mut().for_each(|register| *register = register.swap_bytes());
@@ -110,10 +111,11 @@ impl SimulatedMachine {
         registers
     }
 
-    /// Writes some registers; the effect is complete when this returns.
+    /// Writes registers from `address` on. The machine has reacted to them when this returns.
     ///
     /// # Errors
-    /// The address is outside the client's blocks or the write crosses a border, or the content is not acceptable.
+    /// A register is in no block that a client may write, the write crosses the border of a block, or the machine does
+    /// not accept the values.
     pub fn write(&mut self, address: u16, values: &[u16]) -> Result<(), Exception> {
         if !(1..=123).contains(&values.len()) {
             return Err(Exception::Value);
@@ -142,7 +144,7 @@ impl SimulatedMachine {
         Ok(())
     }
 
-    /// Lets real time pass.
+    /// Advances the machine by the real time `elapsed_real`.
     pub fn tick(&mut self, elapsed_real: Duration) {
         let mut left = elapsed_real;
         while !left.is_zero() {
@@ -166,7 +168,10 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Handles a written beat. It contains the id of its client; only the owner's beat counts.
+    /// Handles a written heartbeat: a counter and the id of the client. Only the heartbeat of the owner counts.
+    ///
+    /// # Errors
+    /// There are not exactly three registers.
     fn write_beat(&mut self, values: &[u16]) -> Result<(), Exception> {
         let [count, high, low]: [u16; 3] = values.try_into().map_err(|_| Exception::Value)?;
         self.beat_block = [count, high, low];
@@ -272,7 +277,7 @@ impl SimulatedMachine {
         image
     }
 
-    /// Updates the status block; a frozen application does not.
+    /// Updates the registers of the status block. Does nothing while the application is frozen.
     fn publish(&mut self) {
         if self.frozen {
             return;
@@ -301,12 +306,12 @@ impl SimulatedMachine {
         self.handshake.boot_id
     }
 
-    /// Returns the name of the machine.
+    /// Returns the name and serial number of the machine.
     pub fn name(&self) -> String {
         self.handshake.body.name()
     }
 
-    /// Returns the addresses of its blocks.
+    /// Returns the addresses of the register blocks of the machine.
     pub fn layout(&self) -> &RegisterLayout {
         &self.options.layout
     }
@@ -316,22 +321,22 @@ impl SimulatedMachine {
         self.options.word_order
     }
 
-    /// Returns the newest events, the oldest of them first.
+    /// Returns the events in the log, the oldest first. Old events are removed from the log.
     pub fn log(&self) -> &[LogEntry] {
         self.handshake.log.entries()
     }
 
-    /// Sets an observer of all events from now on.
+    /// Sets an observer, which receives all events of the machine from now on.
     pub fn set_observer(&mut self, witness: Observer) {
         self.handshake.log.set_observer(witness);
     }
 
-    /// Returns the number of older events that are no longer in the log.
+    /// Returns the number of old events that were removed from the log.
     pub fn forgotten(&self) -> u64 {
         self.handshake.log.forgotten()
     }
 
-    /// Returns every START that moved the machine, as sequence number, job and cycle.
+    /// Returns every START in the log that began a job, as (sequence number, job, cycle).
     pub fn began(&self) -> Vec<(u32, u32, u16)> {
         let began = |seen: &LogEntry| match seen.what {
             HandshakeEvent::Began { start, job, cycle } => Some((start, job, cycle)),
@@ -345,7 +350,7 @@ impl SimulatedMachine {
         &mut *self.handshake.body
     }
 
-    /// Sets how many seconds of its own time pass in a real second.
+    /// Sets the number of simulated seconds in a real second.
     pub fn set_speed(&mut self, speed: f64) {
         self.handshake.speed = speed.max(0.0);
     }
@@ -357,14 +362,15 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Restarts the application, with another boot id and empty memory; an interrupted motion is fault 30.
+    /// Restarts the program of the machine, with another boot id. It keeps only the list of the jobs that it began. If
+    /// the restart interrupts a job, the machine reports fault 30.
     pub fn reboot(&mut self) {
         self.handshake.reboot();
         self.empty_memory();
     }
 
-    /// Restarts an application that keeps its boot id, forgets which jobs it began, and reports no fault: a machine
-    /// that lies.
+    /// Restarts the program of the machine without a trace: it keeps its boot id, forgets which jobs it began, and
+    /// reports no fault. A real machine must not do this.
     pub fn forget(&mut self) {
         self.handshake.forget();
         self.empty_memory();
@@ -379,13 +385,14 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Turns the key at the machine's panel.
+    /// Turns the key switch at the machine's panel to `mode`.
     pub fn set_mode(&mut self, mode: Mode) {
         self.handshake.turn_key(mode);
         self.publish();
     }
 
-    /// Opens the interlocks of [`crate::command::interlock`] in `bits`, whatever the physics says; 0 closes them again.
+    /// Opens the interlocks in `bits`, which are those of [`crate::command::interlock`], whatever their state in the
+    /// simulation. With `bits` = 0, they have the state of the simulation again.
     pub fn open_interlocks(&mut self, bits: u16) {
         self.handshake.open(bits);
         self.publish();
@@ -397,25 +404,27 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Makes an idle machine move without a command until it is held. With `strays` = false, returns the machine to the
-    /// state before that motion.
+    /// Makes an idle machine move without a command if `strays` is true. If `strays` is false, ends such a motion: the
+    /// machine is idle again.
     pub fn stray(&mut self, strays: bool) {
         self.handshake.stray(strays);
         self.publish();
     }
 
-    /// Changes the identities in force after the next payload has come into force and a client has read the slots.
+    /// Requests a fault that happens once: after the next payload has come into force and a client has read the slots,
+    /// the machine changes the identities of its payloads in force.
     pub fn spoil(&mut self) {
         self.handshake.spoil();
     }
 
-    /// Stops the machine with a fault of docs/modbus.md.
+    /// Stops the machine with the fault number `fault` of docs/modbus.md.
     pub fn fail(&mut self, fault: u16) {
         self.handshake.fail(fault);
         self.publish();
     }
 
-    /// Makes the two snapshot numbers differ at the next read of the status, as if the read were torn.
+    /// Makes the two snapshot numbers differ at the next read of the status block, as if its registers were of two
+    /// moments.
     pub fn tear_status(&mut self) {
         self.torn = true;
     }

@@ -129,7 +129,7 @@ impl BeatMonitor {
         Self { began, ..Self::default() }
     }
 
-    /// Records a beat at a time.
+    /// Records a heartbeat at the time `now`.
     pub(crate) fn record(&mut self, now: Duration) {
         self.max_silence = self.silence_at(now);
         self.first = self.first.or(Some(now));
@@ -137,7 +137,7 @@ impl BeatMonitor {
         self.count = self.count.saturating_add(1);
     }
 
-    /// Returns the statistics until now.
+    /// Returns the statistics of the heartbeats up to the time `now`.
     pub(crate) fn statistics(&self, now: Duration) -> BeatStatistics {
         let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
         let mean = between.checked_div(self.count.saturating_sub(1)).unwrap_or_default();
@@ -189,7 +189,7 @@ impl EventLog {
         self.entries.push(seen);
     }
 
-    /// Sets an observer of all events from now on.
+    /// Sets an observer, which receives all events from now on.
     pub(crate) fn set_observer(&mut self, witness: Observer) {
         self.observer = Some(witness);
     }

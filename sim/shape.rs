@@ -8,9 +8,9 @@ use crate::Vec3;
 ///
 /// Units: millimetres; `gradient` is dimensionless, `hessian` in 1/mm.
 pub trait Shape: Send + Sync {
-    /// Returns z at (x, y).
+    /// Returns the height z of the surface at (x, y), in mm.
     fn height(&self, x: f64, y: f64) -> f64;
-    /// Returns dz/dx and dz/dy.
+    /// Returns the derivatives dz/dx and dz/dy of the surface at (x, y).
     fn gradient(&self, x: f64, y: f64) -> [f64; 2];
     /// Returns the second derivatives of z: by x twice, by x and y, by y twice.
     fn hessian(&self, x: f64, y: f64) -> [f64; 3];
@@ -20,7 +20,7 @@ pub trait Shape: Send + Sync {
         [x, y, self.height(x, y)]
     }
 
-    /// Returns the unit normal on the side of +z.
+    /// Returns the unit normal above (x, y); its z component is positive.
     fn normal(&self, x: f64, y: f64) -> Vec3 {
         let [p, q] = self.gradient(x, y);
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -144,7 +144,10 @@ impl Shape for Biconic {
         [along(c[0], k[0], x), along(c[1], k[1], y)]
     }
 
-    /// With the numerator N = sum c t^2, the root r of 1 - sum k c^2 t^2 and the denominator D = 1 + r, z = N / D.
+    /// Returns the second derivatives of z: by x twice, by x and y, by y twice.
+    ///
+    /// z = N / (1 + r), with N = cx x^2 + cy y^2 and r = sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2). cx and cy are
+    /// the curvatures, kx and ky the conic constants along x and y.
     fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
         let c = self.radius_mm.map(|r| 1.0 / r);
         let a = [0, 1].map(|i| (1.0 + self.conic[i]) * c[i] * c[i]);
@@ -242,7 +245,8 @@ pub struct XyPolynomial {
 }
 
 impl XyPolynomial {
-    /// Sums the terms with each power differentiated `dx` and `dy` times.
+    /// Returns the derivative of the polynomial at (x, y), `dx` times with respect to x and `dy` times with respect to
+    /// y.
     fn derivative(&self, x: f64, y: f64, dx: u32, dy: u32) -> f64 {
         let power = |t: f64, n: u32, times: u32| {
             let factor: f64 = (0..times).map(|k| f64::from(n) - f64::from(k)).product();
@@ -285,10 +289,11 @@ impl<S: Shape> Shape for ThroughOrigin<S> {
     }
 }
 
-/// Projects a point onto a surface, from a start nearby. Returns the projection and the signed distance of the point
-/// along the normal; `None` if the iteration does not converge.
+/// Projects the point `centre` onto a surface by Newton's method, from the start (x, y). Returns (x, y) of the
+/// projection and the signed distance of the point along the normal. Returns `None` if the iteration does not converge.
 ///
-/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0 by Newton's method.
+/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0. Here c is the point, S the point of the surface, and S_x and S_y are
+/// its derivatives with respect to x and y.
 pub(crate) fn project_onto(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
     for _ in 0..40 {
         let ([p, q], [r, s, t]) = (shape.gradient(x, y), shape.hessian(x, y));

@@ -98,7 +98,7 @@ impl Default for GrinderSpec {
 }
 
 impl GrinderSpec {
-    /// A grinder without any error, as stiff as can be, whose wheel leaves nothing between its tracks.
+    /// Returns a grinder without errors: it is infinitely stiff, and its wheel leaves no ridges between the tracks.
     pub fn perfect() -> Self {
         Self {
             wheel_radius_error_um: 0.0,
@@ -192,7 +192,7 @@ impl Default for CmmSpec {
 }
 
 impl CmmSpec {
-    /// A machine without noise, that has the part where it should be.
+    /// Returns a CMM without noise, on which the part is exactly at the expected position.
     pub fn perfect() -> Self {
         Self {
             translation_mm: [0.0; 3],
@@ -333,7 +333,7 @@ const LENGTH: &str = "0.5 to 10000 mm";
 const SHARE: &str = "0 to 1";
 
 impl WorldSpec {
-    /// Checks every number.
+    /// Checks every number of the specification.
     ///
     /// # Errors
     /// Returns the first number that is outside the range for which the simulation is valid.
@@ -405,8 +405,11 @@ impl WorldSpec {
         check_all("cmm.travel_mm_s", &[c.travel_mm_s], 0.1, 1e6, "0.1 to 1000000 mm/s")
     }
 
-    /// Checks that the surface has a height everywhere on the part. The domains of these shapes are convex, so it is
-    /// sufficient to check the rim.
+    /// Checks that the surface has a height and a slope of at most 10 everywhere on the part. It is sufficient to check
+    /// the rim, because the domain of each shape is convex.
+    ///
+    /// # Errors
+    /// A point of the rim has no height, or its slope is more than 10.
     fn check_shape(&self) -> Result<(), SpecError> {
         let (shape, [half_x, half_y]) = (self.part.shape.build(), self.part.aperture.half_mm());
         for k in 0..360 {

@@ -46,7 +46,9 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// Accepts a header. Returns false if its kind or its length is not acceptable.
+    /// Accepts the header of a payload, and then waits for its pages. `of` is the kind of machine, `limit_bytes` the
+    /// maximum length of a payload. Returns false if the machine does not use this kind of payload, or if the length is
+    /// 0 or above the limit.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
         let (kind, announced_bytes) = (words[0], order.to_u32([words[2], words[3]]));
         if slot_of(of, kind).is_none() || announced_bytes == 0 || announced_bytes > limit_bytes {
@@ -65,8 +67,8 @@ impl Inbox {
         true
     }
 
-    /// Accepts a page. Returns `None` if the page is out of order or its length is wrong, and `Some(Some(_))` with the
-    /// payload if all bytes have arrived and their CRC is right. Otherwise returns `Some(None)`.
+    /// Accepts the page in `words`. Returns `None` if the page is out of order or its length is wrong. Returns
+    /// `Some(Some(_))` with the payload if this page completes it and its CRC is right, otherwise `Some(None)`.
     pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
         if self.has_page(order, words) {
             return Some(None);
@@ -82,7 +84,7 @@ impl Inbox {
         Some(if self.bytes.len() as u32 == self.announced_bytes { self.close() } else { None })
     }
 
-    /// Returns true if a page was accepted already.
+    /// Returns true if the page whose number is in `words` was accepted already.
     pub(crate) fn has_page(&self, order: WordOrder, words: &[u16]) -> bool {
         order.to_u32([words[0], words[1]]) < self.next_page
     }
@@ -97,7 +99,7 @@ impl Inbox {
         Some(Arrived { kind: self.kind, bytes: self.bytes.clone(), identity: self.identity })
     }
 
-    /// Reports that the machine cannot use the payload that has arrived.
+    /// Marks the payload that has arrived as refused. `answer` is the number of the reason in docs/modbus.md.
     pub(crate) fn refuse(&mut self, answer: u16) {
         self.state = InboxState::Refused;
         self.reason = answer;
@@ -115,7 +117,7 @@ impl Inbox {
     }
 }
 
-/// Returns the slot in force for a kind of payload, `None` if the machine has no use for it.
+/// Returns the index of the slot for the payload number `kind`, or `None` if this machine does not use such payloads.
 pub(crate) fn slot_of(machine: Kind, kind: u16) -> Option<usize> {
     match (machine, kind) {
         (Kind::Cmm, 1) => Some(0),
@@ -178,8 +180,8 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
-    /// Packs the present result of a running job as an outbox without a CRC and without a `done` number. The outbox
-    /// contains only full pages.
+    /// Packs the result so far of a running job as an outbox, without a CRC and without a `done` number. The outbox
+    /// contains only full pages. Returns `None` if a value in its header is not finite.
     pub(crate) fn partial(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);
@@ -188,7 +190,8 @@ impl Outbox {
         Some(outbox)
     }
 
-    /// Packs a result as an outbox. Returns `None` if one of its figures is not finite.
+    /// Packs a result as an outbox. Returns `None` if a value in its header, for example the temperature, is not
+    /// finite.
     pub(crate) fn new(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
         if !figures.iter().all(|figure| figure.is_finite()) {
@@ -222,14 +225,15 @@ impl Outbox {
         self.header.clone()
     }
 
-    /// Returns the 116 registers of a page; beyond the last page, they give 0 data registers.
+    /// Returns the 116 registers of the page with the number `page`. A page after the last one has 0 data registers.
     pub(crate) fn page_image(&self, order: WordOrder, page: u32) -> Vec<u16> {
         let data = self.registers.chunks(PAGE_REGISTERS).nth(page as usize).unwrap_or(&[]);
         page_image(order, page, data)
     }
 }
 
-/// Returns the registers of a page of an outbox: number of the page, number of valid registers, and the registers.
+/// Returns the registers of a page of an outbox: the number of the page, the number of its data registers, and the data
+/// registers.
 pub(crate) fn page_image(order: WordOrder, page: u32, data: &[u16]) -> Vec<u16> {
     RegisterBlock::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
 }

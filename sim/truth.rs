@@ -63,7 +63,8 @@ pub(crate) enum Source {
     NotFound = 7,
 }
 
-/// Returns the stream of random numbers of a source, for its use number `number`.
+/// Creates the random number generator for one use of a source of noise; `number` counts the uses. Equal arguments give
+/// equal random numbers.
 pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
     let mut rng = crate::rng(seed);
     rng.set_stream((source as u64) << 32 | u64::from(number));
@@ -110,7 +111,8 @@ pub(crate) struct WorldState {
 }
 
 impl WorldState {
-    /// Creates the initial state; `systematic_mm` returns the systematic error of the grinder at the part's nodes.
+    /// Creates the initial state of the simulated cell. `systematic_mm` returns the systematic error of the grinder at
+    /// the nodes of the part, in mm.
     pub fn new(spec: WorldSpec, systematic_mm: impl FnOnce(&WorldSpec, &Part) -> Vec<f64>) -> Self {
         let part = Part::blank(&spec.part, blank_seed(spec.seed, 1));
         let systematic_mm = systematic_mm(&spec, &part);
@@ -147,7 +149,8 @@ impl WorldState {
         (self.passes_of_blank, self.damaged_after) = (0, None);
     }
 
-    /// Ensures that the part in the grinder is that of the job.
+    /// Assigns the part in the grinder to a job. Loads a new blank first if the last job was another one and the
+    /// specification requires a fresh part for each job.
     pub fn blank_for(&mut self, job: u32) {
         if self.spec.part.fresh_per_job && self.job.is_some_and(|other| other != job) {
             self.load_blank();
@@ -167,7 +170,8 @@ impl WorldState {
         self.placement
     }
 
-    /// Applies the defects that appear after the present number of passes. Does nothing if they are applied already.
+    /// Adds the defects that are specified to appear after the present number of passes. Does nothing if they were
+    /// added already.
     fn damage(&mut self) {
         if self.damaged_after.replace(self.passes_of_blank) == Some(self.passes_of_blank) {
             return;
@@ -245,7 +249,7 @@ pub(crate) fn locked(state: &Mutex<WorldState>) -> MutexGuard<'_, WorldState> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Returns the outbox of a job that never began.
+/// Returns the result data of a job that never began: no points and no record.
 pub(crate) fn empty_result(temperature_c: f64) -> ResultData {
     ResultData {
         kind: 0,

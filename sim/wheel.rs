@@ -49,7 +49,7 @@ pub struct PlainWheel {
 }
 
 impl PlainWheel {
-    /// Creates a wheel whose controller assumes this radius.
+    /// Creates a wheel whose controller assumes the radius `stated_mm`.
     pub(crate) fn new(world: Arc<Mutex<WorldState>>, stated_mm: f64) -> Self {
         let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;
         Self { world, radius_mm, first_track: None, previous_track: None, current_track: None }
@@ -101,7 +101,8 @@ impl PlainWheel {
         }
     }
 
-    /// Ends a complete sweep: the strips beyond the outermost tracks take the heights of those tracks.
+    /// Ends a complete sweep over the part. Grinds the strips beyond the first and the last track to the heights of
+    /// those tracks.
     pub fn finish_sweep(&mut self) {
         self.next_track();
         let world = Arc::clone(&self.world);
@@ -115,8 +116,8 @@ impl PlainWheel {
     }
 }
 
-/// Lowers the material between the bounds `along` (x) and `across` (y) to the height that `wanted` returns for a node,
-/// over the nominal surface.
+/// Grinds all nodes within the limits `along` of x and `across` of y. `wanted` returns the commanded height of a node
+/// over the nominal surface in mm, or `None` to leave the node unchanged. A node that is already lower does not change.
 fn grind(state: &mut WorldState, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
     let mu = state.spec.grinder.error_copying;
     let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);

@@ -16,14 +16,14 @@ pub enum WordOrder {
 }
 
 impl WordOrder {
-    /// Returns the two registers of a value.
+    /// Returns the two registers of a value in this word order.
     pub fn from_u32(self, value: u32) -> [u16; 2] {
         let mut words = [(value >> 16) as u16, value as u16];
         self.turn(&mut words);
         words
     }
 
-    /// Returns the four registers of a value.
+    /// Returns the four registers of a value in this word order.
     pub fn from_f64(self, value: f64) -> [u16; 4] {
         let bits = value.to_bits();
         let mut words = [48, 32, 16, 0].map(|shift| (bits >> shift) as u16);
@@ -31,7 +31,7 @@ impl WordOrder {
         words
     }
 
-    /// Reads a value from two registers.
+    /// Reads a value from two registers in this word order.
     pub fn to_u32(self, words: [u16; 2]) -> u32 {
         let [high, low] = match self {
             Self::Big => words,
@@ -40,7 +40,7 @@ impl WordOrder {
         u32::from(high) << 16 | u32::from(low)
     }
 
-    /// Reads a value from four registers.
+    /// Reads a value from four registers in this word order.
     pub fn to_f64(self, mut words: [u16; 4]) -> f64 {
         self.turn(&mut words);
         f64::from_bits(words.iter().fold(0, |bits, word| bits << 16 | u64::from(*word)))
@@ -80,7 +80,8 @@ impl RegisterBlock {
         self.words(offset, &words)
     }
 
-    /// Writes bytes that no word order changes: text, an identity.
+    /// Writes bytes, for example of a text or an identity, from the register `offset` on. The word order does not apply
+    /// to them.
     pub(crate) fn bytes(self, offset: usize, bytes: &[u8]) -> Self {
         self.words(offset, &registers_of(bytes))
     }
@@ -95,12 +96,12 @@ impl RegisterBlock {
     }
 }
 
-/// Returns the bytes of registers in the order in which they are sent.
+/// Returns the bytes of registers, the high byte of each register first.
 pub fn bytes_of(registers: &[u16]) -> Vec<u8> {
     registers.iter().flat_map(|register| register.to_be_bytes()).collect()
 }
 
-/// Returns the registers that carry some bytes; an odd last byte is followed by a zero byte.
+/// Packs bytes into registers, the high byte of each register first. An odd last byte is followed by a zero byte.
 pub fn registers_of(bytes: &[u8]) -> Vec<u16> {
     bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair.get(1).copied().unwrap_or(0)])).collect()
 }

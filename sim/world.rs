@@ -43,18 +43,18 @@ impl World {
         Ok(Self { state: Arc::new(Mutex::new(WorldState::new(spec, systematic_mm))) })
     }
 
-    /// Returns the grinder. There is only one, so give it to one wire.
+    /// Returns the simulated grinder. A world has only one grinder, so serve it on only one wire.
     pub fn grinder(&self) -> Grinder {
         Grinder::new(self.state.clone())
     }
 
-    /// Returns the measuring machine. There is only one, so give it to one wire.
+    /// Returns the simulated measuring machine. A world has only one, so serve it on only one wire.
     pub fn cmm(&self) -> Cmm {
         Cmm::new(self.state.clone())
     }
 
-    /// Returns the probe of the measuring machine, for control touch by touch. There is only one, so give it to one
-    /// wire.
+    /// Returns the probe of the measuring machine, which makes one touch for each call. A world has only one measuring
+    /// machine, so serve it on only one wire.
     pub fn touch_probe(&self) -> TouchProbe {
         TouchProbe::new(self.state.clone())
     }
@@ -98,7 +98,8 @@ impl World {
         locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
-    /// Returns the true deviations at many positions (x, y) at one moment, in mm.
+    /// Returns the true deviations of the real surface from the nominal at many positions (x, y), in mm. All values are
+    /// of one moment.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
@@ -135,7 +136,7 @@ impl World {
         locked(&self.state).placement
     }
 
-    /// Returns the true mean of the deviation over the part, in mm.
+    /// Returns the mean, over the part, of the true deviation of the real surface from the nominal, in mm.
     pub fn level_mm(&self) -> f64 {
         let state = locked(&self.state);
         let part = &state.part;

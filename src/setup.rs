@@ -189,8 +189,11 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     Ok((task, plan))
 }
 
-/// Returns the machine parameters that are compensated, with the contact points under the nodes of a correction.
-/// Returns `None` if the recipe compensates no parameter.
+/// Returns the settings for the compensation of machine parameters: the tolerances, and the points of the surface under
+/// the nodes of a correction. Returns `None` if the recipe compensates no parameter.
+///
+/// # Errors
+/// No tracks of the wheel can be planned on the surface (`ground` is an error).
 fn parameter_compensation(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -213,9 +216,9 @@ fn parameter_compensation(
     }))
 }
 
-/// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad: the rotation displaces
-/// the edge of the part by the position uncertainty. Returns `None` if the recipe does not state the expanded
-/// uncertainty (k = 2) from which both are computed.
+/// Returns two standard uncertainties of the pose in the fixture: of the position in mm, and of the rotation in rad.
+/// The first is half of `lock_uncertainty_um` (k = 2). The second is the rotation that displaces the edge of the part
+/// by the first. Returns `None` if the recipe does not state `lock_uncertainty_um`.
 fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
@@ -233,7 +236,7 @@ fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     })
 }
 
-/// Returns the minimum share of a plan's targets that must be found.
+/// Returns the minimum share (0 to 1) of the targets of a plan that the probe must find.
 fn min_found_share(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
     let share =
@@ -241,7 +244,7 @@ fn min_found_share(recipe: &Recipe) -> f64 {
     share * recipe.measure.min_coverage
 }
 
-/// Returns the acceptance limits.
+/// Returns the acceptance limits of the recipe. A missing limit is infinite.
 fn tolerance(recipe: &Recipe) -> Tolerance {
     let limit = |um: Option<Micrometres>| um.map_or(f64::INFINITY, Micrometres::mm);
     Tolerance {
@@ -253,8 +256,8 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
     }
 }
 
-/// Returns the timeout for the transfer of `bytes` over the serial line of a machine, with a margin for retries.
-/// Returns zero for a machine without a serial line.
+/// Returns the maximum time for the transfer of `bytes` bytes to a machine over a serial Modbus line, with a margin for
+/// retries. Returns zero for a machine with another wire.
 fn transfer_timeout(link: &LinkConfig, bytes: usize) -> Duration {
     let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
@@ -275,8 +278,8 @@ fn map_options(recipe: &Recipe) -> MapOptions {
     }
 }
 
-/// Returns the text of all settings that two runs must share so that one can learn from the other: the cell, the part,
-/// and the settings of grinding, measuring and compensation.
+/// Returns a text of the settings that determine the errors of a pass: the cell, and the text `kind` from
+/// [`learning_kind`]. A run can start from the results of an earlier run only if both have the same text.
 fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     let mut said = format!("cell {:?}, {kind}", cell.name);
     // Another simulated world counts as another grinder.
@@ -286,8 +289,9 @@ fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     said
 }
 
-/// Returns the text of [`learning_setting`] without the cell: the settings that runs of two cells must share so that
-/// one can start from the results of the other.
+/// Returns a text of the settings that determine the errors of a pass, without the cell: the part, and the settings of
+/// grinding, measuring and compensation. A run can start from the results of another cell only if both runs have the
+/// same text. `part` is the identity of the nominal surface.
 fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
@@ -315,8 +319,8 @@ fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize
     said
 }
 
-/// Reads or samples the nominal surface. Returns it with its path and with the SHA-256 of its source, which identifies
-/// the part.
+/// Reads the nominal surface from a file, or samples it from a formula. Returns the surface, the path of its source
+/// (the file or the recipe), and the SHA-256 that identifies the part.
 fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
@@ -341,7 +345,7 @@ fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupEr
     }
 }
 
-/// Parses the format of a recipe's table of nominal points.
+/// Returns the format of the file of nominal points, as the recipe states it: columns and units.
 ///
 /// # Errors
 /// Returns the key with an invalid value, and the reason.
@@ -349,7 +353,7 @@ pub fn nominal_table_format(words: &TableSettings) -> Result<formats::Table, (&'
     table_format(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
 }
 
-/// Parses the format of a recipe's table of points to measure.
+/// Returns the format of the file of points to measure, as the recipe states it: columns and units.
 ///
 /// # Errors
 /// Returns the key with an invalid value, and the reason.
@@ -366,7 +370,7 @@ fn table_format(words: &TableSettings, keys: [&'static str; 3]) -> Result<format
     })
 }
 
-/// Builds the nominal surface from the content of a file. Only points are projected.
+/// Builds the nominal surface from the content of the file at `path`. `projection` is used for scattered points only.
 ///
 /// # Errors
 /// Returns an error with the path of the file if its content does not make a surface.
@@ -386,7 +390,8 @@ pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjec
     }
 }
 
-/// Samples a defined surface at its spacing, within its outline.
+/// Samples a surface that is defined by a formula: at the spacing of its definition, within its outline. `path` is used
+/// in errors.
 fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
     let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm));
     let grid = grid.map_err(|source| SetupError::Definition { path: path.to_owned(), source })?;
@@ -395,8 +400,8 @@ fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, Setu
         .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
-/// Returns the identity of a formula, computed from its nodes. The same surface has the same identity in every
-/// notation.
+/// Returns the SHA-256 of the nodes of a surface. The same surface thus has the same identity, however its formula is
+/// written.
 fn surface_identity(nominal: &Nominal) -> [u8; 32] {
     let mut hash = Sha256::new();
     for point in nominal.points() {
@@ -436,8 +441,9 @@ fn reference_sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Referen
     }
 }
 
-/// Checks that the gap between the reference sphere and the part is large enough for the probe. The part counts as the
-/// box around its nominal points, extended downwards without limit, in the pose of the fixture.
+/// Checks that the gap between the reference sphere and the part is large enough for the probe. The part is
+/// approximated by the box around its nominal points in the pose of the fixture; the box is extended downwards without
+/// limit. Returns an error if the gap is too small.
 fn check_sphere(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -548,13 +554,17 @@ fn surface_and_outline(recipe: &Recipe, nominal: &Nominal) -> Result<SurfaceAndO
     Ok((if is_from_below(recipe) { field.mirrored() } else { field }, outline))
 }
 
-/// Returns true if the part is machined from the side of -z. It is then also measured from that side.
+/// Returns true if the recipe sets the side of -z as the measured side. The part is then ground from this side too.
 fn is_from_below(recipe: &Recipe) -> bool {
     recipe.measure.side.side() == Some(Side::Opposite)
 }
 
-/// Returns the track distance in mm, from the recipe or from the allowed scallops, and the scallops between the tracks.
-/// The scallops are `None` if no path over the part can be computed.
+/// Returns the distance between the tracks of the wheel in mm, and the scallops (the ridges between the tracks). The
+/// distance is that of the recipe, or the largest one with which the scallops stay small enough. The scallops are
+/// `None` if no path over the part can be planned (`ground` is an error) and the recipe sets the distance.
+///
+/// # Errors
+/// No path can be planned, and the recipe sets no distance.
 fn track_distance(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -588,8 +598,8 @@ fn track_distance(
     Ok((track_mm, Some(unit.with_track_mm(track_mm))))
 }
 
-/// Returns the maximum track distance, in mm, at which the scallops stay within their share of the tolerances of a
-/// recipe. The result is rounded down to two digits.
+/// Returns the maximum track distance in mm at which the scallops use at most the share [`MAX_SCALLOP_SHARE`] of each
+/// tolerance. The result is rounded down to two significant digits. It is infinite if the recipe has no tolerance.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     let share = |limit: Option<Micrometres>| limit.map_or(f64::INFINITY, |um| MAX_SCALLOP_SHARE * um.mm());
     let most_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
@@ -600,7 +610,8 @@ pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     (most_mm * per_mm).floor() / per_mm
 }
 
-/// Returns the settings for the programs of a part.
+/// Returns the settings from which the program of each pass of a part is written. `ground` is the surface as a height
+/// over x and y with its outline, `track_mm` the distance between the tracks.
 fn programs(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -652,8 +663,8 @@ fn programs(
     }
 }
 
-/// Returns the path options `plain` with the rotary axis of the cell's grinder and the tilt of the wheel from the
-/// recipe.
+/// Returns the path options `plain`, completed by the rotary axis of the grinder, from the cell, and by the tilt of the
+/// wheel, from the recipe.
 fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
     let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
     let rotary = cell.grinder.rotary.map(|head| {
@@ -678,8 +689,8 @@ fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOpti
     PathOptions { rotary, tilt: lean, ..plain }
 }
 
-/// Returns the wheel of a recipe in the form that paths use. A cup is tilted by more than the slope of the part, unless
-/// the recipe sets the angle.
+/// Converts the wheel of a recipe into the form for path planning. If the recipe sets no tilt for a cup wheel, the tilt
+/// is the largest slope of the part plus a margin.
 fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
     const CUP_TILT_MARGIN_RAD: f64 = 0.0873;
     match *wheel {
@@ -699,7 +710,8 @@ fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
     }
 }
 
-/// Returns the thermal expansion of part and scales, if the recipe states that of the part.
+/// Returns the thermal expansion of the part and of the scales of the measuring machine. Returns `None` if the recipe
+/// does not state the expansion of the part.
 fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<ThermalExpansion> {
     const MILLIONTH: f64 = 1e-6;
     let of_part = recipe.part.expansion_um_m_k?;
@@ -780,9 +792,10 @@ pub fn create_drivers(
     Ok((cmm, grinder))
 }
 
-/// Returns the settings of a machine with a Modbus wire; `None` for a machine with another wire.
+/// Returns the settings for the driver of a machine on a Modbus line; `None` for a machine with another wire. `owner`
+/// and `epoch` identify this client to the machine.
 ///
-/// `simulated` states whether the cell's machines are simulated. A machine that reports the opposite is refused.
+/// `simulated` is true if the machines of the cell are simulated. A machine that reports the opposite is refused.
 pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (line, unit) = link.wire.modbus_line()?;
     Some(ModbusSettings::from_context(line, unit, &driver_context(link, simulated, [owner, epoch])))
@@ -830,13 +843,14 @@ pub fn create_grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
     link.wire.create_grinder(&DriverContext { cell_folder, ..driver_context(link, cell.simulated, [1, 1]) })
 }
 
-/// Returns the box of allowed positions of the probe's centre, as minimum and maximum in mm.
+/// Returns the box of allowed positions of the probe's centre, as its minimum and maximum corner in mm. Returns `None`
+/// if the cell file does not state it.
 fn probe_travel_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.min_mm, travel.max_mm])
 }
 
-/// Returns the context for the driver of a machine, without its wire. The values that depend on the part or on the run
-/// are empty.
+/// Returns a context for the driver of a machine in which all values of the part and of the run are empty. A caller
+/// that needs them sets them. `owner` and `epoch` identify this client to the machine.
 fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
     DriverContext {
         part: "",
@@ -857,7 +871,7 @@ fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) 
     }
 }
 
-/// Returns the time between two polls of a machine.
+/// Returns the interval at which the status of a machine is read.
 pub fn poll_interval(link: &LinkConfig) -> Duration {
     if link.wire.is_by_person() { link.timing.poll.max(MIN_MANUAL_POLL_INTERVAL) } else { link.timing.poll }
 }

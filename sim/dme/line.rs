@@ -15,7 +15,8 @@ impl Tag {
     /// Tag of a message that no command requested.
     pub const UNSOLICITED: Self = Self { event: true, number: 0 };
 
-    /// Returns true for the tag of an event command, which is carried out at once.
+    /// Returns true for the tag of an event command. The server carries out such a command at once, before the queued
+    /// commands.
     pub fn is_event(self) -> bool {
         self.event
     }
@@ -39,7 +40,8 @@ pub struct DmeError {
 }
 
 impl DmeError {
-    /// Creates an error of the standard, with its severity.
+    /// Creates an error of the I++ DME standard with its number and severity. `cause` is the command or the text that
+    /// caused it.
     pub fn new(number: u16, cause: &str) -> Self {
         let severity = match number {
             504 => 1,
@@ -111,10 +113,10 @@ impl Command {
 
 type Refused = (Option<Tag>, DmeError);
 
-/// Parses a line without its line end.
+/// Parses a command line, without its line end, into tag and command.
 ///
 /// # Errors
-/// Returns the tag, if it could be read, and the error to send.
+/// Returns the error to send, and the tag if the line has a valid one.
 pub fn read(line: &str) -> Result<(Tag, Command), Refused> {
     let bytes = line.as_bytes();
     if let Some(bad) = bytes.iter().find(|b| !(32..127).contains(*b)) {
@@ -150,7 +152,12 @@ fn command(text: &str) -> Result<Command, u16> {
     Ok(Command { name: name.to_owned(), arguments, fault: None })
 }
 
-/// Splits the text at commas that are outside strings and parentheses.
+/// Parses the arguments of a command. `inside` is the text between its parentheses. A comma within a string or within
+/// inner parentheses does not separate arguments.
+///
+/// # Errors
+/// Returns the error number of the standard: 502 if a string or a parenthesis is not closed, otherwise that of the
+/// first invalid argument.
 fn arguments(inside: &str) -> Result<Vec<Argument>, u16> {
     let (mut depth, mut quoted, mut from, mut parts) = (0i32, false, 0, Vec::new());
     for (at, c) in inside.char_indices() {

@@ -81,7 +81,8 @@ impl Frame {
     const MACHINE: Self =
         Self { rows: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3], written: [0.0; 6] };
 
-    /// Creates a frame from its origin and its Euler angles: theta about x', between psi about z and phi about z''.
+    /// Creates a frame from six numbers: the origin x, y, z in mm, then the Euler angles theta, psi, phi in degrees.
+    /// The rotation matrix is Rz(phi) Rx(theta) Rz(psi).
     fn new(written: [f64; 6]) -> Self {
         let [x, y, z, theta, psi, phi] = written;
         let about_z = |deg: f64| {
@@ -141,13 +142,13 @@ pub struct DmeMachine {
     pub(super) events: Vec<MachineEvent>,
 }
 
-/// Returns true if the command moves the machine.
+/// Returns true if the command with this name moves the machine.
 pub(super) fn moves(command: &str) -> bool {
     matches!(command, "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home")
 }
 
 impl DmeMachine {
-    /// Creates a machine with its probe high over its table.
+    /// Creates a machine with its probe at the top of the travel, over the middle of the table.
     pub fn new(probe: TouchProbe, options: Options) -> Self {
         let [least, most] = probe.volume_mm();
         let at_mm = [0.5 * (least[0] + most[0]), 0.5 * (least[1] + most[1]), most[2]];
@@ -184,17 +185,17 @@ impl DmeMachine {
         self.can_scan = false;
     }
 
-    /// Makes the server hide the radius of its tool.
+    /// Makes the server report no radius of its tool from now on.
     pub fn hide_radius(&mut self) {
         self.reports_radius = false;
     }
 
-    /// Returns how often the probe came to the part: touches and scans.
+    /// Returns the number of touches and scans so far. A scan counts once.
     pub fn contacts(&self) -> u32 {
         self.contacts
     }
 
-    /// Moves the probe up as far as it goes, as a person would.
+    /// Moves the probe to the top of its travel, as a person at the machine would.
     pub fn lift(&mut self) {
         self.at_mm[2] = self.probe.volume_mm()[1][2];
         self.to_mm = self.at_mm;
@@ -218,17 +219,18 @@ impl DmeMachine {
         (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
     }
 
-    /// Ends the motion of the command at its target position.
+    /// Moves the probe to the target position of its current motion, and ends the motion.
     pub(super) fn arrive(&mut self) {
         self.stop_short(1.0);
     }
 
-    /// Sets the position of the probe during a scan.
+    /// Sets the position of the probe's centre during a scan, in the machine's frame.
     pub(super) fn set_position(&mut self, at_mm: Vec3) {
         self.at_mm = at_mm;
     }
 
-    /// Ends the motion after the share `share` of its path, from 0 to 1.
+    /// Ends the current motion after the fraction `share` of its path, from 0 to 1. Releases the part if the probe is
+    /// then high enough above its last contact.
     pub(super) fn stop_short(&mut self, share: f64) {
         self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
         self.to_mm = self.at_mm;
@@ -239,7 +241,10 @@ impl DmeMachine {
         }
     }
 
-    /// Begins a command, and returns the result that it has when its time is over.
+    /// Begins a command. Returns its duration and the result that the server sends at the end of that time.
+    ///
+    /// # Errors
+    /// Returns the error with which the machine refuses the command.
     pub(super) fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
         let no = |number| DmeError::new(number, &command.name);
         let arguments = &command.arguments[..];
@@ -347,8 +352,8 @@ impl DmeMachine {
         if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
     }
 
-    /// Returns a position in the machine's frame from the named axes; axes that are not named keep their value. Returns
-    /// `None` if an argument is not an axis with one number.
+    /// Returns the position in the machine's frame that the axes X, Y and Z of a command give. An axis that is not
+    /// named keeps its present value, and IJK is ignored. Returns `None` if there is any other argument.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
         let mut at = self.frame().machine_to_part(self.at_mm);
         for axis in axes {
@@ -382,7 +387,11 @@ impl DmeMachine {
         CommandResult { seconds: way_mm / speed, ..CommandResult::default() }
     }
 
-    /// Touches the real part.
+    /// Touches the surface of the simulated part. `axes` are the arguments of the command: the point X, Y, Z and the
+    /// normal IJK.
+    ///
+    /// # Errors
+    /// Returns the error number of the standard, for example 502 if the normal is missing or an argument is invalid.
     fn touch(&mut self, axes: &[Argument]) -> Result<CommandResult, u16> {
         let point_mm = self.place(axes).ok_or(502u16)?;
         let direction = axes.iter().find_map(|axis| match axis {
@@ -462,7 +471,11 @@ impl DmeMachine {
         told.collect::<Result<_, _>>().map(CommandResult::with_data)
     }
 
-    /// Sets parameters. A value beyond the machine's limits is replaced by the limit, with a warning.
+    /// Sets parameters of the tool. A value beyond a limit of the machine is replaced by the limit, with a warning that
+    /// names `cause`.
+    ///
+    /// # Errors
+    /// Returns 502 for an argument that is not a property with one number, and 510 for an unknown property.
     fn set(&mut self, properties: &[Argument], cause: &str) -> Result<CommandResult, u16> {
         let mut warnings = Vec::new();
         for property in properties {
@@ -481,7 +494,8 @@ impl DmeMachine {
     }
 }
 
-/// Returns the name of a requested property.
+/// Returns the name of the property that an argument requests, for example `X` for `X()`. Returns `None` if the
+/// argument has a value or is not a property.
 fn query_name(argument: &Argument) -> Option<String> {
     match argument {
         Argument::Name(name, Some(numbers)) if numbers.is_empty() => Some(name.clone()),

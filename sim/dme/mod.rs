@@ -52,7 +52,8 @@ struct Running {
 }
 
 impl Running {
-    /// Returns the time of the next output of this command: a line of a scan, or its end.
+    /// Returns the time at which this command sends its next output: a line of a scan, or its end. `speed` is the
+    /// number of simulated seconds in a real second.
     fn next(&self, speed: f64) -> Duration {
         let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
         line.map_or(self.ends, |line| {
@@ -76,7 +77,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// Creates a server for a machine.
+    /// Creates a server for a machine. `speed` is the number of simulated seconds in a real second. `faults` happen at
+    /// the commands that they name.
     pub fn new(machine: DmeMachine, speed: f64, faults: CommandFaults) -> Self {
         Self {
             machine,
@@ -91,12 +93,13 @@ impl Server {
         }
     }
 
-    /// Returns the machine, to read or change it.
+    /// Returns the simulated machine, to read or change it without a command.
     pub fn machine(&mut self) -> &mut DmeMachine {
         &mut self.machine
     }
 
-    /// Handles the loss of the client: the running command continues to its end, and no other command begins.
+    /// Handles the loss of the client at the time `now`. The running command continues to its end, and the waiting
+    /// commands are dropped.
     pub fn client_lost(&mut self, now: Duration) {
         self.waiting.clear();
         self.out.clear();
@@ -135,13 +138,13 @@ impl Server {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
-    /// Returns the time of the next output that the server sends without a received line; `None` if there is none.
+    /// Returns the time of the next output that needs no further line of the client, or `None` if no output is pending.
     pub fn due(&self) -> Option<Duration> {
         let running = self.running.as_ref().map(|running| running.next(self.speed));
         running.into_iter().chain(self.out.front().map(|out| out.at)).min()
     }
 
-    /// Opens the stop circuit.
+    /// Opens the stop circuit: aborts all commands. The server then refuses commands until its errors are cleared.
     pub fn emergency_stop(&mut self, now: Duration) {
         self.abandon(now, &DmeError::new(500, "emergency"));
         self.notify(&[MachineEvent::Stopped]);
@@ -149,7 +152,7 @@ impl Server {
         self.say(now, format!("E0000 ! {}", DmeError::new(500, "emergency")));
     }
 
-    /// Lets time pass, and returns the lines to send now.
+    /// Advances the simulation to the time `now`, and returns the lines that are due.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
         self.advance_time(now);
         let mut due = Vec::new();
@@ -159,7 +162,7 @@ impl Server {
         due
     }
 
-    /// Lets time pass without sending anything.
+    /// Advances the simulation to the time `now`. The lines that become due stay queued for [`Self::tick`].
     pub fn advance_time(&mut self, now: Duration) {
         while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
             if self.say_scanned() {
@@ -170,7 +173,7 @@ impl Server {
         }
     }
 
-    /// Handles a received line, without its line end.
+    /// Handles a line that the client has sent, without its line end: carries out or queues its command, or refuses it.
     pub fn receive(&mut self, text: &str, now: Duration) {
         match line::read(text) {
             Err((tag, error)) => {
@@ -213,7 +216,8 @@ impl Server {
         self.say(now, format!("{tag} %"));
     }
 
-    /// Aborts the running and the waiting commands. Returns true if there were any.
+    /// Aborts the running command and the waiting commands with `error`. Returns true if the error was sent for at
+    /// least one of them.
     fn abandon(&mut self, now: Duration, error: &DmeError) -> bool {
         let running = self.running.take();
         if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {
@@ -243,7 +247,10 @@ impl Server {
         self.running = Some(Running { tag, command, began: now, ends, done, client_gone: false });
     }
 
-    /// Carries out a command, after the checks that precede it.
+    /// Carries out a command. The server itself handles sessions and errors, the machine all other commands.
+    ///
+    /// # Errors
+    /// Returns the error with which the server refuses the command, for example 514 before the errors are cleared.
     fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
         let name = command.name.as_str();
         let no = |number| Err(DmeError::new(number, name));
@@ -267,7 +274,7 @@ impl Server {
         Ok(CommandResult::default())
     }
 
-    /// Sends the next line of a scan; returns false if there is none.
+    /// Sends the next line of the running scan. Returns false if no line is left or no scan runs.
     fn say_scanned(&mut self) -> bool {
         let Some(running) = &mut self.running else { return false };
         let at = running.next(self.speed);
@@ -331,7 +338,8 @@ impl Server {
         }
     }
 
-    /// Sends data of a command, with its fault.
+    /// Sends one line of data of the command with the tag `tag`, at the time `at`. `fault`, if there is one, changes
+    /// this line, for example by reversed fields.
     fn say_data(&mut self, tag: Tag, data: &[String], fault: Option<&Fault>, at: Duration) {
         let mut fields = data.to_vec();
         match fault {

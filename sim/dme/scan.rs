@@ -21,7 +21,12 @@ pub(super) struct Scanned {
 }
 
 impl DmeMachine {
-    /// Scans a curve along its programmed points. The scan ends where the probe loses the surface.
+    /// Scans an open curve. `closed`, `format` and `data` are the arguments of ScanOnCurve; only the values that
+    /// Regrind sends are supported. The scan ends where the probe loses the surface.
+    ///
+    /// # Errors
+    /// Returns the error number of the standard, for example 2002 if the probe cannot scan, and 506 for arguments that
+    /// are not supported.
     pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<CommandResult, u16> {
         let open = Argument::Name("Closed".into(), Some(vec![0.0]));
         let written =
@@ -90,7 +95,7 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the numbers of a line, with its fault.
+/// Returns the fields of a line of a scan, changed by `fault` if it is a fault of such lines.
 pub(super) fn spoilt(mut line: Scanned, fault: Option<&Fault>) -> Vec<String> {
     match fault {
         Some(Fault::UnaskedQuality) => line.points.iter_mut().for_each(|point| point.insert(0, "0".to_owned())),

@@ -20,7 +20,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Returns the bytes of a line with this fault.
+    /// Returns the bytes that are sent instead of `line` if this fault happens.
     pub fn spoil(&self, mut line: Vec<u8>) -> Vec<u8> {
         match self {
             Self::Lost(at) => drop(line.remove((*at).min(line.len() - 3))),

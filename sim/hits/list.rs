@@ -26,7 +26,8 @@ pub struct List {
 }
 
 impl List {
-    /// Reads a list; `None` if a row is not a target, or if there are no rows.
+    /// Parses the text of a list of targets (`plan.csv`). Returns `None` if a row is not a target, or if there are no
+    /// rows.
     pub fn read(text: &str) -> Option<Self> {
         let (about, rows): (Vec<&str>, Vec<&str>) = text.lines().partition(|line| line.starts_with('#'));
         let rows = rows.into_iter().filter(|row| !row.starts_with("index"));

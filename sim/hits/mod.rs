@@ -54,12 +54,13 @@ pub struct PartProgram {
 }
 
 impl PartProgram {
-    /// Creates a program for a machine; it has no list yet.
+    /// Creates the part program of a CMM that prints one line for each touch. It has no list of targets yet.
     pub fn new(probe: TouchProbe, options: Options, faults: PrintFaults) -> Self {
         Self { probe, options, faults, list: None, next: 0, printed: 0 }
     }
 
-    /// Restarts with a list, unless the program has this list already.
+    /// Begins to measure the list of targets in `text`. Does nothing if the text is not a list, or if it is the present
+    /// list.
     pub fn begin(&mut self, text: &str) {
         let list = List::read(text);
         if list.is_some() && list != self.list {
@@ -67,13 +68,13 @@ impl PartProgram {
         }
     }
 
-    /// Returns the time that one touch takes.
+    /// Returns the duration of one touch, in simulated time.
     pub fn per_touch(&self) -> Duration {
         Duration::from_secs_f64(self.probe.seconds_per_point())
     }
 
-    /// Touches the next target. Returns the output of this touch; `None` if no target is left. After the last target,
-    /// the probe moves clear of the part.
+    /// Touches the next target of the list, and returns the output of this touch. Returns `None` if no target is left.
+    /// After the last target, the probe moves clear of the part.
     pub fn touch_next(&mut self) -> Option<Outgoing> {
         let target = *self.list.as_ref()?.targets.get(self.next)?;
         self.next += 1;

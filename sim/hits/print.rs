@@ -31,7 +31,7 @@ impl Default for Style {
 }
 
 impl Style {
-    /// Returns the line of a touch, with its line end.
+    /// Returns the line that is printed for a touch at `at_mm`, with its line end.
     pub fn line(&self, at_mm: Vec3) -> Vec<u8> {
         let value = |k: usize| match self.whole {
             true => format!("{}", (at_mm[self.axes[k]] * 1e3).round() as i64),

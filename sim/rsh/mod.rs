@@ -90,7 +90,8 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// Creates a controller that is switched on and homed, with no program.
+    /// Creates a controller that is switched on and homed, with no program open. `speed` is the number of simulated
+    /// seconds in a real second.
     pub fn new(wheel: PlainWheel, speed: f64, faults: LineFaults) -> Self {
         Self {
             wheel,
@@ -116,7 +117,7 @@ impl Controller {
         }
     }
 
-    /// Sets an observer of all events from now on.
+    /// Sets an observer, which receives all events of the controller from now on.
     pub fn set_observer(&mut self, witness: Observer) {
         self.observer = Some(witness);
     }
@@ -153,12 +154,12 @@ impl Controller {
         self.notify(ControllerEvent::Stopped);
     }
 
-    /// Makes the machine ready again, as a person would.
+    /// Closes the stop circuit, switches the drives on and homes the machine, as a person would.
     pub fn make_ready(&mut self) {
         (self.stopped, self.on, self.homed) = (false, true, true);
     }
 
-    /// Switches to another mode or back, as a person would; a running program continues.
+    /// Switches the controller to a mode, as a person would. Does nothing while a program is active.
     pub fn set_mode(&mut self, mode: &'static str) {
         if !self.is_busy() {
             self.mode = mode;
@@ -180,8 +181,8 @@ impl Controller {
         }
     }
 
-    /// Gives control to another client. That client aborts the running program if `aborts` is true. If no program then
-    /// runs, it opens `program`.
+    /// Gives control to another client, which aborts the running program if `aborts` is true. If no program runs after
+    /// that, this client opens the program `program`.
     pub fn steal(&mut self, program: Option<&str>, aborts: bool) {
         self.owner = Some(u64::MAX);
         if aborts {
@@ -192,7 +193,8 @@ impl Controller {
         }
     }
 
-    /// Ends the controller with all its state, and starts it again.
+    /// Simulates a crash and a new start of the controller: it has then no clients and no program, and its drives are
+    /// off.
     pub fn kill(&mut self) {
         self.break_off();
         (self.clients, self.owner, self.program, self.log) = (BTreeMap::new(), None, None, None);
@@ -204,7 +206,7 @@ impl Controller {
 
     // ---- lines --------------------------------------------------------------------------------------------------------------------
 
-    /// Handles a new client.
+    /// Registers a new client with the number `client`.
     pub fn connected(&mut self, client: u64) {
         self.clients.insert(client, Client::default());
     }
@@ -214,20 +216,20 @@ impl Controller {
         self.clients.remove(&client);
     }
 
-    /// Returns true if a client is still served.
+    /// Returns true if a client is connected and has not sent `quit`.
     pub fn serves(&self, client: u64) -> bool {
         self.clients.contains_key(&client)
     }
 
-    /// Returns the time of the next action for a client without a received line: a queued line to handle, or a line to
-    /// send. Returns `None` if there is none.
+    /// Returns the time at which the controller next handles a queued line of this client, or sends a line to it,
+    /// without a further line of the client. Returns `None` if nothing is queued.
     pub fn due(&self, client: u64) -> Option<Duration> {
         let client = self.clients.get(&client)?;
         let next = client.lines.front().map(|_| client.free_at);
         next.into_iter().chain(client.out.front().map(|out| out.at)).min()
     }
 
-    /// Handles a line of a client, without its line end.
+    /// Handles a line that a client has sent, without its line end, at the time `now`.
     pub fn receive(&mut self, client: u64, line: &str, now: Duration) {
         if let Some(client) = self.clients.get_mut(&client) {
             client.lines.push_back(line.trim().to_owned());
@@ -235,7 +237,7 @@ impl Controller {
         self.attend(client, now);
     }
 
-    /// Lets time pass, and returns the lines to send to a client now.
+    /// Advances the simulation to the time `now`, and returns the lines that are due for a client.
     pub fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
         self.attend(client, now);
         let Some(client) = self.clients.get_mut(&client) else { return Vec::new() };
@@ -246,7 +248,7 @@ impl Controller {
         due
     }
 
-    /// Handles the queued lines of a client up to the time `now`.
+    /// Advances the simulation to the time `now`, and carries out the queued lines of the client `number` that are due.
     fn attend(&mut self, number: u64, now: Duration) {
         self.advance_time(now);
         loop {
@@ -297,7 +299,7 @@ impl Controller {
         }
     }
 
-    /// Carries out a line and returns the answer; `None` if the line has no answer.
+    /// Carries out a line of the client `number` and returns the answer; `None` if the line has no answer.
     fn obey(&mut self, number: u64, line: &str) -> Option<String> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default().to_ascii_lowercase();
@@ -356,8 +358,8 @@ impl Controller {
         })
     }
 
-    /// Carries out a `set`. Returns true if it is acknowledged, false if it is refused, and `None` if the client has no
-    /// control.
+    /// Carries out a `set` of the client `number`: `what` is the word after `set`, `rest` the text after that. Returns
+    /// true if it is acknowledged, false if it is refused, and `None` if the client has no control.
     fn set(&mut self, number: u64, what: &str, rest: &str) -> Option<bool> {
         let client = self.clients.get_mut(&number)?;
         match (what, rest.to_ascii_lowercase().as_str()) {
@@ -457,7 +459,7 @@ impl Controller {
         self.notify(ControllerEvent::Aborted);
     }
 
-    /// Ends the running program at its present position.
+    /// Ends the active program, with the machine at its present position.
     fn break_off(&mut self) {
         self.interpreter = Interpreter::Idle;
         self.steps.clear();
@@ -472,7 +474,7 @@ impl Controller {
         }
     }
 
-    /// Lets time pass: the machine moves along its program.
+    /// Advances the simulation to the time `now`: the machine moves along its program.
     pub fn advance_time(&mut self, now: Duration) {
         let mut left_s = now.saturating_sub(self.last_time).as_secs_f64() * self.speed;
         self.last_time = now;

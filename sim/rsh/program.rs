@@ -80,7 +80,7 @@ impl Program {
         }
     }
 
-    /// Returns the number of lines.
+    /// Returns the number of lines of the program.
     pub(super) fn len(&self) -> usize {
         self.lines.len()
     }
@@ -92,13 +92,13 @@ impl Program {
         (self.plane, self.centres_are_absolute) = ([0, 1, 2], false);
     }
 
-    /// Continues reading: the queued steps have been carried out.
+    /// Lets the reading of lines continue after a line that waits until all queued steps are carried out.
     pub(super) fn go_on(&mut self) {
         self.waits = false;
     }
 
-    /// Reads lines ahead of the motion and queues their steps in `steps`. Returns the actions that are carried out at
-    /// once.
+    /// Reads lines ahead of the motion and adds their steps to `steps`, until the queue is full, the program ends, or a
+    /// line waits for the motion. Returns the actions on the log file, which happen when a line is read.
     pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<LogAction> {
         let mut said = Vec::new();
         while !self.waits && steps.len() < MAX_QUEUED_STEPS && self.next < self.lines.len() {
@@ -169,7 +169,11 @@ impl Program {
         }
     }
 
-    /// Returns the move to a position: straight, or an arc about a centre whose missing coordinates are 0.
+    /// Returns the move to `to_mm`: straight, or an arc about `centre` if an arc mode is active. A missing coordinate
+    /// of the centre is 0.
+    ///
+    /// # Errors
+    /// There is no such arc.
     fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Waypoint, String> {
         let turn = match self.motion {
             motion @ (2 | 3) => {
@@ -184,7 +188,8 @@ impl Program {
     }
 }
 
-/// Returns the action on the log file that a comment requests; `None` for any other comment.
+/// Returns the action on the log file that the comment `text` requests, for example `(LOG,text)`; `None` for any other
+/// text.
 pub(super) fn says(text: &str) -> Option<LogAction> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));
@@ -197,7 +202,7 @@ pub(super) fn says(text: &str) -> Option<LogAction> {
     })
 }
 
-/// Returns the words of a block, each as a letter and its number, without comments.
+/// Returns the words of a block of G-code, each as a letter and its number, without comments.
 fn words(text: &str) -> Vec<(char, f64)> {
     let code = text.split([';', '(']).next().unwrap_or_default();
     let starts: Vec<usize> = code.char_indices().filter(|(_, c)| c.is_ascii_alphabetic()).map(|(at, _)| at).collect();

@@ -42,7 +42,7 @@ impl SharedServer {
         looked
     }
 
-    /// Returns the time of the server.
+    /// Returns the time since the server was created.
     pub fn now(&self) -> Duration {
         self.0.began.elapsed()
     }
@@ -51,7 +51,7 @@ impl SharedServer {
         self.0.server.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves a client until either side closes the connection, which ends its session.
+    /// Serves a client until either side closes the connection. The session of the client ends then.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
         self.serve_after(stream, None).await;
     }
@@ -104,7 +104,7 @@ pub struct ServingDme {
 }
 
 impl ServingDme {
-    /// Serves over TCP; port 0 takes any free port.
+    /// Serves an I++ DME server over TCP. Port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -112,8 +112,8 @@ impl ServingDme {
         Self::tcp_after(addr, server, None).await
     }
 
-    /// Serves over TCP a machine that gets its parts from an external grinder: it carries out each command after
-    /// everything that the grinder has done.
+    /// Serves a machine over TCP. If `grinder` is given, each command first waits until the part is ground along the
+    /// whole path that the grinder's controller has executed.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -130,7 +130,7 @@ impl ServingDme {
         Ok(Self { local_addr, server, _tasks: tasks })
     }
 
-    /// Returns the address of the server.
+    /// Returns the address of the TCP server.
     pub fn local_addr(&self) -> SocketAddr {
         self.local_addr
     }
@@ -141,7 +141,8 @@ impl ServingDme {
     }
 }
 
-/// Serves one client after another.
+/// Serves one client after another. If `grinder` is given, each command first waits until the part is ground along the
+/// whole path that the grinder's controller has executed.
 async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<ExecutedPath>) {
     loop {
         match listener.accept().await {
@@ -155,7 +156,8 @@ async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<Exec
     }
 }
 
-/// Sends lines, several in one segment unless a line is to be split; returns true if the connection is to be closed.
+/// Sends lines to the client together, but a line marked `split` byte by byte. Returns true if the last line requires
+/// that the connection is closed.
 async fn send(stream: &mut (impl AsyncWrite + Unpin), outgoing: &[Outgoing]) -> io::Result<bool> {
     let mut together = Vec::new();
     for line in outgoing {

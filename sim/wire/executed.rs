@@ -65,10 +65,11 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl ExecutedPath {
-    /// Starts the program, restarts it whenever it ends, and moves the wheel along the reported path.
+    /// Starts a helper program that reports the path that the controller executes, and moves the wheel along that path.
+    /// Restarts the program whenever it ends.
     ///
     /// # Errors
-    /// The program cannot be started at all.
+    /// The first start of the program fails.
     pub fn follow(command: Command, wheel: Wheel) -> io::Result<Self> {
         let mut command = command;
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
@@ -83,7 +84,7 @@ impl ExecutedPath {
     }
 
     /// Waits until the wheel has been moved along the whole path that the controller has executed before this call.
-    /// Returns at once if no helper program runs any more: then no more path is reported.
+    /// Returns at once if no helper program runs, because then no path is reported. Also returns after a time limit.
     pub async fn caught_up(&self) {
         let question = {
             let (question, when) = &mut *locked(&self.last_question);
@@ -116,7 +117,8 @@ impl Drop for ExecutedPath {
     }
 }
 
-/// Runs the helper program, and starts it again whenever it ends.
+/// Runs the helper program that reports the executed path, and restarts it whenever it ends, until `shared.ended` is
+/// set. Moves the wheel along the reported path.
 fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel) {
     let mut next = Ok(first);
     // Number of consecutive programs that reported nothing.
@@ -153,12 +155,14 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
     }
 }
 
-/// Returns the pause after a number of consecutive programs that reported nothing.
+/// Returns the pause before the next start of the helper program. `silent` is the number of consecutive starts after
+/// which it reported nothing.
 fn pause_after(silent: u32) -> Duration {
     (RESTART_DELAY * 2u32.pow(silent.min(8))).min(MAX_RESTART_DELAY)
 }
 
-/// Moves the wheel line by line until the lines end. Returns true if at least one line arrived.
+/// Moves the wheel along the positions in `lines`, one for each servo cycle, until the lines end. Returns true if at
+/// least one valid line arrived.
 fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {

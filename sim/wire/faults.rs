@@ -141,30 +141,31 @@ pub struct FaultPlan {
 }
 
 impl FaultPlan {
-    /// Creates a plan without faults; random choices of its rules use the seed.
+    /// Creates a plan without faults. The seed is for the random choices of rules that are added to it.
     pub fn new(seed: u64) -> Self {
         Self { rules: Vec::new(), rng: crate::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
     }
 
-    /// Creates a plan in which each request has one of the faults with a probability.
+    /// Creates a plan in which each request has a fault with the probability `share`. The fault is chosen at random
+    /// from `faults`.
     pub fn seeded(seed: u64, share: f64, faults: Vec<Fault>) -> Self {
         let mut plan = Self::new(seed);
         plan.rules.push(Rule { when: When::Chance(share), faults, skip: 0, left: u64::MAX });
         plan
     }
 
-    /// Adds a fault for the first request that the rule selects.
+    /// Adds a fault for the first request that `when` selects.
     pub fn once(self, when: When, fault: Fault) -> Self {
         self.times(1, 1, when, fault)
     }
 
-    /// Adds a fault for every request that the rule selects.
+    /// Adds a fault for every request that `when` selects.
     pub fn always(self, when: When, fault: Fault) -> Self {
         self.times(1, u64::MAX, when, fault)
     }
 
-    /// Adds a fault for `count` of the requests that the rule selects. The first of them is number `first`, counted
-    /// from 1.
+    /// Adds a fault for `count` of the requests that `when` selects. The first of them is number `first` of the
+    /// selected requests, counted from 1.
     pub fn times(mut self, first: u64, count: u64, when: When, fault: Fault) -> Self {
         self.rules.push(Rule { when, faults: vec![fault], skip: first.saturating_sub(1), left: count });
         self
@@ -193,12 +194,13 @@ impl SharedFaultPlan {
         Self::default()
     }
 
-    /// Replaces the rules; the count of requests restarts, and requests to be repeated are dropped.
+    /// Replaces the plan of faults. The count of requests restarts, and the stored requests that were to be carried out
+    /// again are dropped.
     pub fn set(&self, plan: FaultPlan) {
         *self.lock() = plan;
     }
 
-    /// Returns the faults that have happened, with their requests.
+    /// Returns the faults that have happened, each with its request.
     pub fn fired(&self) -> Vec<(Request, Fault)> {
         self.lock().fired.clone()
     }
@@ -208,7 +210,7 @@ impl SharedFaultPlan {
         self.lock().requests
     }
 
-    /// Numbers a request, and returns its faults.
+    /// Counts a request, stores its number in it, and returns the faults that happen to it.
     pub(crate) fn draw(&self, request: &mut Request) -> Vec<Fault> {
         let mut plan = self.lock();
         let FaultPlan { rules, rng, requests, fired, .. } = &mut *plan;
@@ -231,12 +233,13 @@ impl SharedFaultPlan {
         met
     }
 
-    /// Stores a request that is to be carried out again.
+    /// Stores a request, given as `unit` and `pdu`, that is carried out again before the request number `before`.
     pub(crate) fn defer(&self, before: u64, unit: u8, pdu: &[u8]) {
         self.lock().again.push((before, unit, pdu.to_vec()));
     }
 
-    /// Returns the requests that are carried out again before this one.
+    /// Removes and returns the stored requests, each as unit and PDU, that are carried out again before the request
+    /// number `number`.
     pub(crate) fn take_due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
         let mut plan = self.lock();
         let (due, later) = plan.again.drain(..).partition(|(before, ..)| *before <= number);

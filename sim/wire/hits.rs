@@ -35,10 +35,10 @@ pub struct ServingHits {
 }
 
 impl ServingHits {
-    /// Prints on a pseudo-terminal.
+    /// Creates a printer of hit lines on a new pseudo-terminal.
     ///
     /// # Errors
-    /// The system has none left.
+    /// No pseudo-terminal is available.
     pub fn serial() -> io::Result<Self> {
         let pty = Pty::open()?;
         let path = Some(pty.path().to_owned());
@@ -51,7 +51,7 @@ impl ServingHits {
         Ok(Self { path, local_addr: None, lines, tasks })
     }
 
-    /// Prints to one client after another over TCP; port 0 takes any free port.
+    /// Creates a printer of hit lines on a TCP server, for one client after another. Port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -71,17 +71,17 @@ impl ServingHits {
         Ok(Self { path: None, local_addr, lines, tasks })
     }
 
-    /// Returns the path of the serial line.
+    /// Returns the path of the pseudo-terminal, or `None` for TCP.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Returns the address of the TCP server.
+    /// Returns the address of the TCP server, or `None` for a pseudo-terminal.
     pub fn local_addr(&self) -> Option<SocketAddr> {
         self.local_addr
     }
 
-    /// Sends bytes, and returns after they are on the line or when there is no client.
+    /// Sends bytes, and waits until they are on the line. Returns at once if there is no client any more.
     pub async fn send(&self, bytes: &[u8]) {
         let (written, are_written) = oneshot::channel();
         if self.lines.send(LineAction::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
@@ -89,13 +89,13 @@ impl ServingHits {
         }
     }
 
-    /// Ends the connection.
+    /// Closes the connection after the bytes that are already queued.
     pub async fn hang_up(&self) {
         let _ = self.lines.send(LineAction::HangUp).await;
     }
 
-    /// Runs a part program that measures every list that appears as `plan.csv` in a folder, faster than real time by
-    /// the factor `speed`.
+    /// Runs a part program that measures each list of targets that appears as `plan.csv` in a folder, and prints its
+    /// touches. `speed` is the number of simulated seconds in a real second.
     pub fn run(&mut self, mut program: PartProgram, folder: &Path, speed: f64) {
         let (list, lines) = (folder.join("plan.csv"), self.lines.clone());
         self.tasks.spawn(async move {
@@ -123,7 +123,10 @@ impl ServingHits {
     }
 }
 
-/// Prints the queued bytes until the other side is gone or the line is hung up.
+/// Prints the queued bytes to `stream` until the other side closes it or a hang-up is queued.
+///
+/// # Errors
+/// The stream cannot be read or written any more.
 async fn print(
     mut stream: impl AsyncRead + AsyncWrite + Unpin,
     inbox: &mut mpsc::Receiver<LineAction>,

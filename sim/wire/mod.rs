@@ -70,7 +70,7 @@ impl SharedMachine {
         look(&mut self.lock().machine)
     }
 
-    /// Lets the time since the last call pass at the machine.
+    /// Advances the machine by the real time since the last call, but at most by `MAX_TICK`.
     fn advance_time(&self) {
         let now = Instant::now();
         let last = self.lock().ticked.replace(now).unwrap_or(now);
@@ -91,7 +91,7 @@ impl SharedMachine {
 /// Machines of a wire with their unit ids.
 pub type Units = Vec<(u8, SharedMachine)>;
 
-/// Lets real time pass at the machines until it is dropped.
+/// Advances the machines with real time. Runs until its future is dropped.
 pub async fn advance_machines(machines: Vec<SharedMachine>) {
     let mut ticks = tokio::time::interval(TICK);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -164,7 +164,7 @@ impl Delivery {
     }
 }
 
-/// Carries out a request, and returns the answer as the wire delivers it.
+/// Carries out a Modbus request with the faults that are due, and returns the answer as the wire delivers it.
 fn answer(units: &Units, faults: &SharedFaultPlan, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
     let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
     let mut request = describe(machine, unit, pdu);
@@ -262,7 +262,8 @@ fn refusal(function: u8, exception: Exception) -> Vec<u8> {
     vec![function | 0x80, exception as u8]
 }
 
-/// Carries out functions 3, 6 and 16, and returns the protocol data unit of the answer.
+/// Carries out a Modbus request: function 3 (read), 6 or 16 (write). Returns the protocol data unit of the answer,
+/// which is an exception for any other function.
 fn carry_out(machine: &SharedMachine, pdu: &[u8]) -> Vec<u8> {
     let word = |at: usize| u16::from_be_bytes([pdu[at], pdu[at + 1]]);
     let done = match (pdu[0], pdu.len()) {
@@ -304,7 +305,7 @@ impl Drop for Serving {
 }
 
 impl Serving {
-    /// Serves machines over Modbus TCP; port 0 takes any free port.
+    /// Serves machines, each with its unit number, over Modbus TCP. Port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -312,7 +313,7 @@ impl Serving {
         Self::tcp_with(addr, units, SharedFaultPlan::none()).await
     }
 
-    /// Serves machines over Modbus TCP with faults.
+    /// Serves machines, each with its unit number, over Modbus TCP with the faults of a plan.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -346,8 +347,8 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Creates a link to the serial port at the path `at`, which a client's configuration can name. The link exists
-    /// while the port is served.
+    /// Creates a symbolic link at the path `at` to the serial port, so that a client's configuration can have a fixed
+    /// path. The link exists while the port is served.
     ///
     /// # Errors
     /// Something that is not a link exists there, the link cannot be made, or this is not a serial port.
@@ -401,27 +402,27 @@ impl Serving {
         self.tasks.spawn(async move { rtu::serve_rtu(port, machines, line, faults).await });
     }
 
-    /// Returns the address of the server, if it is TCP.
+    /// Returns the address of the TCP server, or `None` for a serial port.
     pub fn local_addr(&self) -> Option<SocketAddr> {
         self.local_addr
     }
 
-    /// Returns the path of the serial port, for a client to open if it is a pseudo-terminal.
+    /// Returns the path of the serial port, or `None` for TCP. A client can open it if it is a pseudo-terminal.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Returns the machines with their units.
+    /// Returns the machines, each with its unit number.
     pub fn machines(&self) -> &Units {
         &self.machines
     }
 
-    /// Returns the machine of a unit.
+    /// Returns the machine with a unit number, or `None` if there is none.
     pub fn machine(&self, unit: u8) -> Option<&SharedMachine> {
         self.machines.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine)
     }
 
-    /// Returns the faults of this wire; they can be changed at any time.
+    /// Returns the plan of the faults of this wire. It can be changed at any time.
     pub fn faults(&self) -> &SharedFaultPlan {
         &self.faults
     }

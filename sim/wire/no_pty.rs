@@ -12,7 +12,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 pub enum Pty {}
 
 impl Pty {
-    /// Returns the error that there is no pseudo-terminal.
+    /// Returns an error, because this system has no pseudo-terminals.
     ///
     /// # Errors
     /// Always.
@@ -21,7 +21,7 @@ impl Pty {
         Err(io::Error::new(io::ErrorKind::Unsupported, why))
     }
 
-    /// Returns the path that a client opens.
+    /// Returns the path of the pseudo-terminal that a client opens.
     pub fn path(&self) -> &Path {
         match *self {}
     }

@@ -24,10 +24,13 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Opens a pseudo-terminal that changes no byte.
+    /// Opens a pseudo-terminal in raw mode, which changes no byte.
     ///
     /// # Errors
-    /// The system has none left. Panics outside a tokio runtime, as all its sockets do.
+    /// No pseudo-terminal is available.
+    ///
+    /// # Panics
+    /// Panics outside of a tokio runtime.
     pub fn open() -> io::Result<Self> {
         let near = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
         grantpt(&near)?;
@@ -45,13 +48,13 @@ impl Pty {
         Ok(Self { near, far, path })
     }
 
-    /// Returns the path that a client opens.
+    /// Returns the path of the pseudo-terminal that a client opens.
     pub fn path(&self) -> &Path {
         &self.path
     }
 }
 
-/// Links a terminal to another path.
+/// Creates a symbolic link at the path `at` to a pseudo-terminal.
 pub(super) fn link(terminal: &Path, at: &Path) -> io::Result<()> {
     std::os::unix::fs::symlink(terminal, at)
 }

@@ -41,12 +41,12 @@ impl SharedController {
         looked
     }
 
-    /// Lets the machine's time pass.
+    /// Advances the simulated machine to the present time.
     pub fn advance_time(&self) {
         self.locked().advance_time(self.now());
     }
 
-    /// Returns the time of the controller.
+    /// Returns the time since the controller was created.
     pub fn now(&self) -> Duration {
         self.0.began.elapsed()
     }

@@ -27,7 +27,7 @@ pub struct Line {
 }
 
 impl Line {
-    /// Returns a line without hardware that takes the time of its baud rate.
+    /// Returns a simulated line that delays each frame by its transmission time at the baud rate.
     pub fn paced(baud: u32) -> Self {
         Self { baud, paced: true }
     }
@@ -37,18 +37,18 @@ impl Line {
         Self { baud, paced: false }
     }
 
-    /// Returns the duration of a number of characters.
+    /// Returns the transmission time of `count` characters of 11 bits.
     pub fn characters(&self, count: usize) -> Duration {
         Duration::from_secs_f64(11.0 * count as f64 / f64::from(self.baud.max(1)))
     }
 
-    /// Returns the silence between frames: 3.5 characters, 1.75 ms above 19200 baud.
+    /// Returns the silence between two frames: 3.5 characters, or 1.75 ms above 19200 baud.
     pub fn gap(&self) -> Duration {
         if self.baud > 19_200 { Duration::from_micros(1750) } else { self.characters(7) / 2 }
     }
 }
 
-/// Serves machines on a serial line until it is dropped or the line fails.
+/// Serves machines on a serial line. Runs until its future is dropped or the line fails.
 ///
 /// # Errors
 /// The line cannot be read or written any more.
@@ -74,7 +74,8 @@ where
     }
 }
 
-/// Returns the next frame with a correct CRC; other bytes are dropped at the next silence.
+/// Returns the next frame with a correct CRC. `heard` holds the bytes that were received and not used yet. After a
+/// wrong CRC, all bytes up to the next silence are dropped.
 async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> io::Result<Vec<u8>> {
     let mut broken = false;
     loop {
@@ -112,7 +113,8 @@ async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> 
     }
 }
 
-/// Returns the length of the frame that begins here, if it is known.
+/// Returns the length in bytes of the frame at the beginning of `heard`. Returns `None` if its function is unknown or
+/// too few bytes have arrived.
 fn length(heard: &[u8]) -> Option<usize> {
     match heard.get(1)? {
         1..=6 | 8 => Some(8),

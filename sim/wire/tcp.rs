@@ -10,10 +10,10 @@ use tokio::task::JoinSet;
 use super::faults::SharedFaultPlan;
 use super::{After, Framing, Units, answer};
 
-/// Serves machines to any number of clients until it is dropped; it then closes every connection.
+/// Serves machines to any number of clients. Runs until its future is dropped, and then closes every connection.
 ///
 /// # Errors
-/// None; the type is that of the other wires.
+/// Never; the type is the same as that of the serial line.
 pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) -> io::Result<()> {
     let mut clients = JoinSet::new();
     loop {

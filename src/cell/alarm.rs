@@ -396,14 +396,17 @@ catalogue! {
 }
 
 impl AlarmId {
-    /// Returns the general alarm of the catalogue, without the values of a case.
+    /// Returns the general alarm of this id, as the catalogue of alarms lists it. Its text names no machine and no
+    /// value of a certain event.
     pub fn generic_alarm(self) -> Alarm {
         Alarm::new(self, "")
     }
 }
 
 impl Alarm {
-    /// Builds an alarm from its entry in the catalogue and the values of a case.
+    /// Builds the alarm `id` from its entry in the catalogue. `case` states what happened this time, with the machine
+    /// and the values, and is appended to the general description after a colon. With an empty `case`, the text is the
+    /// general description alone.
     pub(super) fn new(id: AlarmId, case: impl AsRef<str>) -> Self {
         let (head, consequence, clears, remedy) = id.entry();
         let what = match case.as_ref() {

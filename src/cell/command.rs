@@ -133,7 +133,7 @@ impl Command {
         format_label(self.label())
     }
 
-    /// Returns the parts of [`Self::name`]: the kind of command and the machine.
+    /// Returns the name of the kind of command, and its machine if it has one. [`Self::name`] formats both.
     pub(super) fn label(&self) -> (&'static str, Option<Device>) {
         let (name, device) = match self {
             Self::Connect { device } => ("connect", Some(device)),

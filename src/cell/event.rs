@@ -492,7 +492,9 @@ pub struct RecordedParameter {
 }
 
 impl RecordedParameter {
-    /// Formats the estimate for people.
+    /// Returns a sentence for people: the parameter with its estimated error, the expanded uncertainty (k = 2), and how
+    /// much of the error is compensated. If nothing is compensated, the sentence says that the error is not
+    /// significant.
     pub fn in_words(&self) -> String {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
         let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
@@ -643,7 +645,8 @@ impl Event {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })
     }
 
-    /// Returns the origin of the event for the record: the name of the person, the machine or the cell, and the place.
+    /// Returns who or what caused the event, for the record: a name and a place. For a person, these are the name and
+    /// the station of the [`Actor`]; for a machine, its name and "wire"; otherwise "cell" and "regrind".
     pub fn origin(&self) -> (String, String) {
         match (self.actor(), self.device()) {
             (Some(Actor { name, station }), _) => (name.clone(), station.clone()),
@@ -652,7 +655,8 @@ impl Event {
         }
     }
 
-    /// Describes the event for a message to a person, if the event does not fit the state of the cell.
+    /// Returns a short noun phrase for the event, such as "the order to hold" or "a report of the grinder". It is used
+    /// in the message that refuses an event that the current state does not accept.
     pub(super) fn in_words(&self) -> String {
         match self {
             Self::LoadConfirmed { .. } => "the confirmation that the part is loaded".to_owned(),

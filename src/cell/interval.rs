@@ -92,8 +92,10 @@ impl RecordedInterval {
         quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
     }
 
-    /// Returns the recorded quantiles. If there are none, returns quantiles of a normal distribution on each side of
-    /// the median: the distance from the median to that end of the interval counts as 1.96 standard uncertainties.
+    /// Returns the quantiles of the figure in mm, one for each probability that an interval records. If none were
+    /// recorded, returns quantiles of two half normal distributions about the median: below the median, the distance
+    /// from the median to the lower end of the interval counts as 1.96 standard deviations, and above it, the distance
+    /// to the upper end.
     fn quantiles(&self) -> [f64; Self::COUNT] {
         let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
         let of_normal = |k: usize| {

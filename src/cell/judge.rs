@@ -35,8 +35,8 @@ impl Figures {
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
-    /// Returns the intervals of the peak to valley (PV) and of the root mean square (RMS). The flag is true if the PV
-    /// is the PV 99.8 %, and false if it is the PV of all points.
+    /// Returns the intervals of the two judged figures: peak to valley (PV) and root mean square (RMS). The flag is
+    /// true if the first interval is of the PV 99.8 %, and false if it is of the PV of all points.
     fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
             Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
@@ -99,7 +99,8 @@ pub struct ComparedFigure {
 }
 
 impl ComparedFigure {
-    /// Describes the probability that the figure is within its limit, for people. Returns `None` if it is not limited.
+    /// Returns a text for people with the probability that the figure is within its limit. Returns `None` if the figure
+    /// has no limit.
     pub fn probability_in_words(&self) -> Option<String> {
         let [least, most] =
             [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
@@ -117,8 +118,8 @@ fn format_percent(probability: f64) -> String {
 }
 
 impl Tolerance {
-    /// Compares the two figures that are judged with their limits: the peak to valley that the tolerance selects, and
-    /// the RMS.
+    /// Compares the two judged figures with their limits. The first is the peak to valley that the tolerance selects
+    /// (of all points or PV 99.8 %), the second is the RMS.
     pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
         let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_of);
         let compared = |name, of: RecordedInterval, limit_mm: f64| {
@@ -149,10 +150,11 @@ impl Tolerance {
         pv.max(rms) == Conformity::Within && self.exceeded_with_outliers(figures).is_some()
     }
 
-    /// Describes the outliers if the part exceeds a limit when they are included. Returns `None` otherwise.
+    /// Returns a text that names the outliers and each exceeded limit, if the part exceeds a limit when the outliers
+    /// are included. Returns `None` if it does not, or if there are no outliers.
     ///
-    /// The outliers are assumed to increase the figures of the part by as much as the figures of the points: the PV by
-    /// the same difference, the RMS by the same difference of the squares.
+    /// With the outliers, a judged figure increases as much as the figure of the measured points does: the PV by the
+    /// same difference in mm, the RMS by the same difference of the squares.
     fn exceeded_with_outliers(&self, now: &Figures) -> Option<String> {
         let left_out = now.left_out.as_ref()?;
         let [pv, rms] = self.compare(now);
@@ -246,7 +248,7 @@ fn judge_next_pass(
     tell(verdict, format!("no improvement expected, {so_far}: {figures}; {expected}"))
 }
 
-/// Returns the worse conformity of the two figures.
+/// Returns the conformity of the part: the worse one of its judged peak to valley and its judged RMS.
 fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
     let [pv, rms] = plan.tolerance.compare(now);
     pv.conformity.max(rms.conformity)
@@ -265,15 +267,16 @@ fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
         && still(rms_before, rms.median_mm, rms.expanded_mm.max(plan.stall_mm))
 }
 
-/// Returns how far the figures are from acceptance: the larger ratio of a figure to its limit. Returns the RMS if there
-/// is no limit.
+/// Returns the larger of the two ratios of a judged figure to its limit; a part is better the smaller this number is.
+/// Returns the RMS in mm if neither figure has a limit.
 pub(super) fn distance_to_acceptance(plan: &CellPlan, figures: &Figures) -> f64 {
     let compared = plan.tolerance.compare(figures);
     let shares = compared.iter().filter(|of| of.limit_mm.is_finite() && of.limit_mm > 0.0);
     shares.map(|of| of.median_mm / of.limit_mm).reduce(f64::max).unwrap_or(compared[1].median_mm)
 }
 
-/// Describes a cycle that was better than the last one.
+/// Returns the text that names the best cycle of a run: its number, its judged figures, and the folder with its
+/// correction. The text begins with "; ", because it is appended to the reason why the run ended.
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
     let [pv, rms] = judged_medians_mm(plan, figures);
     format!(

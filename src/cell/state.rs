@@ -27,7 +27,7 @@ impl Device {
         }
     }
 
-    /// Returns the machine that must be clear of the part while this one moves.
+    /// Returns the other one of the two machines.
     pub fn other(self) -> Self {
         match self {
             Self::Cmm => Self::Grinder,
@@ -208,7 +208,8 @@ impl State {
         matches!(self, Self::Stopped | Self::Aborted | Self::Complete)
     }
 
-    /// Returns the phase in which the cell is, or in which it will continue.
+    /// Returns the phase of the cycle that the cell executes. If the cell is held or suspended, this is the phase in
+    /// which it will continue. Returns `None` in a state without a phase.
     pub fn phase(self) -> Option<Phase> {
         match self {
             Self::Execute(phase)
@@ -222,8 +223,8 @@ impl State {
         }
     }
 
-    /// Returns the machine that has not confirmed that it is at rest, while the cell is held or suspended: the state of
-    /// its job is unknown. Returns `None` in all other cases.
+    /// Returns the machine whose job has an unknown state while the cell is held or suspended: it has not confirmed
+    /// that it is at rest. Returns `None` in all other cases.
     pub fn unconfirmed(self) -> Option<Device> {
         match self {
             Self::Held(phase) | Self::Suspended(phase) => {

@@ -32,7 +32,8 @@ impl Cell {
         std::mem::take(&mut self.commands)
     }
 
-    /// Handles an event and leaves the commands in `commands`.
+    /// Handles an event at the time `now` since the run began. Stores the resulting commands in the field `commands` of
+    /// the cell.
     ///
     /// # Errors
     /// Returns the reason of a refusal, or `None` if the state has no reaction to the event. In the second case the
@@ -54,8 +55,11 @@ impl Cell {
         answered
     }
 
-    /// Returns the reason why an event is foreign: it belongs to another cycle than the current one. Returns `None`
-    /// otherwise, and for the end of a job that answers a STOP.
+    /// Returns the reason for a refusal if the event belongs to another cycle than the current one. Returns `None` if
+    /// it does not.
+    ///
+    /// Also returns `None` for [`Event::Ended`] of the machine that is being stopped: STOP can reach the machine while
+    /// it still has the job of the cycle before.
     fn foreign_reason(&self, event: &Event) -> Option<String> {
         // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
         // machine then still has the job of the cycle before.
@@ -339,7 +343,8 @@ impl Cell {
     }
 }
 
-/// Returns true if an event shows that a machine executes the requested job or has ended it.
+/// Returns true if `event` shows that the machine `of` executes the job that the cell has requested, or has ended this
+/// job.
 fn shows_job(event: &Event, of: Device) -> bool {
     match event {
         Event::Started { device, .. }

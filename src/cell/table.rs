@@ -50,7 +50,7 @@ impl Reaction {
         Self { next, commands: labels.into_iter().map(format_label).collect() }
     }
 
-    /// Returns true if the event did not fit.
+    /// Returns true if the cell refuses the event in this state.
     pub fn is_refusal(&self) -> bool {
         self.commands.iter().any(|command| command == REFUSE)
     }
@@ -171,7 +171,8 @@ fn sample_plan(disposal: HoldOrStop) -> CellPlan {
     }
 }
 
-/// Returns sample events of every kind for a cycle, with the values on which the cell decides.
+/// Returns sample events of every kind, all of them for cycle `cycle`. They cover all values on which the decisions of
+/// the cell depend.
 pub fn sample_events(cycle: u32) -> Vec<Event> {
     let mut events = order_events();
     for device in Device::BOTH {

@@ -49,8 +49,8 @@ impl Cell {
         }
     }
 
-    /// Updates the furthest position that the cell has reached. If the position advances in the job of a machine,
-    /// resets the failure series of this machine.
+    /// Updates the furthest position that the cell has reached: the cycle and its phase. If the position advances while
+    /// a machine has a job, resets the [`FailureSeries`] of this machine.
     pub(super) fn update_furthest_position(&mut self) {
         let Some(phase) = self.state.phase() else { return };
         let place = (self.cycle, phase.position());
@@ -62,8 +62,8 @@ impl Cell {
         }
     }
 
-    /// Resets the failure series of a machine that has made progress. Withdraws the alarm [`AlarmId::FailsAgain`] if no
-    /// reported series is left.
+    /// Resets the [`FailureSeries`] of a machine that has made progress. If people were notified of this series, and of
+    /// no other series that still lasts, withdraws the alarm [`AlarmId::FailsAgain`].
     fn reset_failures(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.failure_series[device as usize]).reported;
         if was_told && !self.failure_series.iter().any(|vain| vain.reported) {
@@ -71,7 +71,9 @@ impl Cell {
         }
     }
 
-    /// Counts one more failure of a machine. Returns true if the failures are enough to stop retrying.
+    /// Adds a failure to the [`FailureSeries`] of a machine, or begins a new series if the last failure is too long
+    /// ago. Returns true if the series is long enough to stop retrying: it has the maximum number of failures, or at
+    /// least [`MIN_RECURRING_FAILURES`] over the time limit of the plan.
     fn count_failure(&mut self, device: Device) -> bool {
         let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
         let now = self.now;
@@ -96,8 +98,8 @@ impl Cell {
         );
     }
 
-    /// Enters a state and sets its deadline. The time limit for a hold counts from the first HOLD, even if the link is
-    /// lost and comes back meanwhile.
+    /// Enters `state` and sets its deadline. If a running job is held or suspended again after a lost link, the
+    /// deadline of the first HOLD stays in force.
     pub(super) fn enter_state(&mut self, state: State) {
         if std::mem::take(&mut self.stall_notified) {
             self.withdraw(AlarmId::ProgressStands);
@@ -155,8 +157,9 @@ impl Cell {
         }
     }
 
-    /// Returns how long a running job may make no progress: first until a person is notified, after that until the job
-    /// is held.
+    /// Returns how long a running job may report no progress. Before people are notified, this is the time until the
+    /// notification, if the plan has a notification time below the limit. After the notification, or without one, it is
+    /// the time that remains until the job is held.
     fn progress_limit(&self, device: Device) -> Duration {
         let limit = self.plan.deadlines.progress[device as usize];
         let notice =
@@ -250,8 +253,8 @@ impl Cell {
         });
     }
 
-    /// Continues with the next phase. If the cell is being held or suspended, it becomes held or suspended before this
-    /// phase.
+    /// Enters the phase `next`. If the cell is holding, held, suspending or suspended, it becomes held or suspended
+    /// instead, with `next` as the phase in which it will continue.
     pub(super) fn advance(&mut self, next: Phase) {
         match self.state {
             Holding(_) | Held(_) => self.enter_state(Held(restart_phase(next))),
@@ -260,8 +263,9 @@ impl Cell {
         }
     }
 
-    /// Enters a phase and issues its command. Checks first, at every entry: in manual mode no machine is prepared or
-    /// started, and while a cause of a suspension is active, only phases that need no machine are entered.
+    /// Enters a phase and issues its command. Does not enter it in two cases. If a machine is in manual mode, the cell
+    /// is held before a job is prepared or started. While a cause of a suspension is active, the cell is suspended
+    /// before any phase that needs a machine.
     fn enter_phase(&mut self, phase: Phase) {
         if matches!(phase.job(), Some((_, JobStep::Prepare | JobStep::Start))) && self.has_manual_machine() {
             self.raise_manual_mode();
@@ -363,7 +367,8 @@ impl Cell {
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
 
-    /// Decrements the number of passes, after the grinder has proved that it did not start the pass.
+    /// Decrements the number of started passes. Called after the grinder has proved that it did not execute a START.
+    /// Does nothing for the measuring machine.
     fn uncount_pass(&mut self, device: Device) {
         self.pass_count = self.pass_count.saturating_sub(u32::from(device == Device::Grinder));
     }
@@ -415,7 +420,8 @@ impl Cell {
         }
     }
 
-    /// Handles the declaration of a person that the cell need not ask a machine again to discard its result.
+    /// Handles the declaration of a person that a machine need not discard the result of its job. The cell no longer
+    /// requests this, and becomes held before its next phase.
     pub(super) fn on_result_given_up(&mut self, phase: Phase) {
         self.withdraw(AlarmId::MachineRefused);
         self.acknowledge_refused = [false; 2];
@@ -435,7 +441,9 @@ impl Cell {
         }
     }
 
-    /// Repeats a measurement under the next cycle number, after a person resumes. No START is sent twice.
+    /// Prepares a repetition of the measurement: takes the next cycle number, and holds the cell before the plan is
+    /// sent. A person resumes the cell. The measurement gets a new number, so that no START is sent twice for one
+    /// cycle.
     pub(super) fn repeat_measurement(&mut self) {
         self.cycle += 1;
         self.enter_state(Held(Measure(JobStep::Send)));
@@ -603,8 +611,9 @@ impl Cell {
 
 // Interruptions.
 impl Cell {
-    /// Holds on the order of a person or for a cause inside the cell. A machine that moves gets HOLD; anything else
-    /// runs to the end of its phase.
+    /// Holds the cell at `phase`, on the order of a person or for a cause inside the cell. If a machine runs its job,
+    /// orders it to hold. If the phase waits for a person, the cell is held at once. Any other phase runs to its end
+    /// first.
     pub(super) fn hold(&mut self, phase: Phase) {
         match phase.job() {
             Some((device, JobStep::Run)) => {
@@ -616,8 +625,8 @@ impl Cell {
         }
     }
 
-    /// Holds a suspended cell. If the state of a job is unknown, its machine may still be moving. The cell is then
-    /// holding, and not held yet.
+    /// Changes a suspended cell to held. If the state of the job is unknown (step Reconcile), the machine may still
+    /// move, so the cell becomes holding and waits until the machine is at rest.
     pub(super) fn hold_suspended(&mut self, phase: Phase) {
         let unseen = matches!(phase.job(), Some((_, JobStep::Reconcile)));
         self.enter_state(if unseen { Holding(phase) } else { Held(phase) });
@@ -638,8 +647,9 @@ impl Cell {
         self.push(Command::HoldMachine { device });
     }
 
-    /// Handles a machine that moves without an order of the cell: orders it to hold, and also holds the machine that
-    /// runs its job.
+    /// Handles a machine that moves without an order of the cell. Raises an alarm and orders the machine to hold. Also
+    /// holds the cell, and with it the machine whose job is running. If this motion was reported before, does nothing
+    /// more.
     pub(super) fn on_unordered_motion(&mut self, phase: Phase, device: Device) {
         let known = self.machine_mut(device);
         known.clear = false;
@@ -667,8 +677,8 @@ impl Cell {
         self.raise(AlarmId::NotAutomatic, &format!("{} in manual mode", names.join(" and ")));
     }
 
-    /// Handles a machine that left automatic mode. If a machine runs a job, this job is held; a suspended job waits for
-    /// a person instead of resuming by itself.
+    /// Handles a machine that left automatic mode. If a job is in progress, raises an alarm and holds the cell. A
+    /// suspended cell becomes held, so that it waits for a person instead of resuming by itself.
     pub(super) fn on_manual_mode(&mut self, device: Device, message: &str) {
         self.machine_mut(device).manual = true;
         let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving_device()?))) else {
@@ -694,7 +704,8 @@ impl Cell {
         }
     }
 
-    /// Handles a sign of progress of the running job. Records the longest time between two signs.
+    /// Handles a progress report of the running job: resets the failures of the machine, restarts the time limit, and
+    /// stores the longest interval between two reports.
     pub(super) fn on_progressed(&mut self, device: Device) {
         self.reset_failures(device);
         if let Some(last) = self.last_progress.replace(self.now) {
@@ -703,7 +714,9 @@ impl Cell {
         self.enter_state(self.state);
     }
 
-    /// Handles a command that was not sent because it could not be recorded: the cell waits for no answer to it.
+    /// Handles a command that was not sent because it could not be recorded. No answer will come, so the cell becomes
+    /// held at `phase`. It does not become held while the job of a machine runs, or after a START, which is reported as
+    /// refused. A machine that was ordered to hold gets HOLD again.
     pub(super) fn on_not_recorded(&mut self, phase: Phase) {
         let runs = matches!(phase.job(), Some((_, JobStep::Run)));
         match self.state {
@@ -832,9 +845,9 @@ impl Cell {
         }
     }
 
-    /// Handles a lost link. A phase that needs the link waits, in the state that `wait` returns, at a step from which
-    /// it can restart. A job of the other machine continues. A machine that was ordered to hold counts as held only
-    /// after it confirms that it is at rest.
+    /// Handles a lost link. If the phase needs the link, the cell enters the state that `wait` returns, at a step from
+    /// which it can restart. A job of the other machine continues. A machine that was ordered to hold counts as held
+    /// only after it has confirmed that it is at rest. `why` is the reason of the loss.
     pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.set_link_lost(device, true);
         let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
@@ -990,8 +1003,8 @@ impl Cell {
         Ok(())
     }
 
-    /// Enters `Execute` with the running job `run`. Holds the job again if a machine is in manual mode, and suspends it
-    /// if a condition is missing.
+    /// Enters `Execute` with the phase `run`, in which a machine runs its job. If a machine is in manual mode, holds
+    /// the job again. If a condition is missing, suspends the job.
     pub(super) fn enter_running(&mut self, run: Phase) {
         self.enter_state(Execute(run));
         // The time during which the machine was held is no measure of its pace.
@@ -1058,7 +1071,9 @@ impl Cell {
         self.push(Command::Reconcile { device, cycle: self.cycle });
     }
 
-    /// Handles a restart of this program. The cell then knows only that the machines may still run the job of this run.
+    /// Handles a restart of this program by `actor`. Forgets the states of the machines, holds the cell, raises an
+    /// alarm and connects both machines. The machines may still run the job of this run, so a job that may be moving is
+    /// reconciled first.
     pub(super) fn on_restarted(&mut self, actor: &str) {
         if self.state == Completing {
             self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear");
@@ -1081,8 +1096,9 @@ impl Cell {
 
 // The ends, and time.
 impl Cell {
-    /// Ends the run in order: stops a machine that has a job, or acknowledges its result. `judged_out` is true if the
-    /// run ends because the part is not accepted.
+    /// Ends the run in order. Stops a machine that may have a job, or acknowledges the result of a finished job.
+    /// Without either, the run ends at once. `reason` is written to the ending. `judged_out` is true if the run ends
+    /// because the part is not accepted.
     pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
         reason.clone_into(&mut self.ending_reason);
         self.not_accepted = judged_out;
@@ -1110,8 +1126,9 @@ impl Cell {
         self.push(Command::Finish(ending));
     }
 
-    /// Runs the safe sequence: sends ABORT to every machine that was connected in this run; after that checks that each
-    /// is clear.
+    /// Begins the safe sequence: sends ABORT to every machine that was connected in this run. After they confirm, the
+    /// cell checks that each machine is clear of the part. Ends the run at once if no machine was connected. `reason`
+    /// is written to the ending.
     pub(super) fn abort(&mut self, reason: &str) {
         reason.clone_into(&mut self.ending_reason);
         self.abort_repeated = false;
@@ -1131,7 +1148,8 @@ impl Cell {
         }
     }
 
-    /// Starts the safe sequence again, because the program was restarted in the middle of it or of a stop.
+    /// Connects the machines of this run and begins the safe sequence (ABORT) again. Called after a restart of this
+    /// program that happened during an abort or a stop.
     pub(super) fn restart_abort(&mut self) {
         for device in Device::BOTH {
             if self.machine(device).was_connected {
@@ -1236,7 +1254,8 @@ impl Cell {
         }
     }
 
-    /// Returns true if a person is notified of a job without progress before the job is held.
+    /// Returns true if people must be notified when this job makes no progress: the plan has a notification time below
+    /// the time limit of the job, and nobody was notified yet.
     fn needs_stall_notice(&self, device: Device) -> bool {
         !self.stall_notified && self.progress_limit(device) < self.plan.deadlines.progress[device as usize]
     }
@@ -1277,8 +1296,8 @@ pub(super) fn restart_phase(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the phase from which to restart after a lost link or a restart of the program: the step Reconcile if a
-/// machine may be moving, otherwise that of [`restart_phase`].
+/// Returns the phase from which to restart `phase` after a lost link or a restart of the program. If a machine may be
+/// moving, this is the step Reconcile of its job; otherwise it is the result of [`restart_phase`].
 fn phase_after_link_loss(phase: Phase) -> Phase {
     match phase.moving_device() {
         Some(device) => Phase::from_job(device, JobStep::Reconcile),
@@ -1318,12 +1337,13 @@ pub(super) fn awaits_answer(phase: Phase, device: Device, what: MachineRequest) 
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
 }
 
-/// Returns the machine that may be moving in the phase of a state; `None` if there is none.
+/// Returns the machine that may be moving in the phase of `state`; `None` if no machine may.
 pub(super) fn running_device(state: State) -> Option<Device> {
     state.phase().and_then(Phase::moving_device)
 }
 
-/// Returns the machine whose job is being reconciled in a state; `None` if there is none.
+/// Returns the machine whose job is being reconciled in `state`, that is, whose job has an unknown state. Returns
+/// `None` if there is no such machine.
 pub(super) fn reconciling_device(state: State) -> Option<Device> {
     match state {
         Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {

@@ -239,7 +239,8 @@ fn is_folder_of_runs(folder: &Path) -> bool {
     !has_record(folder) && folders(folder).any(|run| has_record(&run))
 }
 
-/// Returns the text about files in a run folder that the record does not list.
+/// Returns lines about files in a run folder that the record does not list. Also reports a `report.html` that differs
+/// from the report that this record gives. Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
@@ -268,7 +269,9 @@ fn mark(begin: &Value) -> &'static str {
     if begin["simulation"] == true { "SIMULATION  " } else { "" }
 }
 
-/// Returns the text about the signer and the extent of the signature.
+/// Returns the text about the signature of a record: up to which record it reaches, and the keys that signed.
+/// `as_given` is true if the user gave the key with `--key`; otherwise the text warns that the key may not be that of
+/// the cell.
 fn signed(verified: &Verified, as_given: bool) -> String {
     let Verified { keys, signed, records, .. } = verified;
     let [first, others @ ..] = keys.as_slice() else {
@@ -330,7 +333,7 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     print_lines(folder, Some(head), wanted, row)
 }
 
-/// Returns a record as a row of the table.
+/// Formats a record as a line of the table: number, UTC time to the second, actor, kind, cycle, and description.
 fn row(record: &Record) -> String {
     // Whole seconds without `T` and `Z`. Within a second the sequence numbers show the order, and --json has the full
     // time.
@@ -341,7 +344,8 @@ fn row(record: &Record) -> String {
     format!("{:>6}  {utc:<19}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
 }
 
-/// Prints a line for each selected record while the records are read. Stops when the reader of the output is gone.
+/// Prints `head`, and then the text that `line` returns for each record of the run in `folder` for which `wanted`
+/// returns true. Prints while it reads. Stops without an error if the program that reads the output has ended.
 fn print_lines(
     folder: PathBuf,
     head: Option<String>,

@@ -31,8 +31,11 @@ impl Blocks {
         Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
     }
 
-    /// Paints the third component of each node over x and y. `colour` receives the mean value of a pixel divided by the
-    /// maximum absolute mean: a number from -1 to 1.
+    /// Paints the nodes `[x, y, value]` on a grid of pixels; a pixel gets the mean value of the nodes in it. `most` is
+    /// the maximum width and height in characters. `colour` returns the RGB colour for a pixel: its argument is the
+    /// mean divided by the largest absolute mean, from -1 to 1.
+    ///
+    /// Returns `None` if the nodes have no extent in x or in y, or if `most` contains 0.
     fn painted(nodes: &[[f64; 3]], most: [usize; 2], colour: impl Fn(f64) -> [u8; 3]) -> Option<Self> {
         let range = |k: usize| nodes.iter().fold([f64::MAX, f64::MIN], |[a, b], node| [a.min(node[k]), b.max(node[k])]);
         let ([x0, x1], [y0, y1]) = (range(0), range(1));
@@ -70,7 +73,8 @@ impl Blocks {
         self.rows.iter().map(|row| row.iter().map(block).chain(["\n".to_owned()]).collect::<String>()).collect()
     }
 
-    /// Puts another map of the same size to the right, at a distance of `apart` characters.
+    /// Appends the map `other`, which must have the same number of rows, to the right. Leaves `apart` empty columns
+    /// between the maps.
     pub(super) fn append_right(mut self, other: Self, apart: usize) -> Self {
         for (row, more) in self.rows.iter_mut().zip(other.rows) {
             row.extend(std::iter::repeat_n([None; 2], apart).chain(more));

@@ -61,8 +61,8 @@ impl CellMonitor {
         &self.status
     }
 
-    /// Calls [`CellMonitor::poll`] on a separate thread, and returns the monitor: a long record, or a run that does not
-    /// answer, would block the caller.
+    /// Calls [`CellMonitor::poll`] on a separate thread, and returns the monitor afterwards. The calling task is not
+    /// blocked by a long record or by a run that does not answer.
     pub(super) async fn poll_in_background(mut self) -> Self {
         let runs = self.runs.clone();
         let looked = tokio::task::spawn_blocking(move || {
@@ -93,8 +93,8 @@ impl CellMonitor {
         self.silent = Some((run, since));
     }
 
-    /// Determines the status from the records, for the case that no run listens at its control socket: a run starts or
-    /// ends, was interrupted, or has ended.
+    /// Updates the status of the cell from the records in the folder of runs. Called when no run answers at its control
+    /// socket: a run is starting or ending, was interrupted, or has ended.
     fn update_from_records(&mut self) {
         let folders: Vec<PathBuf> = control::folders(&self.runs).collect();
         self.known.retain(|run, _| folders.contains(run));

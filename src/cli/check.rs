@@ -101,7 +101,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Checks one file. Returns its kind, and its summary or its problems.
+/// Checks one file. Returns the kind of file ("dialect", "cell file" or "recipe"), and either its hash with notes or
+/// its problems.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
         let good = |(_, sha256): (_, [u8; 32])| Good { sha256: hex(&sha256), notes: Vec::new() };
@@ -166,7 +167,7 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
 /// Checks the table `[simulation]` of a recipe, the true shape of the simulated part, in the same way as the simulator.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     let Some(table) = recipe.simulation.clone() else { return Ok(()) };
-    let remedy = "correct it, or leave it out: every key has a usual value";
+    let remedy = "correct it, or remove the key: every key has a default";
     let world: WorldSpec = toml::Value::Table(table)
         .try_into()
         .map_err(|error: toml::de::Error| recipe.problem("simulation", error.message().trim(), "", remedy))?;
@@ -176,7 +177,8 @@ fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     })
 }
 
-/// Returns the value, or shows all problems of the file at their positions and returns a failure.
+/// Returns the value of `read`. If it is an error, prints all problems of the file with their positions, and returns
+/// [`Failure::Checked`].
 pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     read.map_err(|problems| match show(&problems) {
         Ok(()) => Failure::Checked { bad: 1, files: 1 },
@@ -184,7 +186,7 @@ pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     })
 }
 
-/// Shows problems: with their lines of text on a terminal, otherwise on one line each.
+/// Prints problems to standard error: on a terminal with the lines of text that they are in, otherwise one line each.
 fn show(problems: &Problems) -> Result<(), Failure> {
     let text = if io::stderr().is_terminal() {
         let columns = Term::stderr().size_checked().map_or(100, |(_, columns)| usize::from(columns));
@@ -199,7 +201,8 @@ fn show(problems: &Problems) -> Result<(), Failure> {
     }
 }
 
-/// Draws one problem: the error, its position, the line of text with the allowed values, and the remedy.
+/// Draws one problem of `problems` as text for a terminal: the error, its position, the line of the file, the allowed
+/// values, and the remedy.
 fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> String {
     let key = if problem.key.is_empty() { String::new() } else { format!("`{}` ", problem.key) };
     let title = Level::ERROR.primary_title(format!("{key}{}", problem.found));

@@ -13,7 +13,7 @@ use serde_json::Value;
 /// Parser of a command-line argument that names a variant of the enum `T`.
 pub(super) struct WordOf<T>(PhantomData<fn() -> T>);
 
-/// Returns the parser of an argument that names a variant of the enum `T`.
+/// Returns a command-line parser that converts the name of a variant into the enum `T`.
 pub(super) fn word_of<T>() -> WordOf<T> {
     WordOf(PhantomData)
 }
@@ -43,7 +43,8 @@ impl<T: Clone + DeserializeOwned + JsonSchema + Send + Sync + 'static> TypedValu
     }
 }
 
-/// Returns the names of the variants of the enum `T` with their help texts, from its JSON schema.
+/// Returns the names of the variants of the enum `T`, each with its doc comment as help text. Both are taken from the
+/// JSON schema of `T`.
 fn words<T: JsonSchema>() -> Vec<PossibleValue> {
     let schema = schemars::schema_for!(T).to_value();
     let list = |of: &Value, key: &str| of.get(key).and_then(Value::as_array).cloned().unwrap_or_default();

@@ -155,7 +155,8 @@ fn summary(amended: &Amended) -> String {
 /// Distance outside the grid, in nodes, within which the values of a map level off.
 const LEVEL_OFF_NODES: f64 = 5.0;
 
-/// Reads a nominal surface, and returns it as a target surface without a correction.
+/// Reads the nominal surface in `file` and returns it as the target surface of a pass without a correction. `table` is
+/// the format of the file if it is a table of points.
 fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
     let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };

@@ -96,7 +96,8 @@ enum ConfirmedState {
     Over,
 }
 
-/// Sends an order to a cell. `order` builds the request from the reason on the command line.
+/// Sends an order to the cell that the command line names. `order` builds the [`Request`] from the reason of the
+/// person.
 pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Result<Outcome, Failure> {
     give(arguments.run.as_deref(), &order(arguments.reason.clone()), arguments.json)
 }
@@ -124,7 +125,8 @@ fn named_map(arguments: &Confirmation) -> Result<Option<String>, Failure> {
     }
 }
 
-/// Returns the absolute path of the named file, because the cell can run in another folder.
+/// Returns the absolute path of the file that the person names in a confirmation, because the cell can run in another
+/// folder. Returns `None` if no file is named, and an error if the file does not exist.
 fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
     let absolute =
         |path: &PathBuf| path.canonicalize().map_err(|source| Failure::NoFile { path: path.clone(), source });
@@ -147,8 +149,8 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
-/// Sends a request to the cell of a run folder. If nobody listens there, uses the socket next to the lock of its
-/// machines.
+/// Sends a request to the cell of a run folder and returns the reply. If no program listens in the folder, uses the
+/// second control socket of this run, which is next to the lock file of its machines.
 fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     match send_request(folder, request) {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
@@ -158,7 +160,8 @@ fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     }
 }
 
-/// Returns true if a program drives the run of a folder: it listens in the folder or next to the lock of its machines.
+/// Returns true if a program drives the run of a folder: it listens at the control socket in the folder, or at the one
+/// next to the lock file of its machines.
 pub(super) fn is_driven(folder: &Path) -> bool {
     is_live(folder) || socket_beside_lock(folder).is_some()
 }
@@ -168,7 +171,8 @@ fn socket_beside_lock(folder: &Path) -> Option<PathBuf> {
     runs_holding_machines().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
 }
 
-/// Returns the runs that hold machines on this computer and whose cells listen next to the machine locks.
+/// Returns the runs that have locked machines on this computer and whose cells listen: the run folder, and the control
+/// socket next to the lock file.
 fn runs_holding_machines() -> impl Iterator<Item = (PathBuf, PathBuf)> {
     MachineLock::control_sockets().into_iter().filter(|(_, door)| is_live_at(door))
 }
@@ -236,8 +240,11 @@ pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     live_or(runs, newest)
 }
 
-/// Returns the folder of the active run, or the result of `otherwise` if no run is active. Returns an error if several
-/// runs are active, or if `otherwise` finds no run.
+/// Returns the folder of the only active run in `runs`. If no run is active, returns the result of `otherwise`, which
+/// gets the folder `runs`.
+///
+/// # Errors
+/// Several runs are active, or no run is active and `otherwise` returns `None`.
 pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
     if live.is_empty() {

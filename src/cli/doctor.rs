@@ -109,7 +109,8 @@ fn in_words(finding: &Finding) -> String {
     format!("{mark:<9}{what}: {words}\n")
 }
 
-/// Checks whether runs can be written to a folder, and how much space its disk has.
+/// Checks that runs can be written to the folder `runs`, and that its disk has at least 1 GiB of free space. A missing
+/// folder is created for the check and removed again.
 fn folder(runs: &Path) -> Finding {
     const LITTLE_BYTES: u64 = 1 << 30;
     // A missing folder is created, tested, and removed again.
@@ -130,8 +131,8 @@ fn folder(runs: &Path) -> Finding {
     }
 }
 
-/// Finds runs whose folders every user of the computer can read; earlier versions created such folders. A process that
-/// reads a record can block its writer.
+/// Reports runs whose folders every user of this computer can read, because a process that reads a record can block its
+/// writer. Earlier versions created such folders. Returns `None` if there are none.
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
@@ -142,7 +143,8 @@ fn open_runs(runs: &Path) -> Option<Finding> {
     (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
 }
 
-/// Checks that the clock shows neither a time before the last recorded run nor a time before the release of this code.
+/// Checks the clock of this computer. It must not show a time before the end of the last recorded run, or before the
+/// release of this program.
 fn clock(runs: &Path) -> Finding {
     /// Date of this code. A correct clock shows no earlier time.
     const MIN: &str = "2026-01-01T00:00:00Z";
@@ -210,7 +212,8 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     ]
 }
 
-/// Checks a server that runs no job: opens a session, requests identity and status, and ends the session.
+/// Checks the connection to a machine that is a server: locks it, opens a session, requests identity and status, and
+/// ends the session. Runs no job. `made` is its driver, or the reason why there is none.
 async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M, DriverError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,
@@ -239,8 +242,9 @@ async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M
 /// Time for which the line of a machine that prints its hits is read.
 const LISTENS: Duration = Duration::from_secs(5);
 
-/// Checks a machine that only prints its hits: reads its line for [`LISTENS`], and reports each printed line with the
-/// formats that match it.
+/// Checks the connection to a measuring machine that only prints its hits. Listens for at most [`LISTENS`]. Reports
+/// which formats fit the line that the machine prints, or that no line arrived. `made` is its driver, or the reason why
+/// there is none.
 async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Finding {
     let what = Device::Cmm.to_string();
     let _taken = match lock_machine(link, MachineKind::Cmm, Path::new("regrind doctor")) {

@@ -233,8 +233,8 @@ impl From<PlantError> for Failure {
 }
 
 impl Failure {
-    /// Returns the failure for a cell that cannot be reached. If this user has no permission, it is unknown whether a
-    /// cell runs there.
+    /// Returns the failure for a cell of the run in `folder` that did not answer a request. The kind of `source`
+    /// decides: no permission (a cell may or may not run there), a timeout, or no program that listens.
     pub(super) fn unreached(folder: &std::path::Path, source: io::Error) -> Self {
         let path = folder.to_owned();
         match source.kind() {
@@ -284,7 +284,8 @@ impl Failure {
         }
     }
 
-    /// Returns the failure of a registration with the name of the file or argument that caused it.
+    /// Converts the error of a registration into a failure that names its cause: the nominal file, the measured file,
+    /// or the command-line option to change. `nominal` and `measured` are the paths of the two files.
     pub(super) fn of_registration(source: RegistrationError, nominal: &Path, measured: &Path) -> Self {
         use RegistrationError::*;
         let hint = match source {

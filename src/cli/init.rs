@@ -112,8 +112,8 @@ struct InitSettings {
     part: Option<String>,
 }
 
-/// Returns the values from the arguments. A person at a terminal is asked for missing ones, unless the folder was
-/// given.
+/// Returns the settings for the new folder from the arguments. If the folder is missing there, asks a person at the
+/// terminal for each missing setting. Returns an error if the folder is missing and there is no terminal.
 fn read_settings(arguments: &Arguments) -> Result<InitSettings, Failure> {
     let Arguments { folder, machines, part } = arguments.clone();
     if let Some(folder) = folder {
@@ -150,7 +150,8 @@ fn ask_for_machines() -> Result<Machines, Failure> {
     })
 }
 
-/// Asks until the answer is valid. Enter alone selects the default.
+/// Prints `question` and reads answers until `read` accepts one. An empty answer stands for the default `usual`.
+/// Returns an error if the input ends.
 fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, Failure> {
     loop {
         super::print(&format!("{question} [{usual}]: "))?;
@@ -187,7 +188,8 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
     Ok(Outcome::Accepted)
 }
 
-/// Returns a shipped recipe with the name of the new part, and with paths in the new folder.
+/// Returns the text of the shipped recipe `shipped` for a new folder: replaces the part name `shipped_name` by `name`,
+/// and the paths by those in the new folder.
 fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
     let named = toml::Value::String(name.to_owned()).to_string();
     shipped
@@ -198,7 +200,7 @@ fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
         .replace("config/file-exchange.toml", "cell.toml")
 }
 
-/// Returns a shipped cell file with paths in the new folder.
+/// Returns the text of the shipped cell file `shipped` for a new folder: replaces its paths by those in the new folder.
 fn cell_of(shipped: &str) -> String {
     let text = shipped
         .replace("../docs/cell.schema.json", "cell.schema.json")
@@ -213,8 +215,8 @@ fn cell_of(shipped: &str) -> String {
 
 fn readme(name: &str, machines: Machines) -> String {
     let mut text = format!(
-        "# {name}\n\n`recipe.toml` says how the part is made, measured and accepted, `cell.toml` which machines make it. An editor that knows TOML completes \
-         both from the schemas beside them. In this folder:\n\n```sh\n"
+        "# {name}\n\n`recipe.toml` states how the part is ground, measured and accepted, `cell.toml` on which machines. An editor for TOML completes \
+         both files from the schemas in this folder. Commands for this folder:\n\n```sh\n"
     );
     let commands = machines.commands();
     let width = commands.iter().map(|(command, _)| command.chars().count()).max().unwrap_or(0);

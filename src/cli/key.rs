@@ -104,7 +104,8 @@ impl Place {
     }
 }
 
-/// Returns the key that signs the runs of this user, or `None` if there is no key.
+/// Reads the key that signs the runs of this user. Returns `None` if the user has no key, and an error if the key file
+/// cannot be read.
 pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
     let path = match Place::of_this_user() {
         Place::Usual(Some(path)) if path.exists() => path,

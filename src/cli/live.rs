@@ -50,8 +50,8 @@ pub(super) struct PreparedRun {
 }
 
 impl RunContext<'_> {
-    /// Locks the machines and opens their wires. Sends nothing to them. `now` is the current time in s, as
-    /// [`super::run::epoch`] returns it.
+    /// Locks both machines and opens the connections to them. Sends nothing to a machine. `now` is the current time in
+    /// seconds, as returned by [`super::run::epoch`].
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
         let taken = [
@@ -63,7 +63,8 @@ impl RunContext<'_> {
         Ok(Machines { cmm, grinder, taken })
     }
 
-    /// Runs until the end and writes the report.
+    /// Executes the prepared run on `machines` until it ends, shows its progress, and writes its report. An error while
+    /// the report is written is only printed.
     pub(super) async fn carry_out(self, machines: Machines, work: PreparedRun) -> Result<Ending, Failure> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
@@ -126,8 +127,9 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
     Ok(ending)
 }
 
-/// Holds the cell at the next safe place on the first Ctrl-C, and aborts it on the second. After a resume, the next
-/// Ctrl-C counts as the first one, except within [`IN_ONE_GO`].
+/// Turns Ctrl-C into orders. The first Ctrl-C holds the cell at the next safe place, the second aborts it. If a person
+/// has resumed the cell in between, the next Ctrl-C holds it again, except within the time [`IN_ONE_GO`] after the
+/// first.
 async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
@@ -172,8 +174,9 @@ async fn heed_enter(orders: OrderSender, actor: Actor) {
 /// Time between two checks whether the cell still waits for the confirmation of the loaded part.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// Stops the run in order on the first event from outside, and aborts it on the next. A closing terminal can send its
-/// event twice: the second one is ignored within [`IN_ONE_GO`].
+/// Turns events that end this program, such as a closing terminal, into orders. The first event stops the run in order,
+/// the next one aborts it. A closing terminal can send its event twice, so a second one within [`IN_ONE_GO`] is
+/// ignored.
 async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     let mut first: Option<Instant> = None;
     while let Some(outside::Ending { by, hung_up }) = endings.next().await {
@@ -187,7 +190,9 @@ async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     }
 }
 
-/// Locks a machine on a line against all other runs on this computer.
+/// Locks a machine, identified by its address, against all other runs on this computer. `run` is the folder of the run
+/// that takes the lock. Returns `None` if the machine has no address, for example because it exchanges files. Returns
+/// an error if another run has the lock.
 pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.modbus_line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
@@ -205,8 +210,8 @@ pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> 
     Ok(taken)
 }
 
-/// Returns the number that identifies this run as a client of its machines. It depends only on the station and the run
-/// folder, so it is the same for every person who resumes the run.
+/// Returns the number by which the machines recognise this run as their client. It is computed from the station of
+/// `actor` and the run folder only. So it is the same if another person resumes the run at this station.
 pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");

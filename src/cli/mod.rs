@@ -187,12 +187,12 @@ fn run() -> ExitCode {
     }
 }
 
-/// Returns the runtime of asynchronous commands.
+/// Creates the tokio runtime that executes asynchronous commands.
 fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
     tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(Failure::Terminal)
 }
 
-/// Prints text. A reader that is gone is not an error.
+/// Prints text to standard output. It is not an error if the program that reads the output has ended.
 fn print(text: &str) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     // A question has no line end, so it needs a flush.
@@ -209,7 +209,9 @@ fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
     print(&text)
 }
 
-/// Parses the name of a person, a part or a place.
+/// Checks that a text can be the name of a person, a part or a place, and returns it without spaces at its ends.
+/// Returns the reason if it is empty, longer than 300 characters, or has characters that are invisible or change the
+/// order of the letters.
 fn name(text: &str) -> Result<String, String> {
     const LONGEST: usize = 300;
     match (misleading(text), text.trim()) {
@@ -223,7 +225,8 @@ fn name(text: &str) -> Result<String, String> {
     }
 }
 
-/// Parses the remark of a person, which can be empty.
+/// Checks the remark of a person, which can be empty, and returns it. Returns the reason if it has invisible characters
+/// or is too long.
 fn remark(text: &str) -> Result<String, String> {
     if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
 }

@@ -56,7 +56,8 @@ pub(super) fn surface(path: &Path, projection: PlaneProjection, table: &Table) -
     setup::nominal_from_file(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
 }
 
-/// Samples a defined surface at its spacing.
+/// Parses the definition of a surface in `text` and samples it at the spacing that the definition states. `path` is
+/// used in errors.
 ///
 /// # Errors
 /// Returns all errors of the definition, with the file name.

@@ -207,8 +207,8 @@ impl ScallopsDocument {
         Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
     }
 
-    /// Returns the tolerances of which the scallops use more than [`MAX_SCALLOP_SHARE`]. Each text has the used
-    /// percentage and the recipe key.
+    /// Returns a text for each tolerance of which the scallops use more than the share [`MAX_SCALLOP_SHARE`], such as
+    /// "40 % of acceptance.pv_um". A scallop is the ridge between two tracks of the wheel.
     fn beyond(&self) -> Vec<String> {
         let taken = [
             ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),
@@ -313,16 +313,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the arcs in the program of the first pass, if the cell uses arcs.
+/// Returns the summary of the arcs in the program of the first pass. Returns `None` if the cell uses no arcs or there
+/// is no program, and an error if the dialect cannot express the program.
 fn arcs_of(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> Result<Option<ArcsDocument>, Failure> {
     let (Some((path, summary)), Ok(programs)) = (program, &task.programs) else { return Ok(None) };
     let arcs = programs.arc_summary(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
     Ok(arcs.zip(programs.arcs_within_mm).map(|(arcs, within_mm)| ArcsDocument::new(&arcs, summary, within_mm)))
 }
 
-/// Returns the minimum measuring time in minutes: the time in which the probe searches every target from its approach
-/// distance. The moves between targets are not included, because the measuring machine chooses them. Returns `None` if
-/// the recipe has no targets.
+/// Returns a lower bound of the measuring time in minutes: the number of targets, on the part and on the reference
+/// sphere, times the time for the approach distance at probing speed. The moves between targets are not included,
+/// because the measuring machine chooses them. Returns `None` if the task has no targets on the part.
 fn min_measuring_minutes(task: &Task) -> Option<f64> {
     let targets = task.targets.len() + task.reference_sphere.map_or(0, |sphere| sphere.points);
     let seconds = targets as f64 * task.probing.approach_mm / task.probing.speed_mm_s;
@@ -345,8 +346,8 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     }
     if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MAX_MINUTES) {
         warnings.push(format!(
-            "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; see measure.speed_mm_s and how many \
-             points are required",
+            "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; raise measure.speed_mm_s, or \
+             require fewer points",
             n(minutes / 60.0),
             MAX_MINUTES / 60.0,
             counted(task.targets.len(), "point"),
@@ -357,7 +358,8 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     warnings
 }
 
-/// Returns a warning if the scallops leave too little of the tolerances for the errors that a correction can remove.
+/// Returns a warning if the scallops (the ridges between the tracks of the wheel) use more than the share
+/// [`MAX_SCALLOP_SHARE`] of a tolerance. Returns `None` if they do not.
 fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let scallops = task.scallops?;
     let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
@@ -372,23 +374,25 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     })
 }
 
-/// Returns the estimated duration of a run in words, as far as recipe and cell define it.
+/// Returns the estimated duration of a run in words: the grinding time of all passes, and the minimum time of all
+/// measurements.
 fn time_in_words(d: &Document) -> String {
     let n = three_digits;
     let measurements = counted(d.most_measurements as usize, "measurement");
     let measuring = d.least_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
-        format!("of {} minutes and more by the search moves alone", n(minutes))
+        format!("of {} minutes and more for the search moves alone", n(minutes))
     });
     format!(
-        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; the moves between points, and loading are \
-         not told by recipe and cell",
+        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; without the time for moves between \
+         points and for loading, which recipe and cell do not state",
         if d.most_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.most_passes) },
         n(d.grinding_minutes),
         n(d.least_hours_to_last),
     )
 }
 
-/// Returns the removal of a pass from the part and from the wheel, in words.
+/// Returns the text about one pass: the volume in mm3 that is removed from the part, and the volume that the wheel
+/// loses, or that this loss is unknown.
 fn removal_in_words(d: &Document) -> String {
     let n = three_digits;
     let most = f64::from(d.most_passes);
@@ -401,7 +405,8 @@ fn removal_in_words(d: &Document) -> String {
     format!("about {} mm3 a pass; {wheel}", n(d.removed_mm3_a_pass))
 }
 
-/// Plans and checks the path of the first pass. Returns `None` if only the controller of the grinder can plan the path.
+/// Plans the path of the first pass and checks it against the limits of the grinder. Returns `None` if this program
+/// cannot plan a path for the part, and the controller of the grinder has to.
 pub(super) fn first_path(
     task: &Task,
     recipe: &Recipe,

@@ -79,7 +79,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the name of the cell for publication.
+/// Returns the name of the cell, as the plant file states it for the publishers. If the plant file states no name or no
+/// receiver of live values, prints this problem and returns a failure.
 fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
     match &config.cell {
@@ -91,7 +92,7 @@ fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     }
 }
 
-/// Waits until no other program publishes this cell, and returns the publisher lock.
+/// Takes the publisher lock of the cell and returns it. Waits as long as another program holds the lock.
 async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<PublisherLock, Failure> {
     let folder = config.path().with_extension("live");
     let mut waits = false;
@@ -106,7 +107,8 @@ async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<Pu
     }
 }
 
-/// Publishes the cell until the end is requested.
+/// Publishes the state of the cell until the future `ended` completes. `cell` is the published name, and `turn` the
+/// lock against other publishers.
 async fn publish(
     config: &PlantConfig,
     cell: &str,
@@ -145,7 +147,8 @@ async fn publish(
     }
 }
 
-/// Starts all publishers that the plant file names.
+/// Starts a task for each publisher that the plant file names (Sparkplug, OPC UA). The tasks publish each status that
+/// arrives in `told`, and report connections and refused requests through `notes`.
 fn begin(
     config: &PlantConfig,
     cell: &str,
@@ -167,7 +170,8 @@ fn begin(
 
 enum Never {}
 
-/// Publishes the status of the cell, from run to run.
+/// Sends the status of the cell to the publishers through `to`. Follows each active run in the folder `runs`, one after
+/// the other. Never returns.
 async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatus>) -> Never {
     loop {
         if let Some(folder) = control::live_runs(runs).next() {
@@ -179,7 +183,7 @@ async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatu
     }
 }
 
-/// Publishes the status of a run until it no longer answers.
+/// Sends each status of the run in `folder` to the publishers through `to`. Returns when the run no longer answers.
 async fn watch_run(folder: &Path, look: &mut CellMonitor, to: &watch::Sender<CellStatus>) {
     let Ok(mut watch) = regrind_control::watch(folder).await else { return };
     while let Ok(Some(snapshot)) = watch.next().await {
@@ -199,7 +203,8 @@ fn publish_status(now: &CellStatus, to: &watch::Sender<CellStatus>) {
 
 // ---- returned events ----------------------------------------------------------------------------------------------
 
-/// Prints the events of the publishers, and records refused requests while a run is active.
+/// Prints the events of the publishers. Also records each refused request in the active run, within a [`Quota`] per
+/// minute. Returns when all publishers have ended.
 async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: bool) {
     let mut some = Vec::new();
     let mut quota = Quota::new(Instant::now());
@@ -256,14 +261,17 @@ impl Quota {
         }
     }
 
-    /// Counts a refusal, and returns true if it is to be reported individually.
+    /// Counts a refused request. Returns true if the request is reported individually: it is one of the first
+    /// [`ONE_BY_ONE`] in its minute.
     fn takes(&mut self, now: Instant) -> bool {
         self.turn(now);
         self.reported += 1;
         self.reported <= ONE_BY_ONE
     }
 
-    /// Returns the number of refusals to report together now. `over` is true if no further refusals can arrive.
+    /// Returns the number of refused requests that were not reported individually, if this number is due for a report:
+    /// once a minute, or at the end. `over` is true at the end, when no further events can arrive. Returns `None` if no
+    /// report is due.
     fn summed_up(&mut self, now: Instant, over: bool) -> Option<u64> {
         self.turn(now);
         let is_due = self.unreported > 0 && (over || !self.has_summed_up);
@@ -274,7 +282,8 @@ impl Quota {
     }
 }
 
-/// Reports a refused request, here and in the record of the active run.
+/// Prints a refused request, and records it as a remark in the active run. `by` is the client that sent the request,
+/// `what` describes the request.
 async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     say(
         json,

@@ -77,7 +77,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Prints the reason why a machine did not reach idle. The other machine can still succeed.
+/// Prints the failure to bring a machine to idle and returns false, so that the caller continues with the other
+/// machine. Returns an error only if the terminal cannot be used.
 fn print_failure(home: Result<bool, Failure>) -> Result<bool, Failure> {
     match home {
         Err(failure @ Failure::Terminal(_)) => Err(failure),
@@ -99,8 +100,12 @@ struct Recovery {
 }
 
 impl Recovery {
-    /// Shows the state of a machine and asks for each step, until the machine is idle or is left as it is. Returns true
-    /// if it is idle.
+    /// Brings a machine to idle. Shows its state, and asks a person before each step. Returns true if the machine is
+    /// idle. Returns false if the person declines a step, if a step changes nothing, or if no step is possible over the
+    /// wire of this machine.
+    ///
+    /// # Errors
+    /// The machine cannot be reached, or a step fails.
     async fn bring_home<M: Machine>(
         &mut self,
         device: Device,
@@ -139,7 +144,7 @@ impl Recovery {
             }
             super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.consequence(device)))?;
             if answer()? != step.name() {
-                super::print("the machine is left in this state\n")?;
+                super::print("no command was sent; the machine stays in this state\n")?;
                 return Ok(false);
             }
             match recovery::execute_step(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await
@@ -152,8 +157,8 @@ impl Recovery {
         }
     }
 
-    /// Returns the folder of the run on this computer that has this job number and no recorded end; `None` if there is
-    /// none.
+    /// Returns the folder of an interrupted run on this computer whose job number is `job`. Returns `None` if no run
+    /// without a recorded end has this number.
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;

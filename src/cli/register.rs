@@ -136,7 +136,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the method that the points require. A probe without a ball measures the surface itself.
+/// Returns the method of the registration: `Contact` if the argument is a probe radius of 0, because such points are on
+/// the surface itself; otherwise the method of the arguments.
 fn method(arguments: &Arguments) -> Method {
     if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
 }
@@ -227,7 +228,8 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
     text
 }
 
-/// Returns the results of the model, as lines.
+/// Returns the results of the error model as lines for people: figures of the form with their 95 % intervals, and the
+/// estimated parameters.
 fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =
@@ -252,8 +254,8 @@ fn form_in_words(form: &Form) -> String {
         false => String::new(),
     };
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       form with standard deviation {} µm and range {} mm{lay}; noise of a point {} µm{drift}\n\
-         frame       standard uncertainty {sigma} µm along x, y, z, with that form unknown\n",
+        "form        RMS {}, PV {}, PV 99.8 % {}; 95 % intervals\n{few}{areas}model       form with standard deviation {} µm and range {} mm{lay}; noise of a point {} µm{drift}\n\
+         frame       standard uncertainty {sigma} µm along x, y, z, because the form is unknown\n",
         within(&figures.rms),
         within(&figures.pv),
         within(&figures.pv_998),
@@ -263,7 +265,8 @@ fn form_in_words(form: &Form) -> String {
     )
 }
 
-/// Returns slopes and the figures of ISO 10110-5, if there are enough points for them.
+/// Returns lines for people about slopes and the figures of ISO 10110-5, with their 95 % intervals. Returns an empty
+/// text if there are too few points for them.
 fn area_in_words(form: &Form) -> String {
     let mut text = String::new();
     if let Some(SlopeFigures { rms, largest, integration_mm, .. }) = form.slope {
@@ -272,14 +275,16 @@ fn area_in_words(form: &Form) -> String {
             format!("{median} urad ({low} to {high})")
         };
         let length = three_digits(integration_mm);
-        text += &format!("slopes      RMS {}, largest {}; over {length} mm, with 95 %\n", urad(rms), urad(largest));
+        text +=
+            &format!("slopes      RMS {}, largest {}; over {length} mm; 95 % intervals\n", urad(rms), urad(largest));
     }
     if let Some(IsoFigures { power, irregularity, symmetric, .. }) = form.iso {
         let [power, irregularity, symmetric] = [power, irregularity, symmetric].map(|of| {
             let [median, low, high] = [of.median_mm, of.low_mm, of.high_mm].map(|mm| three_digits(1e6 * mm));
             format!("{median} nm ({low} to {high})")
         });
-        text += &format!("ISO 10110-5 power {power}, irregularity {irregularity}, symmetric {symmetric}; with 95 %\n");
+        text +=
+            &format!("ISO 10110-5 power {power}, irregularity {irregularity}, symmetric {symmetric}; 95 % intervals\n");
     }
     text
 }
@@ -290,7 +295,8 @@ fn pose_in_words(document: &RegistrationDocument) -> String {
     format!("shift {x:.4}, {y:.4}, {z:.4} mm, turned by {:.4} degrees", pose.angle_rad().to_degrees())
 }
 
-/// Returns the distance of an alternative from the pose found, as text.
+/// Returns the distance between the pose found and an alternative pose, as text: translation in mm and rotation in
+/// degrees.
 fn apart(document: &RegistrationDocument, other: &Alternative) -> String {
     let read = |rows| Pose::from_rows(rows).expect("a pose that was found is one");
     let between = read(document.cmm_from_model).inverse() * read(other.cmm_from_model);

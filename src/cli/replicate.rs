@@ -94,13 +94,14 @@ impl Replication<'_> {
         self.ended()
     }
 
-    /// Returns the outcome of the command: `NotInTolerance` if any run differs from its copy at the plant.
+    /// Returns the outcome of the command: `NotInTolerance` if a run differs from its copy at the plant, otherwise
+    /// `Accepted`.
     fn ended(&self) -> Result<Outcome, Failure> {
         Ok(if self.shipper.skipped().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
     }
 
-    /// Replicates in rounds; retries while the plant cannot be reached. With `--while-stdin`, ends shortly after
-    /// standard input is closed.
+    /// Replicates in rounds until it is told to end. Retries with growing intervals while the plant cannot be reached.
+    /// With `--while-stdin`, ends after standard input is closed, when all data has been sent or after a time limit.
     async fn go_on(&mut self) -> Result<(), Failure> {
         let mut over = self.arguments.while_stdin.then(end_of_input);
         let mut last = None;
@@ -134,7 +135,7 @@ impl Replication<'_> {
         }
     }
 
-    /// Replicates new records and the status of the cell.
+    /// Connects to the plant if necessary. Sends it all new records and the status of the cell.
     async fn round(&mut self) -> Result<ReplicationResult, Failure> {
         if self.link.as_ref().is_none_or(DatabaseLink::is_closed) {
             self.link = Some(plant::open(&self.config).await?);
@@ -183,7 +184,7 @@ impl Replication<'_> {
         super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
     }
 
-    /// Prints once that the plant is unreachable.
+    /// Prints that the plant cannot be reached and why. Prints this only once until the plant has answered again.
     fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
             eprintln!("ship: {error}; the cell continues, and its records wait here until the plant can be reached");
@@ -192,7 +193,8 @@ impl Replication<'_> {
     }
 }
 
-/// Sends the status of the cell to the plant. An unknown status is not sent: the plant then detects the silence.
+/// Sends the status of the cell to the plant. Does not send an unknown status, so that the plant shows the cell as
+/// silent.
 async fn send_status(link: &DatabaseLink, told: &CellStatus) -> Result<(), PlantError> {
     match &told.run_status {
         RunStatus::Active { run, snapshot } => {
@@ -203,7 +205,8 @@ async fn send_status(link: &DatabaseLink, told: &CellStatus) -> Result<(), Plant
     }
 }
 
-/// Waits until standard input is closed by all writers.
+/// Starts a thread that reads standard input, and returns a receiver. The receiver completes when all writers have
+/// closed standard input.
 pub(super) fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
     let (ended, end) = tokio::sync::oneshot::channel::<()>();
     // Own thread, which ends with the program, because a blocked read of a pipe cannot be cancelled.

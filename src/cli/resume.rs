@@ -74,7 +74,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))
 }
 
-/// Continues an interrupted run. Checks the record, the recipe, the cell file and the task before it opens a machine.
+/// Continues the interrupted run in `folder`. First verifies the record, rebuilds task and plan from the stored recipe
+/// and cell file, and replays the recorded decisions. Returns an error if one of them has changed. Opens the machines
+/// only after these checks.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
     // From here on, another program that resumes or verifies the run finds it driven.
@@ -116,7 +118,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns true if a folder contains nothing except an empty database with its lock.
+/// Returns true if a run folder contains nothing except a journal database and its lock file.
 fn is_bare(run: &Path) -> bool {
     let mut names = fs::read_dir(run).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
     names.all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
@@ -150,8 +152,11 @@ struct RunStart {
 }
 
 impl RunStart {
-    /// Verifies the record of a run without an end, and reads how the run began. If records are lost, reports the loss.
-    /// Then continues only if `despite_loss` confirms it.
+    /// Verifies the record of an interrupted run and reads the inputs with which the run began.
+    ///
+    /// # Errors
+    /// The record is invalid, has no first entry, or has an end. Records at the end may be lost, and `despite_loss` is
+    /// false; if it is true, the loss is only reported.
     fn read(run: &Path, despite_loss: bool) -> Result<Self, Failure> {
         let reader = Reader::open(run).map_err(Failure::Journal)?;
         let lost = || may_be_lost(run).map_err(Failure::Journal);
@@ -208,7 +213,8 @@ impl RunStart {
         Ok(begun)
     }
 
-    /// Returns the recorded text of a file with which the run began.
+    /// Returns the text of the input file `name` (recipe or cell file) that the run `run` stored when it began. Returns
+    /// an error if the record does not list the file or if its content has changed.
     fn text(&self, run: &Path, name: &str) -> Result<String, Failure> {
         let path = run.join(name);
         let Some(file) = self.files.get(name) else {
@@ -222,7 +228,8 @@ impl RunStart {
         })
     }
 
-    /// Rebuilds the task and the plan of the run, and checks that they are unchanged.
+    /// Builds the task and the plan from the recipe and the cell file with which the run began. Returns an error if
+    /// they differ from the recorded ones, for example because a file that the recipe names has changed.
     fn prepared(&self, run: &Path, recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), Failure> {
         let (mut task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
         if let Some(seed) = self.seed {

@@ -132,7 +132,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Opens the machines, begins the record, and runs until the end.
+/// Opens the machines, creates the journal and executes the run until its end. `earlier` is the knowledge from earlier
+/// runs, and `key` signs the record.
 async fn carry_out(
     arguments: &Arguments,
     recipe: &Recipe,
@@ -188,8 +189,8 @@ async fn carry_out(
     live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await
 }
 
-/// Returns a time as whole seconds since 1970 (31 bits, at least 1), so that a program that starts later has a higher
-/// number.
+/// Returns `now` as whole seconds since 1970, modulo 2^31 and at least 1. Machines compare these numbers: a program
+/// that starts later has a higher one.
 pub(super) fn epoch(now: SystemTime) -> u32 {
     let seconds = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     u32::try_from(seconds & 0x7fff_ffff).unwrap_or(1).max(1)
@@ -207,7 +208,11 @@ struct EarlierKnowledge {
 }
 
 impl EarlierKnowledge {
-    /// Initialises a task with the knowledge of the newest similar run, or else with that of other cells.
+    /// Initialises a task with what the newest earlier run with the same settings has learned. If there is none, uses
+    /// the results of other cells of the plant, if the arguments name a plant file. Returns this knowledge.
+    ///
+    /// # Errors
+    /// The correction from the earlier run exceeds the limits of this task, or the plant file is invalid.
     fn apply_newest(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
         let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
@@ -221,7 +226,8 @@ impl EarlierKnowledge {
         Ok(earlier)
     }
 
-    /// Initialises a task with the learned results of other cells of the plant, if they can be used.
+    /// Initialises a task with results that other cells of the plant have learned. Results that the task cannot use are
+    /// reported in the messages of the returned value.
     #[cfg(feature = "plant")]
     fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::query_knowledge(plant, task)?;
@@ -271,7 +277,7 @@ impl EarlierKnowledge {
     }
 }
 
-/// Returns the text about the knowledge of other cells with which a first part begins.
+/// Returns a line for people about the knowledge from other cells with which the first part of this kind begins.
 fn others_in_words(others: &KnowledgeOrigin) -> String {
     let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
     let runs = runs.join(" and ");
@@ -294,8 +300,8 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
     }
 }
 
-/// Returns true if the machines of a cell are simulated in this process. Only then can the cell file leave a port open
-/// (0).
+/// Returns true if a machine of the cell is simulated inside this process. This is the case if the cell is simulated
+/// and the cell file leaves the address of a machine open, for example as port 0.
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &LinkConfig| {
         matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
@@ -305,7 +311,8 @@ pub(super) fn within(cell: &CellConfig) -> bool {
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 
-/// Returns the header of the record: everything that a program needs to resume the run.
+/// Returns the first entry of the record of a run. It contains everything that a program needs to resume the run.
+/// `earlier` is the knowledge with which the run begins.
 fn header(
     arguments: &Arguments,
     live: &RunContext,
@@ -356,7 +363,8 @@ fn begin(
     Ok(journal)
 }
 
-/// Saves the correction of the first pass and its program in the folder `cycle-0`, and records the files.
+/// Writes the correction of the first pass and its program to the folder `cycle-0` of the run, and adds the files to
+/// the journal.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
     let folder = journal.folder().join("cycle-0");
     for name in task.save_first_pass(&folder).map_err(Failure::Programs)? {
@@ -369,8 +377,8 @@ fn recipe_name(recipe: &Recipe) -> String {
     recipe.path().file_stem().map_or("run".into(), |stem| stem.to_string_lossy().into_owned())
 }
 
-/// Returns a new folder for a run that begins now: the name of the recipe and the time, and a number if two runs begin
-/// in one second.
+/// Returns the path of a folder that does not exist yet, for a run that begins at `began`. Its name consists of `name`
+/// (of the recipe), the time, and a number if this name is taken. A simulated run also gets the mark SIMULATION.
 pub(super) fn free_folder(runs: &Path, name: &str, began: SystemTime, simulated: bool) -> PathBuf {
     // The mark is in the path of every file of the run.
     let mark = if simulated { "-SIMULATION" } else { "" };

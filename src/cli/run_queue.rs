@@ -83,7 +83,7 @@ pub(super) struct ConfirmedPart {
 }
 
 impl ConfirmedPart {
-    /// Assigns the part to a run. Nothing begins until the plant has confirmed the assignment.
+    /// Assigns the leased part to a run. Returns after the plant has confirmed this; the run must not begin earlier.
     pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
         let name = run.file_name().unwrap_or_default().to_string_lossy();
         let link = plant::open(&self.config).await?;
@@ -148,7 +148,8 @@ enum Next {
     None,
 }
 
-/// Takes the next part and requests its confirmation.
+/// Leases the next part of the queue from the plant, verifies and stores its recipe, and asks a person to confirm the
+/// part. If the recipe is invalid or not approved, returns the part to the queue, and then an error.
 async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
     let link = plant::open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
@@ -176,15 +177,15 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     match confirmed(&link, &lease, &read, arguments).await? {
         true => Ok(Next::Part(path, Box::new(ConfirmedPart { config: config.clone(), lease }))),
         false => {
-            lease.hand_back(&link, "nobody at the cell confirmed it").await?;
+            lease.hand_back(&link, "no person at the cell confirmed the part").await?;
             super::print("the part is given back\n")?;
             Ok(Next::GivenBack)
         }
     }
 }
 
-/// Returns true if a person at the cell confirms the part, or if the recipe needs no confirmation. Renews the lease
-/// while it waits.
+/// Returns true if the run of the leased part may begin: the argument `--part` or a person at the terminal gives its
+/// serial number, or the recipe does not require a confirmation. Renews the lease while it waits for the person.
 async fn confirmed(
     link: &DatabaseLink,
     lease: &Lease,
@@ -211,7 +212,8 @@ async fn confirmed(
     }
 }
 
-/// Returns an error if the run of a part that this cell has started is not over: then the cell takes no further part.
+/// Returns an error if a part that this cell has started still has an open run. The cell then leases no further part.
+/// The error names the run and how to close it.
 async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure> {
     for begun in StartedPart::all(link).await? {
         let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
@@ -236,7 +238,8 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
     Ok(())
 }
 
-/// Returns a started part to the queue if its run did nothing, or gives the part up for the reason in `up`.
+/// Removes the part `serial` from this cell. With a reason in `up`, gives the part up. Without a reason, returns the
+/// part to the queue; this is refused if its run has commanded a machine.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
@@ -277,7 +280,8 @@ enum RunProgress {
     Over,
 }
 
-/// Returns the progress of a run. An unreadable run counts as one that sent a request to a machine.
+/// Returns how far a run has come, from its record. A record that cannot be read counts as that of a run that has
+/// commanded a machine.
 fn run_progress(folder: &Path) -> RunProgress {
     // To look makes no journal where there is none.
     let Ok(reader) = Reader::open(folder) else {
@@ -295,7 +299,8 @@ fn run_progress(folder: &Path) -> RunProgress {
     far
 }
 
-/// Stores a downloaded recipe and its files in a folder named by its hash. Returns the path of the recipe.
+/// Writes a recipe of the plant, with its files, to a subfolder of `runs` that is named by its hash `sha256`. Returns
+/// the path of the recipe. Returns an error if a file name leads out of this folder.
 fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Failure> {
     let folder = runs.join(RECIPES).join(sha256);
     let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };

@@ -59,7 +59,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns two lines per run: its identification, and its result.
+/// Formats a run as two lines: its folder, and its state or result with the part, the number of cycles and the last
+/// figures.
 fn in_words(run: &Listed) -> String {
     let Listed { folder, is_live, summary } = run;
     let figures = summary.cycles.iter().rev().find_map(|of| of.figures);

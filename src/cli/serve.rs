@@ -66,8 +66,8 @@ pub(super) struct PageAccess {
 }
 
 impl PageAccess {
-    /// Listens at an address. Returns an error if other computers can reach the address and a certificate or the list
-    /// of users is missing.
+    /// Opens a listener at the address `listen`. Returns an error if the address is taken, or if other computers can
+    /// reach it and the certificate or the list of users is missing.
     pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
         let Self { certificate, key, users } = self;
         let tls =
@@ -124,7 +124,8 @@ pub(super) struct PageProcess {
 }
 
 impl PageProcess {
-    /// Starts the page for the runs in a folder as a separate process, so it can neither slow the run down nor stop it.
+    /// Starts the page for the runs in a folder as a separate process. The page can therefore neither slow down the run
+    /// of this process nor stop it.
     pub(super) fn start(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };

@@ -158,7 +158,7 @@ impl Show {
         }
     }
 
-    /// Shows that an order was accepted, from any source.
+    /// Prints the order that the cell has accepted, and its effect. `event` is the name of the order, such as `hold`.
     fn order(&mut self, event: &str) -> Result<(), Failure> {
         match event {
             "hold" => self.line(&format!(
@@ -210,7 +210,8 @@ impl Show {
         self.picture(cycle)
     }
 
-    /// Shows the error map of a cycle on a colour terminal, and the series of RMS values up to this cycle.
+    /// Prints the error map of a cycle in colour, and the series of RMS values of the cycles so far. Prints nothing
+    /// without a terminal that shows colours.
     fn picture(&self, cycle: u32) -> Result<(), Failure> {
         let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
         let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
@@ -265,7 +266,7 @@ impl Show {
             let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
         }
         if let Some([taken, whole]) = touches {
-            let _ = writeln!(text, "\n{taken} touches of the part, instead of {whole} with the whole pattern");
+            let _ = writeln!(text, "\n{taken} touches on the part, instead of {whole} with the complete pattern");
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };
         let _ = write!(text, "\n{marked}{word}: {reason}");
@@ -292,7 +293,8 @@ impl Show {
     }
 }
 
-/// Returns the newest error map of a cycle. A repeated measurement is stored in a separate folder.
+/// Returns the path of the newest error map of a cycle; `None` if there is none. A repeated measurement has a folder of
+/// its own.
 fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     let cycle = run.join(format!("cycle-{cycle}"));
     let of = |what: &str, first: u32| {
@@ -323,7 +325,7 @@ fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// Returns the text for the activity of a machine.
+/// Returns the word for the activity of a machine: measuring or grinding.
 fn doing(device: Device) -> &'static str {
     match device {
         Device::Cmm => "measuring",
@@ -331,7 +333,7 @@ fn doing(device: Device) -> &'static str {
     }
 }
 
-/// Returns the progress of a job as text.
+/// Returns the progress of a job as text, from `done` steps of `total`.
 pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     match device {
         Device::Cmm => format!("measuring, {done} of {total} points"),
@@ -341,7 +343,8 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     }
 }
 
-/// Returns the text about the touches of a measurement that is still running.
+/// Returns a line about a measurement that is still running: the number of touches on the part, and the statistics of
+/// their deviations from the targets.
 pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_um }: &PreviewStatistics) -> String {
     format!(
         "preliminary, relative to the planned position: {touched} touched, RMS {rms_um:.2} µm, {least_um:+.2} to {most_um:+.2} µm"

@@ -66,7 +66,8 @@ async fn until_stopped() -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the address of a machine. An open port is replaced by the assigned one.
+/// Returns the address of a simulated machine. If the cell file leaves the port open (0), the address has the port that
+/// the system has assigned.
 fn wire(link: &LinkConfig) -> Value {
     match link.wire.modbus_line() {
         Some((LineAddress::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),

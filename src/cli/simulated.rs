@@ -76,7 +76,7 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     let none = || {
         Failure::Simulation {
         path: recipe.path().to_owned(),
-        reason: "it has no table [simulation], which tells the simulator the true shape of the part; add one, or use a cell of real machines".into(),
+        reason: "it has no table [simulation], which defines the true shape of the simulated part; add one, or use a cell of real machines".into(),
     }
     };
     let table = recipe.simulation.clone().ok_or_else(none)?;
@@ -88,9 +88,8 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     Ok(spec)
 }
 
-/// Serves both machines of a cell on their wires. Replaces a port of 0 in the cell by the assigned port. An I++ DME
-/// server has its own probe, with the radius from the recipe. A grinder with LinuxCNC has its own wheel in the same
-/// way.
+/// Serves the simulated machines of a cell at their addresses. If a port in the cell is 0, replaces it by the assigned
+/// one. The probe of a simulated I++ DME server and the wheel of a simulated LinuxCNC have the radii of the recipe.
 ///
 /// # Errors
 /// Returns an error if a wire is not available.
@@ -158,7 +157,9 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     Ok(simulated)
 }
 
-/// Returns the path that an external controller executes, with the wheel of the recipe.
+/// Starts the external controller `command`, and returns the path of the wheel that the controller executes. The
+/// simulated wheel has the radius of the recipe. Returns the reason if the recipe needs another wheel, pattern or tilt,
+/// or if the program cannot be started.
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
@@ -177,8 +178,9 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
     })
 }
 
-/// Returns the source of programs for the simulated control: the folder into which the cell writes them. `None` if the
-/// cell file names no folder.
+/// Returns the folder of grinding programs that the simulated controller reads, with the dialect of the cell file.
+/// Returns `None` if the cell file names no program folder, and the reason if no simulated controller reads the
+/// dialect.
 fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let program = &cell.grinder.program;
     let Some(folder) = program.folder.clone() else { return Ok(None) };
@@ -198,7 +200,8 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
 }
 
 impl SimulatedCell {
-    /// Writes the true state of the part: PV and RMS at the targets in µm, in the best-fit pose.
+    /// Writes the true PV and RMS of the simulated part to the file `path`, in µm. They are computed from the
+    /// deviations at the targets, after a best fit of the pose.
     #[cfg(feature = "plant")]
     pub(super) fn tell_truth(&self, recipe: &Recipe, cell: &CellConfig, path: &Path) -> Result<(), Failure> {
         let (task, _) = regrind::setup::prepare(recipe, cell).map_err(Failure::Setup)?;
@@ -235,7 +238,8 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a measuring machine by I++ DME, and writes the assigned port into its wire.
+    /// Serves a simulated measuring machine with I++ DME. Writes the assigned port into `wire`. `radius_mm` is the
+    /// radius of the probe, `speed` the factor by which the simulation is faster than reality.
     async fn serve_dme(
         &mut self,
         wire: &mut IppdmeWire,
@@ -257,8 +261,8 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a measuring machine that prints its hits. Its part program measures each list that Regrind writes to its
-    /// folder.
+    /// Serves a simulated measuring machine that prints a line for each hit. It measures each list of points that
+    /// Regrind writes to the folder of `wire`.
     async fn serve_hits(
         &mut self,
         wire: &mut HitLinesWire,
@@ -307,7 +311,8 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Places a link to a terminal at the device path of a serial line.
+    /// Creates a symbolic link at the path `device` to the simulated serial line `terminal`, and stores it for its
+    /// removal. Returns the reason if the link cannot be created.
     fn link(&mut self, terminal: &Path, device: &str) -> Result<(), String> {
         place_link(terminal, Path::new(device)).map_err(|e| {
             format!(
@@ -352,7 +357,7 @@ fn list_folder() -> Result<ScratchFolder, FormatError> {
     Ok(folder)
 }
 
-/// Returns the print format of the machine from the cell file.
+/// Returns the format in which the simulated machine prints its hits, so that the parser of the cell file accepts it.
 fn style(wire: &HitLinesWire) -> hits::print::Style {
     use regrind::device::hit_lines::Separator;
     let reading = wire.parser();
@@ -373,7 +378,7 @@ fn style(wire: &HitLinesWire) -> hits::print::Style {
     }
 }
 
-/// Returns a number that differs at each start, like that of a real machine.
+/// Returns a random number above 0. A real machine has a new number at each start, too.
 fn boot_id() -> u32 {
     rand::random::<u32>().max(1)
 }

@@ -59,7 +59,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns true if an event has an effect.
+/// Returns true if the event of a row is accepted, and changes the state or issues a command. `answer` is one of the
+/// reactions of this row.
 fn acts(row: &TransitionRow, answer: &Reaction) -> bool {
     !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
 }

@@ -55,8 +55,8 @@ impl Drop for SuccessionLock {
 }
 
 impl RunPlace {
-    /// Returns the position of the next run in a folder, and the lock of the folder. Keep the lock until the run has
-    /// its first record.
+    /// Returns the number of the next run in the folder `runs`, with its previous run, and the lock of the folder. The
+    /// caller must keep the lock until the run has its first record.
     pub(super) fn next(runs: &Path) -> Result<(Self, SuccessionLock), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
         // Any user can hold this lock. It does not prevent a run, but without it the run can receive the number of
@@ -71,7 +71,7 @@ impl RunPlace {
         Ok((Self { number, before }, SuccessionLock(folder)))
     }
 
-    /// Adds the number and the previous run to the content of the first record of a run.
+    /// Adds the number of the run, and its previous run, to `content`, the content of the first record of a run.
     pub(super) fn in_record(&self, content: &mut Value) {
         content["number"] = json!(self.number);
         content["before"] = json!(self.before);
@@ -95,7 +95,8 @@ fn name_of(folder: &Path) -> String {
     folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Locks a folder. Returns false if it is not free within a few seconds.
+/// Locks a folder. Waits at most [`TURN_COMES_WITHIN`] for another process. Returns false if the folder could not be
+/// locked.
 fn is_ours_in_time(folder: &File) -> bool {
     let began = Instant::now();
     loop {
@@ -107,8 +108,9 @@ fn is_ours_in_time(folder: &File) -> bool {
     }
 }
 
-/// Returns the newest runs of a folder that have a number. Two criteria select them: the time in the name, and the time
-/// of the last change of the folder. Both are needed, because a copy changes all folders, and a run can have any name.
+/// Returns the newest runs of a folder, each with its number. Omits runs without a number. Selects runs both by the
+/// time in the folder name and by the modification time of the folder, because a copy changes all modification times,
+/// and a name need not contain a time.
 fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let changed = |folder: &PathBuf| fs::metadata(folder).and_then(|found| found.modified()).ok();
     let mut all: Vec<PathBuf> = folders(runs).collect();
@@ -119,7 +121,7 @@ fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     newest.into_iter().filter_map(|folder| Some((RunPlace::read(&folder)?.number, folder))).collect()
 }
 
-/// Returns the time in the name of a run, as 20260704T120000Z, or `None` if there is none.
+/// Returns the time in the folder name of a run, in the form 20260704T120000Z; `None` if the name contains no time.
 fn time_in(name: &str) -> Option<&str> {
     let is_time = |text: &str| {
         let of = |at: usize, byte: u8| {
@@ -174,7 +176,8 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
 }
 
 impl Proof {
-    /// Verifies a single run.
+    /// Verifies the record of a single run, and adds its result to the list and its faults to the flaws. `place` is the
+    /// number of the run with its previous run, if the record states them.
     fn verify_run(&mut self, place: Option<&RunPlace>, folder: &Path, keys: &[PublicKey]) {
         let name = name_of(folder);
         let number = place.map_or("-".to_owned(), |place| place.number.to_string());
@@ -207,7 +210,8 @@ impl Proof {
             .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
     }
 
-    /// Checks that a run follows the one before it, and that the earlier run is unchanged since then.
+    /// Checks that a run continues the series: its number is one higher than that of the run `last`, and `last` still
+    /// contains the records that this run has noted in `before`. Adds each fault to the flaws.
     fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));

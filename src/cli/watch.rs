@@ -89,7 +89,8 @@ async fn in_lines(
     Ok(Outcome::Accepted)
 }
 
-/// Returns the result of a run whose program no longer answers. Returns an error if its end is not on record.
+/// Returns the recorded result of a run after its program has stopped answering. Returns an error if the record has no
+/// end. `told` is the last answer of the program.
 fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Failure> {
     let summary = run_summary(folder).unwrap_or_default();
     if summary.ended.is_some() {
@@ -153,7 +154,8 @@ impl View {
         };
     }
 
-    /// Reads the newest map on record when a new one is possible.
+    /// Reads the newest recorded error map, if the status of the cell has changed and the last attempt is long enough
+    /// ago. Keeps the earlier map if there is no newer one.
     fn read_map(&mut self) {
         let number = self.snapshot.number;
         if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
@@ -270,7 +272,7 @@ impl View {
     }
 }
 
-/// Reads pressed keys on a separate thread that can block.
+/// Starts a thread that waits for pressed keys, and returns their receiver. Ctrl-C is received as Esc.
 fn keys() -> mpsc::Receiver<KeyCode> {
     let (pressed, keys) = mpsc::channel(16);
     std::thread::spawn(move || {

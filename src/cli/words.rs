@@ -33,7 +33,8 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.*}", (3 - before_point).max(0) as usize)
 }
 
-/// Returns a judged figure, with its limit if it has one.
+/// Returns a judged figure as text: its name, its value in µm, its limit if there is one, and the probability that it
+/// is within the limit.
 pub(super) fn judged(compared: &ComparedFigure) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let ComparedFigure { name, median_mm: found_mm, limit_mm, .. } = compared;
@@ -42,7 +43,8 @@ pub(super) fn judged(compared: &ComparedFigure) -> String {
     format!("{name}: {} µm{of}{within}", um(*found_mm))
 }
 
-/// Returns the minimum and the maximum remaining time, as text.
+/// Returns the remaining time as text, from the minimum and the maximum in seconds: "3 to 5 min", or one number if both
+/// are equal.
 pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     let (unit, name) = match most_s {
         s if s < 90.0 => (1.0, "s"),
@@ -54,8 +56,8 @@ pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
 }
 
-/// Wraps lines between words at `columns`. A continuation is indented to the text of its line, that is, to the text
-/// after a label and two spaces. A word longer than a line is left to the terminal.
+/// Wraps each line of `text` between words, at `columns` characters. If a line is a label, at least two spaces and a
+/// text, its continuation lines are indented to the text. A word that is longer than a line is not divided.
 pub(super) fn wrapped(text: &str, columns: usize) -> String {
     let mut out = String::new();
     for line in text.lines() {
@@ -80,7 +82,8 @@ pub(super) fn wrapped(text: &str, columns: usize) -> String {
     out
 }
 
-/// Returns the column of the text after a label, if label and text fit into a line.
+/// Returns the indentation for the continuation of a line: the column after its label and two or more spaces. If this
+/// column is not in the left half of the line, or if there is no label, returns the indentation of the line itself.
 fn text_begins(line: &str, columns: usize) -> usize {
     let begin = line.len() - line.trim_start().len();
     let label = line[begin..].find("  ").map(|at| begin + at);

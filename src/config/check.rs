@@ -27,7 +27,8 @@ pub(super) struct CheckedCell {
 }
 
 impl CheckedCell {
-    /// Returns the cell, or `None` if a value is missing.
+    /// Builds the cell from the checked values. Returns `None` if a required value is missing or invalid. `renamed` are
+    /// the notes on keys with a new name.
     pub(super) fn into_cell(self, path: &Path, text: &str, renamed: Vec<String>) -> Option<CellConfig> {
         Some(CellConfig {
             name: self.name?,
@@ -54,7 +55,8 @@ struct MachineTables<'w> {
     signals: &'w [SignalTable],
 }
 
-/// Checks a cell file as written. Errors are reported to `document`.
+/// Checks the tables of a cell file and converts their values. Reports each error to `document`. A value with an error
+/// is `None` in the result.
 pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> CheckedCell {
     let (cmm, grinder) = (&written.cmm, &written.grinder);
     let machines = [
@@ -174,7 +176,8 @@ impl MachineTables<'_> {
     }
 }
 
-/// Returns the pose of the fixture: rotations about fixed x, then y, then z, then a translation.
+/// Returns the pose of the part in the fixture. The table states rotations about the fixed axes x, then y, then z, and
+/// then a translation.
 fn fixture(written: &FixtureTable) -> Pose {
     let turn = |axis: usize| {
         let mut twist = Twist::zeros();

@@ -26,7 +26,8 @@ pub fn dialects() -> impl Iterator<Item = &'static str> {
     BUILT_IN_DIALECTS.iter().map(|(name, _)| *name)
 }
 
-/// Returns the path of the dialect file that a cell file at `cell` names, or `None` for a built-in dialect.
+/// Returns the path of the dialect file `dialect`, relative to the folder of the cell file `cell`. Returns `None` if
+/// `dialect` is the name of a built-in dialect.
 pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
     let is_built_in = dialects().any(|name| name == dialect);
     (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))

@@ -233,7 +233,8 @@ impl CellConfig {
         })
     }
 
-    /// Returns a problem that another module found with the value of a key, with the position of the key in the text.
+    /// Returns a problem with the value of `key` that another module has found, with the position of the key in the
+    /// file. `found` describes the value, `allowed` the permitted values, and `remedy` what to do.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }

@@ -108,7 +108,7 @@ pub(super) struct RequestLine {
 
 impl RequestLine {
     /// Returns true if a text in the request contains characters that are invisible or change the reading direction.
-    /// Such a text would be misleading in the record.
+    /// Such a text would look different from its content in the record.
     pub(super) fn has_misleading_text(&self) -> bool {
         let text = match &self.request {
             Request::Hold { reason }

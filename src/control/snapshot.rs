@@ -79,7 +79,8 @@ pub enum PartVerdict {
 }
 
 impl PartVerdict {
-    /// Returns the verdict that belongs to a state. Only an accepted part completes a run.
+    /// Returns the verdict on the part that follows from the state of the cell: accepted after Complete, not accepted
+    /// after Stopped or Aborted, otherwise open.
     pub fn from_state(state: StateName) -> Self {
         match state {
             StateName::Complete => Self::Accepted,
@@ -207,7 +208,8 @@ pub struct CycleRow {
 }
 
 impl CycleRow {
-    /// Returns the judged PV and RMS, in µm. Returns those of all used points if no judged values are given.
+    /// Returns the judged PV and RMS of a cycle in µm. For a figure without a judged value, returns that of all points
+    /// used in the registration.
     pub fn judged_um(&self) -> [f64; 2] {
         [self.judged_pv_um.unwrap_or(self.pv_um), self.judged_rms_um.unwrap_or(self.rms_um)]
     }

@@ -79,7 +79,9 @@ pub struct Control {
 }
 
 impl Control {
-    /// Listens in a run folder. If `watched`, an endpoint that was removed or replaced is reported and created again.
+    /// Opens the control endpoint of a run folder. Requests of clients are sent to `orders`, and watching clients
+    /// receive each new value of `status`. If `watched` is true, an endpoint that is removed or replaced is created
+    /// again and reported by [`Self::changed`].
     ///
     /// # Errors
     /// The folder cannot hold a socket, for example because its path is too long for the operating system; or another
@@ -115,7 +117,8 @@ impl Control {
         Ok(())
     }
 
-    /// Waits until the endpoint in the run folder is lost or created again, and returns the change.
+    /// Waits until the endpoint in the run folder is lost or created again, and returns which of the two has happened.
+    /// Never returns if the endpoint is not watched.
     pub async fn changed(&mut self) -> EndpointChange {
         match self.changes.recv().await {
             Some(change) => change,
@@ -135,7 +138,8 @@ impl Drop for Control {
     }
 }
 
-/// Accepts the clients of an endpoint, and of each endpoint that replaces it (received from `made_again`).
+/// Accepts the clients of the endpoint `door`, and serves each in a task. After a replacement arrives in `made_again`,
+/// accepts the clients of that endpoint instead.
 async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpoint>, desk: ControlService) {
     loop {
         let caller = tokio::select! {
@@ -157,8 +161,8 @@ async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpo
     }
 }
 
-/// Checks periodically that an endpoint still exists, and creates it again if not. Disk access runs on a thread of its
-/// own, so a disk that does not answer blocks no order.
+/// Checks periodically that the endpoint `mark` still exists. If it does not, creates it again, sends the new one to
+/// `hand_over` and the change to `tell`. Uses a separate thread for disk access, so that a slow disk delays no order.
 async fn restore_if_removed(
     mut mark: endpoint::EndpointIdentity,
     tell: mpsc::UnboundedSender<EndpointChange>,
@@ -243,7 +247,8 @@ async fn forward_request(
     match tokio::time::timeout(ANSWER_TIMEOUT, handed_over).await {
         Ok(reply) => reply.unwrap_or_else(over),
         Err(_) => refusal(
-            "the cell did not answer in time; it is unknown whether it took the order: check its status".into(),
+            "the cell did not answer in time; it is unknown whether it accepted the order; check with `regrind status`"
+                .into(),
             status,
         ),
     }
@@ -273,8 +278,8 @@ async fn send_reply(write: &mut ClientWriter, reply: &Reply) -> io::Result<()> {
     tokio::time::timeout(IO_TIMEOUT, write.write_all(&text)).await?
 }
 
-/// Returns the person for whom a program acts. The result also names the user of the program, because the name of the
-/// person is only that program's claim.
+/// Returns the person to record for a request. `peer` is the user of the program that sent it; `by` is the person for
+/// whom the program says that it acts. The result names both, because the program could state any name in `by`.
 fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
     let Some(by) = by else { return peer };
     let name = by.name.map_or(peer.name.clone(), |name| format!("{name}, by a program of {}", peer.name));

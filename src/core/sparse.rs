@@ -40,8 +40,12 @@ pub(crate) struct SelectedInverse<'a> {
 }
 
 impl SparsityPattern {
-    /// Orders and analyses a pattern: the columns of the lower triangle, with rows ascending. Returns `None` if there
-    /// is not enough memory.
+    /// Prepares the factorization of all symmetric matrices with one sparsity pattern: computes a fill-reducing order
+    /// and the symbolic Cholesky factorization.
+    ///
+    /// The pattern is the lower triangle by columns: `begins` has the index of the first entry of each column and the
+    /// number of entries as its end, `rows` the row of each entry, ascending within a column. Returns `None` if there
+    /// is not enough memory. Panics if the pattern is not valid.
     pub fn new(columns: usize, begins: Vec<usize>, rows: Vec<usize>) -> Option<Self> {
         let matrix = SymbolicSparseColMat::new_checked(columns, columns, begins, None, rows);
         let params = CholeskySymbolicParams {
@@ -67,7 +71,8 @@ impl SparsityPattern {
         }
     }
 
-    /// Factors a matrix of this pattern; returns `None` if it is not positive definite or memory is not sufficient.
+    /// Computes the Cholesky factor of a matrix with this pattern. `values` holds its entries in the order of the
+    /// pattern. Returns `None` if the matrix is not positive definite or there is not enough memory.
     pub fn factor(&self, values: &[f64]) -> Option<CholeskyFactor<'_>> {
         let matrix = SparseColMatRef::new(self.matrix.as_ref(), values);
         let mut factor = vec![0.0; self.symbolic.len_val()];
@@ -83,7 +88,7 @@ impl SparsityPattern {
 }
 
 impl<'a> CholeskyFactor<'a> {
-    /// Solves for one right-hand side; returns `None` if memory is not sufficient.
+    /// Solves the system of equations for the right-hand side `right`. Returns `None` if there is not enough memory.
     pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
         let symbolic = &self.pattern.symbolic;
         let mut solution = right.to_vec();
@@ -97,7 +102,8 @@ impl<'a> CholeskyFactor<'a> {
         Some(solution)
     }
 
-    /// Computes the entries of the inverse within the factor's pattern.
+    /// Computes the entries of the inverse matrix at all places where the Cholesky factor has entries (selected
+    /// inverse). Returns `None` if the factor has no supernodes.
     pub fn selected_inverse(&self) -> Option<SelectedInverse<'a>> {
         let symbolic = self.pattern.blocks()?;
         let factor = SupernodalLltRef::new(symbolic, &self.values);
@@ -129,8 +135,8 @@ impl<'a> CholeskyFactor<'a> {
 }
 
 impl SelectedInverse<'_> {
-    /// Returns the entry of the inverse at two columns where the matrix has an entry; NaN if it is outside the factor's
-    /// pattern.
+    /// Returns the entry of the inverse in row `a` and column `b` of the original matrix. Returns NaN if the Cholesky
+    /// factor has no entry there; it has one wherever the matrix has one.
     pub fn entry(&self, a: usize, b: usize) -> f64 {
         let at = |k: usize| self.pattern.symbolic.perm().map_or(k, |perm| perm.arrays().1[k]);
         let (column, row) = (at(a).min(at(b)), at(a).max(at(b)));
@@ -145,8 +151,8 @@ impl SelectedInverse<'_> {
         place.map_or(f64::NAN, |place| self.blocks[s][(place, column - begin)])
     }
 
-    /// Returns the inverse on some rows of the factor, in ascending order; the later supernodes already contain all of
-    /// these entries.
+    /// Returns the dense block of the inverse for some `rows` (ascending) of the factor. The supernodes that contain
+    /// these rows must already be computed. `local` is working memory with one element for each row of the matrix.
     fn on_rows(&self, rows: &[usize], local: &mut [usize]) -> Mat<f64> {
         let mut dense = Mat::zeros(rows.len(), rows.len());
         let Some(symbolic) = self.pattern.blocks() else { return dense };

@@ -99,8 +99,8 @@ fn is_nearly_collinear(points: &[Point]) -> bool {
     aside2 <= MAX_WIDTH_SHARE * MAX_WIDTH_SHARE * longest2
 }
 
-/// Returns true if points equal the planned points, rounded to the digits that they have. In a real measurement at
-/// least one touch ends somewhere else than planned.
+/// Returns true if all points equal the planned points, to the last decimal that they have. In a real measurement at
+/// least one touch ends somewhere else than planned. Returns false for fewer than three points.
 fn equals_plan(found: &[Point], planned: &[Point]) -> bool {
     /// Minimum number of points; fewer can agree by chance.
     const MIN_POINTS: usize = 3;

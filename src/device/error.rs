@@ -46,16 +46,16 @@ pub enum DeviceError {
     Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
     #[error(
-        "{machine} answers, but its application has stopped: its beat has been {beat} for {} ms (limit {} ms). Check \
-         the machine; do not rely on its values",
+        "{machine} answers, but its application has stopped: its heartbeat counter has been {beat} for {} ms (limit \
+         {} ms). Check the machine; do not rely on its values",
         .unchanged_for.as_millis(), .limit.as_millis()
     )]
     Frozen { machine: Arc<str>, beat: u16, unchanged_for: Duration, limit: Duration },
     /// A command was written several times and never acknowledged. The driver knows that the machine did not act upon
     /// it later.
     #[error(
-        "{machine} did not acknowledge {command} number {sequence} (its last is {acknowledged}) after {tries} tries: \
-         its application may have stopped, or its program does not follow docs/modbus.md"
+        "{machine} did not acknowledge {command} number {sequence} (the last that it acknowledged is {acknowledged}) \
+         after {tries} tries: its application may have stopped, or its program does not follow docs/modbus.md"
     )]
     NotAcknowledged { machine: Arc<str>, command: MachineCommand, sequence: u32, acknowledged: u32, tries: u32 },
     /// It is unknown whether the job was begun. The start is never repeated; see
@@ -283,8 +283,8 @@ pub enum DeviceError {
 const BUSY: [u8; 6] = [4, 5, 6, 8, 10, 11];
 
 impl DeviceError {
-    /// Returns true if the communication failed, so that the machine itself may be unaffected. Any other error is a
-    /// clear refusal.
+    /// Returns true if the communication failed or the access to the machine was lost, so that the machine itself may
+    /// be unaffected. Any other error is a clear refusal of the machine.
     pub fn is_link(&self) -> bool {
         self.is_busy()
             || matches!(
@@ -303,14 +303,15 @@ impl DeviceError {
             )
     }
 
-    /// Returns true if the machine, or a device between, answers that it cannot do the request now. A retry may
-    /// succeed.
+    /// Returns true for a Modbus exception with which the machine, or a gateway before it, answers that it cannot carry
+    /// out the request now. A retry may succeed.
     pub(super) fn is_busy(&self) -> bool {
         matches!(self, Self::Exception { code, .. } if BUSY.contains(code))
     }
 }
 
-/// Returns in words which functions a machine of another version lacks, and how to correct it.
+/// Returns a text that explains why the version `found` of the register map of a machine does not fit the version
+/// `required` of this program, and what to update.
 fn version_in_words(found: u16, required: u16) -> String {
     if found > required {
         return "this program is older and does not know the newer map: update this program".to_owned();
@@ -332,7 +333,7 @@ fn kind_in_words(kind: std::io::ErrorKind) -> String {
     kind.to_string()
 }
 
-/// Returns in words how to correct the cause of a Modbus exception.
+/// Returns a text that tells a person how to correct the cause of the Modbus exception with this code.
 fn exception_remedy(code: u8) -> &'static str {
     match code {
         1..=3 => {

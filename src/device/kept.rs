@@ -22,21 +22,22 @@ impl<Load> JobMemory<Load> {
         Self { loaded: None, unresolved: None, last_start_sequence: 0, reported_points: 0 }
     }
 
-    /// Restores a job that an interrupted run had begun. It is not begun again, and its outcome is not reported yet.
+    /// Restores the start `intended` that an interrupted run had sent. The job is not begun again, and its outcome is
+    /// unresolved.
     pub(crate) fn restore(&mut self, intended: &Armed) {
         self.unresolved = Some((intended.job, intended.start_sequence));
         self.last_start_sequence = self.last_start_sequence.max(intended.start_sequence);
     }
 
-    /// Returns the payload that is loaded for a job and forgets the unresolved job. The cell prepares another job only
-    /// after it has resolved that one.
+    /// Returns the payload that was loaded for a job, or `None` if another payload or none is loaded. Also forgets the
+    /// unresolved job, because the cell prepares another job only after it has resolved that one.
     pub(crate) fn payload_for(&mut self, job: Job) -> Option<Arc<Load>> {
         self.unresolved = None;
         self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest).map(|(load, _)| Arc::clone(load))
     }
 
-    /// Returns the armed start of a prepared job, with the next start number. The machine has no token and no boot id,
-    /// so both are 0.
+    /// Returns the [`Armed`] of a prepared job, with the next start number. Token and boot id are 0, because this
+    /// machine has none.
     pub(crate) fn arm(&mut self, job: Job) -> Armed {
         self.reported_points = 0;
         Armed { job, start_sequence: self.last_start_sequence + 1, token: 0, boot_id: 0 }

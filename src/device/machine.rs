@@ -22,7 +22,8 @@ pub trait Machine: Send {
         Vec::new()
     }
 
-    /// Opens the wire and proves that the machine at its far end is the intended one, before anything is written to it.
+    /// Opens the connection to the machine. Proves that the machine at its other end is the intended one, before
+    /// anything is written to it.
     fn connect(&mut self) -> impl Future<Output = Result<Identity, DeviceError>> + Send;
 
     /// Returns the present status of the machine. The request also shows the machine that its client is alive, so call
@@ -72,8 +73,8 @@ pub trait Machine: Send {
     /// Gives up the ownership of the machine.
     fn release(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Determines from the machine the outcome of a start that is unknown: after a lost connection, or after a restart
-    /// of this client that found the intent in its journal. Moves nothing. Takes a second or more if the answer is "not
+    /// Asks the machine for the outcome of a start that is unknown: after a lost connection, or after a restart of this
+    /// client that found the start in its journal. Moves nothing. Takes a second or more if the answer is "not
     /// started", because that must be seen twice.
     fn reconcile(&mut self, intended: &Armed) -> impl Future<Output = Result<Reconciled, DeviceError>> + Send;
 
@@ -95,9 +96,9 @@ pub trait Cmm: Machine {
     -> impl Future<Output = Result<(), DeviceError>> + Send;
 
     /// Reads a few preliminary points of this job while it still runs, if the machine offers them. Call it after a
-    /// status, when no other request is due. It is short: at most one step between two calls of the status, and it
-    /// stops if the flag is raised. Returns the new points, if there are any. An error is not returned; the next status
-    /// shows it.
+    /// status, when no other request is due. It is short: it does at most one step between two calls of the status, and
+    /// stops if `_interrupt` is raised. Returns the new points, or `None` if there are none. Hides an error, because
+    /// the next status returns it.
     fn read_ahead(
         &mut self,
         _job: Job,

@@ -5,7 +5,8 @@ use regrind_formats::result::Coordinates;
 
 /// Payload that is sent as one string of bytes and identified by its SHA-256.
 pub trait Identified {
-    /// Returns the SHA-256 of the bytes of the payload, with the high words first, whatever the word order on the wire.
+    /// Returns the identity of the payload: the SHA-256 of its bytes with the high words first, whatever the word order
+    /// of the machine.
     fn identity(&self) -> [u8; 32];
 }
 

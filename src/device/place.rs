@@ -10,7 +10,8 @@ pub struct MachineTable<'a> {
 }
 
 impl MachineTable<'_> {
-    /// Returns a key in the table of the machine, in the form that messages use.
+    /// Returns a key with the name of the machine's table before it, for messages: for example `cmm.wire.unit` for
+    /// `wire.unit`.
     pub fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.table)
     }

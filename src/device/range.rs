@@ -41,7 +41,8 @@ impl ValueRange {
         (self.min..=self.max).contains(&value)
     }
 
-    /// Returns in words why a value is outside the range. Returns `None` if it is inside, or was not reported.
+    /// Returns a text that states why a value is outside the range. Returns `None` if the value is inside, or if it was
+    /// not reported.
     fn violation(&self, value: Option<f64>) -> Option<String> {
         let value = value.filter(|value| !self.contains(*value))?;
         let Self { name: figure, min: least, max: most, unit } = self;
@@ -59,10 +60,10 @@ impl ValueRange {
     }
 }
 
-/// Checks the temperature in °C and the progress `(done, total)` of a status against their ranges. Returns each of
-/// them, `None` if it is missing or outside its range, and a signal with value and range for each value outside its
-/// range. An impossible value does not make the whole status an error, because the status also contains the state of
-/// the machine and the command that it acknowledged.
+/// Checks the temperature in °C and the progress `(done, total)` of a status against their ranges. Returns the
+/// temperature and the progress, each as `None` if it is missing or outside its range. For each value outside its
+/// range, also returns a signal with the value and the range. An impossible value does not make the whole status an
+/// error, because the status also contains the state of the machine and the command that it acknowledged.
 pub(super) fn plausible_status(
     temperature_c: Option<f64>,
     progress: (u32, u32),
@@ -80,14 +81,17 @@ pub(super) fn plausible_status(
     (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
-/// Returns an error if `scale_mm`, the length of one count in mm, is outside its range.
+/// Checks `scale_mm`, the length of one count of a measured point in mm, against its range.
+///
+/// # Errors
+/// The length is outside of the range.
 pub(super) fn check_count_scale(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
     COUNT.refuse(machine, scale_mm)
 }
 
 impl Measurement {
-    /// Returns the first impossible value of a measurement with its range, in words. Values that were not reported are
-    /// not checked.
+    /// Returns a text about the first value of the measurement that is physically impossible, with the allowed range,
+    /// or `None`. Values that were not reported are not checked.
     pub fn range_violation(&self) -> Option<String> {
         let of_whole = TEMPERATURE
             .violation(self.temperature_c)
@@ -105,8 +109,8 @@ impl Measurement {
 }
 
 impl PassRecord {
-    /// Returns the first impossible value of a pass record with its range, in words. Values that were not reported are
-    /// not checked.
+    /// Returns a text about the first value of the pass record that is physically impossible, with the allowed range,
+    /// or `None`. Values that were not reported are not checked.
     pub fn range_violation(&self) -> Option<String> {
         TEMPERATURE
             .violation(self.temperature_c)

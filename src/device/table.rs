@@ -49,7 +49,7 @@ macro_rules! drivers {
                 match self { $(Self::$wire(wire) => DriverFactory::check(wire, place, document)),+ }
             }
 
-            /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the
+            /// Reports to the document the conflicts between this wire, which is that of the CMM, and the wire of the
             /// grinder.
             pub fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
                 match (self, grinder) {
@@ -58,7 +58,8 @@ macro_rules! drivers {
                 }
             }
 
-            /// Returns notes for a person about this wire on this computer.
+            /// Returns notes for a person about this wire on this computer, for example that a serial port does not
+            /// exist.
             pub fn notes(&self) -> Vec<String> {
                 match self { $(Self::$wire(wire) => wire.notes()),+ }
             }
@@ -68,42 +69,43 @@ macro_rules! drivers {
                 match self { $(Self::$wire(_) => <$table>::BY_PERSON),+ }
             }
 
-            /// Returns true if its results may contain their temperature.
+            /// Returns true if the results of a machine on this wire may contain a temperature.
             pub fn reports_temperature(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::REPORTS_TEMPERATURE),+ }
             }
 
-            /// Returns true if the tables `registers` and `signals` apply to it.
+            /// Returns true if the tables `registers` and `signals` of a cell file apply to this wire.
             pub fn has_registers(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }
             }
 
-            /// Returns true if its grinder works from the files in the folder of the run.
+            /// Returns true if a grinder on this wire takes its program and its map from the folder of the run.
             pub fn reads_run_folder(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::READS_RUN_FOLDER),+ }
             }
 
-            /// Returns the meaning of the coordinates of a measurement; `None` if each result states it itself.
+            /// Returns whether the coordinates of a measurement are probe centres or contact points. Returns `None` if
+            /// each result states this itself.
             pub fn coordinates(&self) -> Option<Coordinates> {
                 match self { $(Self::$wire(wire) => wire.coordinates()),+ }
             }
 
-            /// Returns the Modbus line and the unit on it, if this is a Modbus wire.
+            /// Returns the Modbus line and the unit number on it, or `None` if this is not a Modbus wire.
             pub fn modbus_line(&self) -> Option<(LineAddress, u8)> {
                 match self { $(Self::$wire(wire) => DriverFactory::modbus_line(wire)),+ }
             }
 
-            /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
+            /// Returns host and port of the I++ DME server, or `None` if this is another wire.
             pub fn ippdme_address(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => DriverFactory::ippdme_address(wire)),+ }
             }
 
-            /// Returns the source of the hit lines, if this is a wire for them.
+            /// Returns where the hit lines come from, or `None` if this wire has no hit lines.
             pub fn hit_source(&self) -> Option<HitSource> {
                 match self { $(Self::$wire(wire) => DriverFactory::hit_source(wire)),+ }
             }
 
-            /// Returns host and port of linuxcncrsh, if this is a wire to it.
+            /// Returns host and port of the server linuxcncrsh, or `None` if this is another wire.
             pub fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => DriverFactory::linuxcncrsh_address(wire)),+ }
             }
@@ -126,7 +128,8 @@ macro_rules! drivers {
         }
 
         impl AnyCmm {
-            /// Returns the line that another machine may share.
+            /// Returns the Modbus line that the driver uses and that the driver of another machine may share. Returns
+            /// `None` for other wires.
             pub fn link(&self) -> Option<&Link> {
                 match self { $(Self::$wire(cmm) => <$table>::link(cmm)),+ }
             }

@@ -84,18 +84,20 @@ pub trait DriverFactory {
     /// run.
     const READS_RUN_FOLDER: bool = false;
 
-    /// Reports to the document the errors of the table that the schema does not detect.
+    /// Reports to the document the errors in the table of the wire that the schema does not detect.
     fn check(&self, _place: &MachineTable<'_>, _document: &mut Document) {}
 
-    /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the grinder.
+    /// Reports to the document the conflicts between this wire, which is that of the CMM, and the wire of the grinder.
     fn check_against_grinder(&self, _grinder: &Self, _document: &mut Document) {}
 
-    /// Returns notes for a person about this wire on this computer. They are no errors of the cell file.
+    /// Returns notes for a person about this wire on this computer, for example that a serial port does not exist. They
+    /// are no errors of the cell file.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Returns the meaning of the coordinates of a measurement; `None` if each result states it itself.
+    /// Returns whether the coordinates of a measurement are probe centres or contact points. Returns `None` if each
+    /// result states this itself.
     fn coordinates(&self) -> Option<Coordinates> {
         Some(Coordinates::Centres)
     }
@@ -112,27 +114,29 @@ pub trait DriverFactory {
     /// The errors of [`DriverFactory::create_cmm`].
     fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError>;
 
-    /// Returns the line that another machine may share.
+    /// Returns the Modbus line that the driver uses and that the driver of another machine may share. Returns `None`
+    /// for other wires.
     fn link(_cmm: &Self::Cmm) -> Option<&Link> {
         None
     }
 
-    /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
+    /// Returns host and port of the I++ DME server, or `None` if this is another wire.
     fn ippdme_address(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// Returns the source of the hit lines, if this is a wire for them.
+    /// Returns where the hit lines come from, or `None` if this wire has no hit lines.
     fn hit_source(&self) -> Option<HitSource> {
         None
     }
 
-    /// Returns host and port of linuxcncrsh, if this is a wire to it.
+    /// Returns host and port of the server linuxcncrsh, or `None` if this is another wire.
     fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// Returns the Modbus line and the unit on it, if this is a Modbus wire: a simulated machine is served there.
+    /// Returns the Modbus line and the unit number on it, or `None` if this is not a Modbus wire. A simulated machine
+    /// is served there.
     fn modbus_line(&self) -> Option<(LineAddress, u8)> {
         None
     }

@@ -13,7 +13,7 @@ pub enum MachineKind {
 }
 
 impl MachineKind {
-    /// Returns the name of its table in a cell file, which is also its name in commands.
+    /// Returns `cmm` or `grinder`: the name of the machine's table in a cell file, and of the machine in commands.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Cmm => "cmm",
@@ -47,7 +47,7 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identity of a machine that a person operates. Silence never makes its client lost.
+    /// Returns the identity of a machine that a person operates. It has no limit for the silence of its client.
     pub(super) fn for_manual_machine(kind: MachineKind, name: &str) -> Self {
         Self { kind, name: name.to_owned(), boot_id: 0, simulation: false, silence_limit_s: None }
     }
@@ -65,7 +65,7 @@ pub struct Job {
 }
 
 impl Job {
-    /// Returns the cycle and the batch of touches to which it belongs.
+    /// Returns the cycle and the batch of touches to which this job belongs.
     pub fn batch_id(&self) -> BatchId {
         BatchId::decode(self.cycle)
     }
@@ -93,13 +93,14 @@ impl BatchId {
     /// Number of batches that the encoding can distinguish; a measurement has fewer.
     pub const MAX_BATCHES: u32 = 64;
 
-    /// Decodes the number that a machine sees.
+    /// Decodes cycle and batch from `seen`, the cycle number that a machine is given.
     pub fn decode(seen: u16) -> Self {
         let seen = u32::from(seen);
         Self { cycle: seen % Self::MAX_CYCLES, batch: seen / Self::MAX_CYCLES }
     }
 
-    /// Returns the number that a machine sees. It is unique for every batch as long as the limits are kept.
+    /// Encodes cycle and batch as the one cycle number that a machine is given. Different batches of a run have
+    /// different numbers if cycle and batch are below their limits.
     pub fn encode(self) -> u16 {
         (self.cycle % Self::MAX_CYCLES + Self::MAX_CYCLES * (self.batch % Self::MAX_BATCHES)) as u16
     }
@@ -114,8 +115,8 @@ impl fmt::Display for BatchId {
     }
 }
 
-/// Returns the checksum of payloads: the CRC-32 over their identities, in increasing order of their kinds (plan; or
-/// map, pass).
+/// Returns the digest of the payloads of a job: the CRC-32 over their identities. For a CMM this is the plan; for a
+/// grinder the map, then the pass.
 pub fn digest(identities: &[[u8; 32]]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     for identity in identities {
@@ -233,7 +234,7 @@ pub enum MachineState {
 }
 
 impl MachineState {
-    /// Returns true if something may be moving.
+    /// Returns true if the machine may be moving in this state.
     pub fn is_moving(self) -> bool {
         matches!(self, Self::Execute | Self::Holding | Self::Stopping | Self::Aborting)
     }
@@ -350,12 +351,12 @@ impl Fault {
         (Self::ClientSilent, 20),
     ];
 
-    /// Returns the fault with a number.
+    /// Returns the fault with this number in docs/modbus.md, or [`Fault::Other`] for a number that is not listed there.
     pub fn from_number(number: u16) -> Self {
         Self::NUMBERS.iter().find(|(_, known)| *known == number).map_or(Self::Other(number), |(fault, _)| *fault)
     }
 
-    /// Returns the number of a fault.
+    /// Returns the number of the fault in docs/modbus.md.
     pub fn number(self) -> u16 {
         match self {
             Self::Other(number) => number,
@@ -455,7 +456,7 @@ pub struct Status {
 }
 
 impl Status {
-    /// Returns the status of a machine that reports nothing but its state.
+    /// Returns a status that contains only the state of the machine; all other values are unknown.
     pub(super) fn from_state(state: MachineState) -> Self {
         Self {
             state,

@@ -56,7 +56,7 @@ pub struct Problem {
 }
 
 impl Problems {
-    /// Returns one problem that concerns the whole file and has no position in its text.
+    /// Creates a list with one problem, `found`, that concerns the whole file and has no position in its text.
     pub fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
         let problem =
             Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };
@@ -98,7 +98,8 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Returns line and column of a byte. Both count from 1; the column counts characters.
+/// Returns the line and the column of the byte at index `byte` of `text`. Both count from 1; the column counts
+/// characters.
 fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);

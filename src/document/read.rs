@@ -37,10 +37,10 @@ pub struct Document<'t> {
     problems: Vec<Problem>,
 }
 
-/// Reads a text file.
+/// Reads a recipe or another file of settings as text.
 ///
 /// # Errors
-/// Returns an error if the file cannot be read, is too large or is not text.
+/// The file cannot be read, is too large, or is not UTF-8.
 pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
@@ -55,8 +55,11 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
     })
 }
 
-/// Opens a file. Rejects a named pipe, which could block, and a device, which has no end. Paths below `/dev` and
-/// `/proc` are not rejected, because a shell places the input of a program under `/dev/fd`.
+/// Opens a file for reading.
+///
+/// # Errors
+/// A named pipe, which could block, and a device, which has no end. Below `/dev` and `/proc` they are accepted, because
+/// a shell places the input of a program under `/dev/fd`. Any error of the system.
 fn open(path: &Path) -> std::io::Result<File> {
     let found = std::fs::metadata(path)?;
     if !found.is_file() && !found.is_dir() && !path.starts_with("/dev") && !path.starts_with("/proc") {
@@ -76,10 +79,10 @@ pub fn sha256(text: &str) -> [u8; 32] {
 }
 
 impl<'t> Document<'t> {
-    /// Parses the syntax of a text.
+    /// Parses a text as TOML; `file` names it in messages. Values are not checked yet.
     ///
     /// # Errors
-    /// Returns every place where the text is not valid TOML.
+    /// Every place where the text is not valid TOML.
     pub fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
         if text.len() > MAX_BYTES {
             return Err(too_large(file));
@@ -112,9 +115,11 @@ impl<'t> Document<'t> {
         self.push(start..end, String::new(), format!("invalid TOML: {}", error.message().trim()), "", remedy);
     }
 
-    /// Moves the values of old keys to their new names. Returns a note for each old key, with its line.
+    /// Moves the values of old keys to their new names, given by `renamed`. Returns a note for each old key in the
+    /// file, with its line.
     ///
-    /// A table that becomes empty is removed. If a file has both names, the old one is reported as a problem.
+    /// A table that becomes empty is removed. If a file has both names, the old one is reported as a problem and its
+    /// value is removed.
     pub fn rename_keys(&mut self, renamed: &[RenamedKey]) -> Vec<String> {
         let mut notes = Vec::new();
         for RenamedKey { old, new } in renamed {
@@ -137,7 +142,7 @@ impl<'t> Document<'t> {
         notes
     }
 
-    /// Checks the values against a schema. A value that does not fit is reported and removed.
+    /// Checks the values against a JSON schema. Each value that does not fit is added to the problems and removed.
     pub fn check_schema(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
         Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
@@ -146,10 +151,7 @@ impl<'t> Document<'t> {
         }
     }
 
-    /// Deserializes the remaining values.
-    ///
-    /// # Errors
-    /// Reports, with the other problems, values that fit the schema but cannot be deserialized. Then returns `None`.
+    /// Deserializes the values that passed the checks into `File`. If this fails, adds a problem and returns `None`.
     pub fn deserialize<File: DeserializeOwned>(&mut self) -> Option<File> {
         match self.values.clone().try_into() {
             Ok(written) => Some(written),
@@ -161,14 +163,14 @@ impl<'t> Document<'t> {
         }
     }
 
-    /// Returns true if the value of a key, or a value within it, has a problem.
+    /// Returns true if a problem was reported for the value of `key`, or for a value within it.
     pub fn has_problem(&self, key: &str) -> bool {
         let within =
             |found: &str| found.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
         self.problems.iter().any(|problem| within(&problem.key))
     }
 
-    /// Returns true if the text contains a key.
+    /// Returns true if the file has the key, such as `measure.probe_radius_mm`.
     pub fn contains_key(&self, key: &str) -> bool {
         let steps = steps(key);
         let Some((Step::Key(last), before)) = steps.split_last() else { return false };
@@ -184,7 +186,8 @@ impl<'t> Document<'t> {
         table.is_some_and(|table| table.contains_key(last.as_str()))
     }
 
-    /// Reports a problem with the value of a key.
+    /// Adds a problem with the value of `key` to the list: what was found, what is allowed, and the remedy. Its
+    /// position in the text is that of the value.
     pub fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
         let span = span_of(&self.places, &steps(key));
         self.push(span, key.to_owned(), found.into(), allowed, remedy);
@@ -195,7 +198,7 @@ impl<'t> Document<'t> {
         self.problems.push(Problem { span, key, found, allowed: allowed.to_owned(), remedy: remedy.to_owned() });
     }
 
-    /// Returns all problems as an error, if there are any.
+    /// Returns all reported problems as an error, sorted by their position; `Ok` if there are none.
     pub fn finish(self) -> Result<(), Problems> {
         if self.problems.is_empty() { Ok(()) } else { Err(self.into_problems()) }
     }
@@ -219,8 +222,9 @@ impl<'t> Document<'t> {
     }
 }
 
-/// Returns one problem with a value of a text that was read earlier. The key has its new name; the text may have the
-/// old one.
+/// Returns one problem with the value of `key`, for a text whose keys and values were checked earlier. `key` is the
+/// present name; the text can have the old name, according to `renamed`. The last argument holds what was found, what
+/// is allowed, and the remedy.
 pub fn problem_at(
     file: &Path,
     text: &str,
@@ -237,7 +241,7 @@ pub fn problem_at(
     Problems { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
 }
 
-/// Returns the names among the steps of a key, without indices.
+/// Returns the names in the steps of a key, without the indices of list entries.
 fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
     steps.iter().filter_map(|step| match step {
         Step::Key(name) => Some(name.as_str()),
@@ -245,7 +249,8 @@ fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
     })
 }
 
-/// Moves the position of a value in the text, and that of its name, from an old key to a new key.
+/// Moves the position (in the text) of a value and of its name from an old key to a new key. Does nothing if the old
+/// key does not exist.
 fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     let Some(taken) = take_place(root, &names(old).collect::<Vec<_>>()) else { return };
     let mut inside = root;
@@ -263,8 +268,8 @@ fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     }
 }
 
-/// Removes a value, and the tables that become empty by that. Returns the span of its name, and the value; `None` if
-/// the key does not exist.
+/// Removes the value with the path `names`, and the tables that become empty by that. Returns the position of the name
+/// in the text, and the value; `None` if there is no such value.
 fn take_place<'t>(table: &mut DeTable<'t>, names: &[&str]) -> Option<(Range<usize>, Spanned<DeValue<'t>>)> {
     let (first, rest) = names.split_first()?;
     if rest.is_empty() {
@@ -279,7 +284,8 @@ fn take_place<'t>(table: &mut DeTable<'t>, names: &[&str]) -> Option<(Range<usiz
     taken
 }
 
-/// Removes a value, and the tables that become empty by that.
+/// Removes and returns the value with the path `names`, and removes the tables that become empty by that. Returns
+/// `None` if there is no such value.
 fn take_value(table: &mut toml::Table, names: &[&str]) -> Option<toml::Value> {
     let (first, rest) = names.split_first()?;
     if rest.is_empty() {
@@ -307,7 +313,7 @@ fn move_value(root: &mut toml::Table, old: &[Step], new: &[Step]) {
     inside.insert((*last).to_owned(), value);
 }
 
-/// Splits a key such as `cmm.signals[0].address` into steps.
+/// Splits a key, such as `cmm.signals[0].address`, into names and indices.
 fn steps(key: &str) -> Vec<Step> {
     let mut steps = Vec::new();
     for part in key.split('.') {
@@ -318,7 +324,7 @@ fn steps(key: &str) -> Vec<Step> {
     steps
 }
 
-/// Joins steps to a key.
+/// Joins names and indices to a key, such as `cmm.signals[0].address`.
 fn key_of(steps: &[Step]) -> String {
     let mut key = String::new();
     for step in steps {
@@ -335,8 +341,8 @@ fn key_of(steps: &[Step]) -> String {
     key
 }
 
-/// Returns the position of a value, or of the name of a table. If the value does not exist, returns the position of the
-/// innermost existing table.
+/// Returns the position in the text of a value; for a table, that of its name. If the value does not exist, returns the
+/// position of the innermost table around it that exists.
 fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let mut found = 0..0;
     let mut inside: Option<&DeValue> = None;
@@ -362,7 +368,7 @@ fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     found
 }
 
-/// Returns the position of the name of a key.
+/// Returns the position in the text of the name of a key, not of its value.
 fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let Some((Step::Key(last), before)) = steps.split_last() else { return span_of(root, steps) };
     let mut inside: Option<&DeValue> = None;
@@ -391,7 +397,8 @@ struct Shape<'d, 't> {
 }
 
 impl Shape<'_, '_> {
-    /// Reports values that do not fit the schema. Returns false if `value` itself does not fit and must be removed.
+    /// Reports all problems of `value`, and removes values within it that do not fit the schema. Returns false if
+    /// `value` itself does not fit and must be removed.
     fn fits(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
         if let Some(words) = choices(schema) {
             return self.is_one_of(&words, value);
@@ -654,7 +661,7 @@ fn limits(schema: &Schema) -> [f64; 2] {
     [limit("minimum").unwrap_or(f64::NEG_INFINITY), limit("maximum").unwrap_or(f64::INFINITY)]
 }
 
-/// Returns the word that is most similar to `found`; `None` if no word is similar enough.
+/// Returns the word that is most similar to `found`, ignoring capital letters; `None` if no word is similar enough.
 fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w str> {
     let found: String = found.chars().take(64).collect::<String>().to_lowercase().replace('-', "_");
     let likeness = |word: &str| strsim::normalized_damerau_levenshtein(&found, &word.replace('-', "_"));
@@ -665,7 +672,8 @@ fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w 
         .map(|(_, word)| word)
 }
 
-/// Returns the name of a table that has a key, for a message; `None` if no table has it.
+/// Returns the name of the table, in the schema, that has `key`, for a message; `None` if no table has it. `path` must
+/// be empty at first; it holds the names of the tables around `schema`.
 fn home_of(schema: &Schema, key: &str, path: &mut Vec<String>) -> Option<String> {
     let variants = schema.get("oneOf").and_then(Schema::as_array).into_iter().flatten();
     for schema in std::iter::once(schema).chain(variants) {
@@ -689,7 +697,7 @@ fn in_words(words: &[&str]) -> String {
     words.iter().map(|word| format!("\"{word}\"")).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the unit that the end of a key states; `None` if it states no unit.
+/// Returns the unit at the end of a key, such as mm for `probe_radius_mm`; `None` if the key states no unit.
 fn unit_of(key: &str) -> Option<&'static str> {
     const UNITS: [(&str, &str); 8] = [
         ("_mm_min", "mm/min"),
@@ -704,7 +712,7 @@ fn unit_of(key: &str) -> Option<&'static str> {
     UNITS.iter().find(|(suffix, _)| key.ends_with(suffix)).map(|(_, unit)| *unit)
 }
 
-/// Returns a value in the form used in messages.
+/// Returns a value as text for a message, shortened if it is long.
 fn shown(value: &toml::Value) -> String {
     match value {
         toml::Value::String(text) => {

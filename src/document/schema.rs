@@ -5,11 +5,11 @@ use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema};
 use serde_json::Value;
 
-/// Returns the JSON schema of a kind of file, which is deserialized into `File`.
+/// Returns the JSON schema of the settings file that is deserialized into `File`.
 ///
 /// An optional key is an `Option`. TOML has no null, so null is removed from its types. A required key is optional for
-/// the deserializer too, so that its absence is reported with the other problems: its default is NaN, which JSON cannot
-/// represent, or it carries `x-required`.
+/// the deserializer too, so that its absence is reported with the other problems. Such a key has the default NaN, which
+/// JSON cannot represent, or the mark `x-required`.
 pub fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();
@@ -73,7 +73,7 @@ fn without_null(schema: &mut Schema) {
     }
 }
 
-/// Returns the allowed words if a schema is a choice among words; `None` for any other schema.
+/// Returns the words that a schema allows, if it allows only certain words; `None` for any other schema.
 pub fn choices(schema: &Value) -> Option<Vec<&str>> {
     if let Some(values) = schema.get("enum").and_then(Value::as_array) {
         return values.iter().map(Value::as_str).collect();

@@ -19,8 +19,8 @@ fn is_misleading(c: char) -> bool {
         || matches!(c, '\u{2060}'..='\u{2069}' | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns a text in which each misleading character is replaced by its code, as `<U+202E>`. Line ends and tabs stay
-/// unchanged.
+/// Returns a text in which each invisible or misleading character ([`misleading`]) is replaced by its code, such as
+/// `<U+202E>`. Line feeds and tabs stay unchanged.
 pub fn visible(text: &str) -> String {
     text.chars().fold(String::with_capacity(text.len()), |mut shown, c| {
         if is_misleading(c) && !matches!(c, '\n' | '\t') {
@@ -32,7 +32,8 @@ pub fn visible(text: &str) -> String {
     })
 }
 
-/// Returns a text in which numbers with too many digits to count are written with an exponent: `1e300`.
+/// Returns a text in which long numbers, whose digits nobody can count at a glance, are written with an exponent, such
+/// as `1e300`.
 pub fn countable(text: &str) -> String {
     let is_of_number = |c: char| c.is_ascii_digit() || c == '.';
     let mut shown = String::with_capacity(text.len());

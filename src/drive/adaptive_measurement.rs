@@ -22,8 +22,12 @@ pub(super) struct TouchEvaluation {
     pub(super) next: Option<(Vec<usize>, &'static str)>,
 }
 
-/// Evaluates the touches so far. The first batch is too small for an evaluation and is only checked by the gates. After
-/// it, the next targets are those that the first evaluation requires.
+/// Evaluates the touches of an adaptive measurement after each batch, and returns the estimate of the form and the next
+/// targets, if more are required. `found` is the registration of the points so far, and `given` the inputs of the error
+/// model.
+///
+/// After the first batch, which only shows whether the part is in its place, there is no estimate. The next targets are
+/// then as many as the first estimate requires.
 pub(super) fn evaluate_touches(
     task: &Task,
     adaptive: &AdaptiveOptions,
@@ -128,7 +132,8 @@ pub(super) fn plan_repeated_touches(
     Some(RepeatedTouches { outlier_points: alone, control_points: controls, max_control_change_mm, targets })
 }
 
-/// Projects a target onto the nominal surface, along its normal.
+/// Returns a target at the projection of `near` onto the nominal surface, with the normal of `near`. If the surface
+/// cannot be built, returns `near`.
 fn project_onto_nominal(task: &Task, near: &Target) -> Target {
     match OffsetSurface::new(&task.nominal, 0.0, Side::Normal) {
         Ok(surface) => {
@@ -156,7 +161,8 @@ fn reason_message(why: Reason) -> &'static str {
     }
 }
 
-/// Interpolates the form on the grid of the error map. Returns `None` if no map can be computed from it.
+/// Computes an error map from the estimated form at the points of the error model. Returns `None` if these points do
+/// not determine a map.
 pub(super) fn interpolate_form(task: &Task, form: &Form) -> Option<ErrorMap> {
     let of = |p: &model::FormPoint| {
         (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm)

@@ -30,7 +30,8 @@ pub enum BlockingExecutor {
 }
 
 impl BlockingExecutor {
-    /// Runs a piece of work as one of a set of tasks. Returns the handle to abort it.
+    /// Starts the computation `work` as a task in the set `among`: on a thread for blocking work, or, in simulated
+    /// time, after its simulated duration. Returns the handle to abort the task.
     pub(super) fn spawn_computation<T: Send + 'static>(
         &self,
         among: &mut JoinSet<T>,
@@ -45,7 +46,8 @@ impl BlockingExecutor {
         }
     }
 
-    /// Runs a task that may block for long. Returns its thread, if it has one.
+    /// Runs the future `attending`, which may block for long, on a separate thread with the given name, and returns the
+    /// thread. In simulated time, runs it as a task of the present runtime and returns `None`.
     pub(super) fn spawn_service(
         &self,
         name: &str,
@@ -60,7 +62,7 @@ impl BlockingExecutor {
         Some(thread.expect("a thread can be had"))
     }
 
-    /// Waits for the simulated duration of a piece of work, if the time is simulated.
+    /// Waits for the duration of this kind of work, if the time is simulated. Otherwise returns at once.
     pub(super) async fn wait_simulated_duration(&self, what: BlockingWork) {
         if let Self::SimulatedTime(time) = self {
             tokio::time::sleep(time(what)).await;

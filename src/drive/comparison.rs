@@ -28,8 +28,7 @@ const TEXTS: [&str; 16] = [
 /// Table of figures. Its columns `removed`, `direction`, `cut_off` and `made` are texts for people.
 const FIGURES_TABLE: &str = "form.csv";
 
-/// Returns true if two recorded commands decide the same. The cause of an alarm is a text: the machine that it names is
-/// compared in the other commands.
+/// Returns true if two recorded commands are equal, apart from texts for people such as reasons and remedies.
 pub(super) fn is_same_decision(one: &Value, other: &Value) -> bool {
     let decision = |command: &Value| {
         let mut command = command.clone();
@@ -41,7 +40,8 @@ pub(super) fn is_same_decision(one: &Value, other: &Value) -> bool {
     decision(one) == decision(other)
 }
 
-/// Returns true if two JSON values are equal, except for strings with a space below a key of [`TEXTS`].
+/// Returns true if two JSON values are equal. Ignores differences of sentences (strings with a space) below a key of
+/// [`TEXTS`], because these are texts for people.
 pub(super) fn is_same_result(one: &Value, other: &Value) -> bool {
     are_equal(one, other, false)
 }
@@ -64,8 +64,8 @@ fn are_equal(one: &Value, other: &Value, is_text: bool) -> bool {
     }
 }
 
-/// Returns true if two files of the same name have the same content, texts for people and the version of the program
-/// excepted.
+/// Returns true if the files `one` and `other` have the same content. Ignores differences of texts for people and of
+/// the version of the program. `name` is the name of both files and selects how they are compared.
 pub(super) fn is_same_file(name: &str, one: &[u8], other: &[u8]) -> bool {
     if one == other {
         return true;
@@ -91,7 +91,8 @@ pub(super) fn is_same_file(name: &str, one: &[u8], other: &[u8]) -> bool {
         })
 }
 
-/// Removes the version of the program from the first comment of a tool path, `Regrind 1.2.3 tool path`.
+/// Returns a line of a tool path without the version of the program. Changes only lines such as `Regrind 1.2.3 tool
+/// path`.
 fn without_version(line: &str) -> String {
     let version = line.split_once("Regrind ").and_then(|(before, after)| {
         let (version, rest) = after.split_once(" tool path")?;
@@ -100,7 +101,8 @@ fn without_version(line: &str) -> String {
     version.unwrap_or_else(|| line.to_owned())
 }
 
-/// Returns true if two rows of a table are equal, except for fields that have spaces in both.
+/// Returns true if two rows of a table have equal fields. Two different fields count as equal if both contain a space,
+/// because they are then texts for people.
 fn is_same_row(one: &str, other: &str) -> bool {
     let [one, other] = [one, other].map(fields);
     let is_text = |field: &str| field.trim().contains(' ');
@@ -118,7 +120,8 @@ fn fields(row: &str) -> Vec<&str> {
     .collect()
 }
 
-/// Returns true for a comment that describes a compensated parameter. Its value is a number of the correction.
+/// Returns true if a line is a comment about a compensated parameter. Such a line is not compared, because its number
+/// is also in the correction.
 fn is_remark(line: &str) -> bool {
     let comment = line.trim_start().trim_start_matches(['#', '(', ';']).trim_start();
     comment.len() < line.len() && comment.starts_with("parameter: ")

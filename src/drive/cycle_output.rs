@@ -22,7 +22,8 @@ use crate::report::{HeatMap, ReportError, save_coloured_ply};
 /// Length over which slopes are computed, as a share of the cut-off of the map's filter. The map has no shorter waves.
 const SLOPE_LENGTH_SHARE: f64 = 0.5;
 
-/// Writes the figures of a cycle. If there are none, the file gives the reason.
+/// Writes the file `figures.json` with the form figures of a cycle. If they cannot be computed, the file states the
+/// reason. `map` is the error map, and `form` the estimate of the error model, if there are any.
 pub(super) fn save_figures(
     task: &Task,
     files: &mut OutputFiles,
@@ -45,8 +46,8 @@ pub(super) fn save_figures(
     )
 }
 
-/// Returns the options for the figures of an area: the middle of the aperture, and the length over which slopes are
-/// computed.
+/// Returns the options for figures of an area: the centre of the part's outline in mm, and the length in mm over which
+/// slopes are computed.
 pub(super) fn area_options(task: &Task) -> AreaOptions {
     let middle = |[low, high]: [[f64; 2]; 2]| std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     AreaOptions {
@@ -55,7 +56,7 @@ pub(super) fn area_options(task: &Task) -> AreaOptions {
     }
 }
 
-/// Returns in words what registration and filter remove from the deviations.
+/// Describes in words what the registration (rigid motion) and the filter (short waves) remove from the deviations.
 fn removed_components(task: &Task) -> RemovedParts {
     let names = ["x", "y", "z", "rx", "ry", "rz"].into_iter().zip(task.registration_options.locked);
     let held: Vec<&str> = names.filter(|(_, held)| *held).map(|(name, _)| name).collect();
@@ -73,8 +74,8 @@ fn removed_components(task: &Task) -> RemovedParts {
 }
 
 /// Estimates the parameters of the machine that explain a part of the deviations: radius and setting of the wheel, tilt
-/// of the part, wear. Writes the estimates to a file. Returns `None` if they cannot be estimated; the file then gives
-/// the reason.
+/// of the part, wear. Writes the estimates to `parameters.json`. If they cannot be estimated, writes the reason there
+/// and returns `None`. `contacts` are the measured points.
 pub(super) fn save_parameters(
     task: &Task,
     files: &mut OutputFiles,
@@ -92,7 +93,8 @@ pub(super) fn save_parameters(
     }
 }
 
-/// Returns the points used in a registration, with normals and deviations, for the estimate of machine parameters.
+/// Returns the points used in a registration in the form for the estimation of machine parameters: with normals and
+/// deviations.
 pub(super) fn surface_points(found: &Registration) -> Vec<SurfacePoint> {
     let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
     used_deviations(found).map(contact).collect()
@@ -114,8 +116,8 @@ fn parameter_document(task: &Task, told: &ParameterEstimation) -> Value {
     })
 }
 
-/// Returns the parameter corrections of the next pass: those of this pass plus those now compensated. Returns `None` if
-/// the recipe compensates no parameter, or if all corrections are 0.
+/// Returns the parameter corrections for the next pass: those of this pass, plus the compensation that the estimate
+/// `told` adds. Returns `None` if the recipe compensates no parameter, or if all corrections are 0.
 pub(super) fn next_parameter_corrections(
     task: &Task,
     cycle: &CycleState,
@@ -137,8 +139,9 @@ pub(super) fn next_parameter_corrections(
     )
 }
 
-/// Returns a function that computes, from values at the nodes of the correction, the part that parameters of the
-/// machine explain ([`compensation::explained_by_parameters`]). Returns `None` if no parameter is compensated.
+/// Returns a function of values at the nodes of the correction. The function returns, at the same nodes, how much of
+/// the values an error of the machine parameters explains ([`compensation::explained_by_parameters`]). `contacts` are
+/// the measured points. Returns `None` if the recipe compensates no parameter.
 pub(super) fn parameter_explainer<'t>(
     task: &'t Task,
     cycle: &'t CycleState,

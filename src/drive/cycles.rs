@@ -21,13 +21,14 @@ impl Cycles {
         self.0.get(&number)
     }
 
-    /// Returns the payloads of the pass of a cycle. The first pass uses the first correction of the task.
+    /// Returns what the grinder receives for the pass of cycle `number`: the correction map and the parameters of the
+    /// pass. A cycle that does not exist yet is created with the first correction of the task.
     pub(super) fn pass_payloads(&mut self, task: &Task, number: u32) -> (CorrectionMap, Pass) {
         let cycle = self.0.entry(number).or_insert_with(|| CycleState::new(task.first_correction()));
         task.payloads(&cycle.correction)
     }
 
-    /// Creates the plan of a cycle and stores it.
+    /// Creates the measuring plan for the next measurement of cycle `number`, stores it in the cycle, and returns it.
     pub(super) fn create_plan(&mut self, task: &Task, number: u32) -> Arc<Plan> {
         // A part that is measured before any pass, or measured once more, has the state that the last pass left.
         let last = self.0.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
@@ -51,13 +52,14 @@ impl Cycles {
         cycle.plan.insert(Arc::new(plan)).clone()
     }
 
-    /// Returns the number of the batch of touches to which the plan of a cycle belongs; 0 for the first batch.
+    /// Returns the number of the current batch of touches of cycle `number`. It is 0 for the first batch, and for a
+    /// cycle that does not exist.
     pub(super) fn batch(&self, number: u32) -> u32 {
         self.get(number).map_or(0, |cycle| cycle.batch)
     }
 
-    /// Returns the number of touches tried on the part, and the number that the whole pattern would have needed, in all
-    /// measurements.
+    /// Returns two numbers of touches, summed over all measurements: the targets on the part that were tried, and the
+    /// targets that measurements of the complete pattern would have had.
     pub(super) fn touch_counts(&self, task: &Task) -> [usize; 2] {
         let measured = self.0.values().filter_map(|cycle| cycle.points.as_ref());
         let tried = measured.clone().map(|points| match points.tried_targets.is_empty() {
@@ -67,20 +69,21 @@ impl Cycles {
         [tried.sum(), measured.count() * task.targets.len()]
     }
 
-    /// Returns the last judged measurement of an earlier pass than that of cycle `number`; `None` if there is none. A
-    /// measurement that a gate refused, or that repeats one after the same pass, does not count.
+    /// Returns the last judged cycle before cycle `number` whose measurement follows an earlier pass; `None` if there
+    /// is none. A cycle counts only if its measurement was accepted by the gate and has updated the learning.
     pub(super) fn previous_judged(&self, number: u32) -> Option<&CycleState> {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&CycleState| c.is_judged() && c.learning.is_some() && c.correction.cycle < pass;
         self.0.range(..number).rev().map(|(_, c)| c).find(earlier)
     }
 
-    /// Returns the number and the points of the last measurement before a cycle.
+    /// Returns the usable points of the last measurement before cycle `number`, with the number of its cycle; `None` if
+    /// there are none.
     pub(super) fn previous_points(&self, number: u32) -> Option<(u32, Arc<UsablePoints>)> {
         self.0.range(..number).rev().find_map(|(earlier, cycle)| Some((*earlier, cycle.points.clone()?)))
     }
 
-    /// Stores the result of a computation of a cycle.
+    /// Stores the result of a computation in cycle `number`.
     pub(super) fn store(&mut self, number: u32, product: ComputationProduct) {
         if let ComputationProduct::Correction(next) = product {
             self.0.insert(number + 1, CycleState::new(next));
@@ -89,21 +92,22 @@ impl Cycles {
         }
     }
 
-    /// Counts a judgement of a cycle. Returns the number of judgements of this cycle so far.
+    /// Increments the number of judgements of cycle `number`, and returns it. Returns 1 for a cycle that does not
+    /// exist.
     pub(super) fn count_judgement(&mut self, number: u32) -> u32 {
         let Some(cycle) = self.0.get_mut(&number) else { return 1 };
         cycle.judgement_count += 1;
         cycle.judgement_count
     }
 
-    /// Returns the last judged cycle with a state of the learning; `None` if there is none.
+    /// Returns the last judged cycle whose measurement has updated the learning; `None` if there is none.
     pub(super) fn last_with_learning(&self) -> Option<&CycleState> {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.learning.is_some())
     }
 
-    /// Returns the priors for the error fields of later parts: those from earlier parts, updated with the last judged
-    /// pass of each kind in this run. Priors from other cells are not included: otherwise these cells would get their
-    /// own results back as results of this cell.
+    /// Returns the priors of the error model for later parts, one for passes without and one for passes with a
+    /// correction. They combine the priors that this cell had before with the last judged cycle of each of these two
+    /// kinds. Priors from other cells are omitted, because these cells would receive their own results again.
     pub(super) fn part_priors(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
@@ -118,7 +122,7 @@ impl Cycles {
         taught
     }
 
-    /// Returns the rows of the table of cycles.
+    /// Returns the results of the cycles as rows of the table that the status of the cell contains.
     pub(super) fn rows(&self, tolerance: &Tolerance) -> Vec<CycleRow> {
         let rows = self.0.iter().filter_map(|(&cycle, c)| {
             let figures = c.figures.as_ref()?;
@@ -138,8 +142,9 @@ impl Cycles {
     }
 }
 
-/// Creates the next batch of touches of a measurement. The first batch has targets that are far apart; they are
-/// approached slowly if the part may have been clamped again.
+/// Creates the plan for the next batch of an adaptive measurement. The first batch has targets that are far apart. If
+/// the part may have been clamped again (`seated_anew`), its targets are approached slowly. `pose` is used until the
+/// cycle has a registration.
 fn next_batch_plan(task: &Task, cycle: &mut CycleState, pose: &Pose, seated_anew: bool) -> Plan {
     cycle.batch = cycle.points.as_ref().map_or(0, |points| points.tried_targets.len() as u32);
     cycle.batch_targets = match &cycle.next_targets {

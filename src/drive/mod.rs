@@ -107,7 +107,7 @@ pub struct OrderSender {
 }
 
 impl OrderSender {
-    /// Sends an order, which the loop handles in its turn.
+    /// Sends an order to the run, and does not wait for the answer. Does nothing if the run is over.
     pub async fn send(&self, request: Request, actor: Actor) {
         // A run that is over needs no orders.
         let _ = self.orders.send(ReceivedOrder { request, actor, answer: None }).await;
@@ -199,7 +199,7 @@ enum Computation {
 }
 
 impl Computation {
-    /// Returns the computation that writes a file of this name, if there is one.
+    /// Returns the kind of computation that writes a result file of this name; `None` for any other file.
     fn from_file_name(file: &str) -> Option<Self> {
         Some(match file {
             "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
@@ -220,8 +220,8 @@ impl Computation {
     }
 }
 
-/// Returns the path of the folder of a cycle, relative to the run folder. Each further attempt has its own subfolder,
-/// so that recorded files are never overwritten.
+/// Returns the path of the result folder of a cycle, relative to the run folder. The second and each further `attempt`
+/// has a subfolder of its own, so that recorded files are never overwritten.
 fn cycle_folder(cycle: u32, attempt: u32) -> String {
     match attempt {
         0 | 1 => format!("cycle-{cycle}"),
@@ -229,7 +229,8 @@ fn cycle_folder(cycle: u32, attempt: u32) -> String {
     }
 }
 
-/// Returns the path of the folder for the results after a batch of an adaptive measurement, relative to the run folder.
+/// Returns the path of the folder for the results after batch `batch` of an adaptive measurement, relative to the run
+/// folder.
 fn batch_folder(cycle: u32, batch: u32) -> String {
     format!("cycle-{cycle}/batch-{batch}")
 }
@@ -247,7 +248,7 @@ enum RecordAction {
     Confirm { device: Device, confirmation: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
-/// Converts a change of the channel for orders into an event.
+/// Converts a change of the control endpoint (lost or created again) into an event.
 fn control_event(change: EndpointChange) -> Event {
     match change {
         EndpointChange::Lost(why) => Event::ControlLost { why },
@@ -271,8 +272,8 @@ struct ComputationResult {
 }
 
 impl Drive {
-    /// Prepares a run with the machines of a cell file, like [`Drive::new`] with any machines. Not generic, so that it
-    /// is compiled here once, and not again with each caller.
+    /// Calls [`Drive::new`] with the machines of a cell file. This function is not generic, so the run is compiled once
+    /// here, and not again in every crate that calls it.
     ///
     /// # Errors
     /// Those of [`Drive::new`].
@@ -280,10 +281,11 @@ impl Drive {
         Self::new(run, cmm, grinder)
     }
 
-    /// Prepares a run: a task for each machine, the control socket, the thread of the journal. Sends no command yet.
+    /// Prepares a run: creates a task for each machine, the control socket in the run folder, and the recorder of the
+    /// journal. Sends no command to a machine. Returns the run and the sender of orders from this process.
     ///
     /// # Errors
-    /// A run folder in which the control socket cannot be created.
+    /// The control socket cannot be created in the run folder.
     pub fn new<C: Cmm + 'static, G: Grinder + 'static>(
         run: RunInputs,
         cmm: C,
@@ -370,7 +372,8 @@ impl Drive {
         self.elapsed_before + self.started_at.elapsed()
     }
 
-    /// Runs until the cell reaches an end state, and returns the ending. Boxed so that it is compiled here.
+    /// Executes the run until the cell reaches an end state, and returns the ending. The future is boxed so that it is
+    /// compiled in this crate.
     pub fn run(self) -> Pin<Box<dyn Future<Output = Ending> + Send>> {
         Box::pin(self.run_to_end())
     }
@@ -418,8 +421,8 @@ impl Drive {
         self.end_run().await
     }
 
-    /// Reports a computation that panicked to the cell as a failed computation. The reason names a fault of this
-    /// program, so nothing is concluded about the part.
+    /// Handles a computation that panicked, which is a fault of this program. Reports the computation to the cell as
+    /// failed. The reason says so, so that nobody looks for a fault of the part.
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
         let why = format!("the computation failed by a fault of the program; report it: {}", panic_message(error));
@@ -434,7 +437,8 @@ impl Drive {
         self.handle_event(event, None).await;
     }
 
-    /// Continues with the first waiting record. An action is executed only if its record was written.
+    /// Handles the result for the oldest entry that waits to be recorded. If it was recorded, executes the action of
+    /// the entry (a command or an answer). If not, answers with the reason, and does not execute the command.
     async fn handle_recorded(&mut self, recorded: Result<(), RecordFailure>) {
         let Some(PendingRecord { action: then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
@@ -467,15 +471,17 @@ impl Drive {
         }
     }
 
-    /// Reports that a START was not sent: the state of the cell changed while the START waited to be recorded.
+    /// Reports a START to the cell as refused, because it was not sent: it could not be recorded, or the cell changed
+    /// its state before. Does nothing for other commands.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "it was not sent: it could not be recorded, or the cell was held first".to_owned();
+            let why = "START was not sent: it could not be recorded, or the cell was held before".to_owned();
             self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
         }
     }
 
-    /// Reports to the cell that a command whose answer it waits for was not sent, because it was not recorded.
+    /// Reports to the cell that a command was not sent, because it could not be recorded; a START is reported as
+    /// refused. Does nothing for a command to which the cell expects no answer, or that it no longer requires.
     async fn report_not_recorded(&mut self, command: Command) {
         if !self.cell.still_requires(&command) && !matches!(command, Command::StartMachine { .. }) {
             return;
@@ -489,7 +495,8 @@ impl Drive {
         }
     }
 
-    /// Reports to the cell and to people that a record cannot be written.
+    /// Handles a record that cannot be written. Notifies people and the cell of the first of several failures in a row.
+    /// Answers all waiting orders.
     async fn report_record_failure(&mut self, why: RecordFailure) {
         let message = failure_message(&why);
         let is_known = self.record_failure_reason.replace(message.clone()).is_some();
@@ -501,9 +508,9 @@ impl Drive {
         self.answer_unrecorded_orders();
     }
 
-    /// Withdraws the waiting commands while nothing can be recorded. Otherwise the cell would wait for their answers,
-    /// and no one could continue before the disk recovers. The cell requests the withdrawn commands again if it needs
-    /// them.
+    /// Withdraws the commands that wait for their record, while nothing can be recorded, and reports this to the cell.
+    /// Otherwise the cell would wait for their answers until the disk works again. The cell issues them again if it
+    /// needs them.
     async fn withdraw_pending_commands(&mut self) {
         if self.record_failure_reason.is_none() || self.ending.is_some() {
             return;
@@ -520,8 +527,8 @@ impl Drive {
         }
     }
 
-    /// Answers waiting orders while nothing can be recorded, so that no client waits for long. The answer says which
-    /// steps were carried out, and why the order is not recorded.
+    /// Answers the orders that wait for their record, while nothing can be recorded. So no client waits for long. The
+    /// answer states what was carried out, and why it was not recorded.
     fn answer_unrecorded_orders(&mut self) {
         let Some(why) = &self.record_failure_reason else { return };
         let status = self.snapshot();
@@ -538,7 +545,7 @@ impl Drive {
         }
     }
 
-    /// Writes the end of the run and releases the machines.
+    /// Writes the end of the record and the results of the run, and releases the machines. Returns the ending.
     async fn end_run(mut self) -> Ending {
         let ending = self.ending.take().expect("the loop ended with one");
         self.orders.close();
@@ -570,7 +577,8 @@ impl Drive {
         ending
     }
 
-    /// Handles an order and answers its sender.
+    /// Handles an order and answers its sender. Refuses a resume if the state of the cell has changed since the person
+    /// saw it.
     async fn handle_order(&mut self, ReceivedOrder { request, actor, answer }: ReceivedOrder) {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.state_changes
@@ -609,7 +617,8 @@ impl Drive {
         }
     }
 
-    /// Records the text of a [`Request::Remark`], and answers the program that sent it.
+    /// Records the text `what` of a [`Request::Remark`]. Answers the program that sent the request through `answer`,
+    /// after the text is recorded.
     fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let origin = (actor.name.clone(), actor.station.clone());
         let payload = json!({ "remark": what });
@@ -653,7 +662,11 @@ impl Drive {
         });
     }
 
-    /// Returns the machine that a person's confirmation is about, its name in the record, and the confirmation.
+    /// Converts the request of a person into a confirmation for a machine. Returns the machine, the name of the
+    /// confirmation in the record, and the confirmation.
+    ///
+    /// # Errors
+    /// Returns the reason if no job is in progress, if no machine is named, or if the digits of the map are wrong.
     fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving_device);
         let job = || at_work.ok_or("no job of a machine is in progress");
@@ -674,8 +687,9 @@ impl Drive {
         })
     }
 
-    /// Returns the full identity of the map of this cycle. Returns an error if `digits`, at least 8 hexadecimal ones,
-    /// are not its beginning, or if no pass is in progress.
+    /// Returns the SHA-256 of the map of this cycle. `digits` are the first 8 or more hexadecimal digits of it, as a
+    /// person reads them at the grinder. Returns an error if they do not agree or are too few, or if no pass is in
+    /// progress.
     fn map_identity(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
@@ -729,7 +743,8 @@ impl Drive {
         }
     }
 
-    /// Shows the preliminary figures of a measurement that still runs.
+    /// Updates the preview with points of a measurement that still runs, and publishes it. Points of another job than
+    /// the current one delete the preview.
     fn update_preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
         let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };
@@ -741,7 +756,8 @@ impl Drive {
         self.status.send_replace(self.snapshot());
     }
 
-    /// Returns why a pass record is implausible, compared with the commanded pass.
+    /// Returns the first implausible figure of a pass record, compared with the pass that was commanded in this cycle;
+    /// `None` if there is none.
     fn pass_record_flaw(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
         let Some(cycle) = self.cycles.get(number) else { return Some(format!("cycle {number} has no pass")) };
@@ -753,7 +769,7 @@ impl Drive {
         pass_record::implausible_figure(&told, record)
     }
 
-    /// Records and shows the speed of the transfer of points.
+    /// Records how long the transfer of the points of a measurement took, and shows the speed.
     async fn record_transfer(&mut self, measurement: &Measurement, taken: Duration) {
         let cycle = BatchId::decode(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
@@ -787,7 +803,7 @@ impl Drive {
         }
     }
 
-    /// Records files of a cycle, or reports why they could not be written.
+    /// Adds files of a cycle to the record. If `files` is an error, reports that they could not be written.
     async fn record_files(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
         match files {
             Ok(files) if files.is_empty() => {}
@@ -804,8 +820,9 @@ impl Drive {
         }
     }
 
-    /// Records an event, lets the cell handle it, and starts the execution of the commands. Returns the reason of a
-    /// refusal, if there was one, and a ticket for the record.
+    /// Records an event, lets the cell handle it, and starts the execution of the resulting commands. Returns the
+    /// reason if the cell refuses the event, and a receipt that completes when the event is recorded or cannot be
+    /// recorded.
     async fn handle_event(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, RecordReceipt) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
@@ -854,7 +871,8 @@ impl Drive {
         self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
     }
 
-    /// Writes a small document of the loop itself into the run folder and records it.
+    /// Writes `document` as JSON to the file `name`, relative to the run folder, and records the file. If it cannot be
+    /// written, only notifies people.
     async fn write_document(&mut self, name: String, cycle: u32, document: &impl Serialize) {
         let path = self.folder.join(&name);
         let made = create_folder(path.parent().unwrap_or(&self.folder));
@@ -864,7 +882,8 @@ impl Drive {
         }
     }
 
-    /// Records a command. After that the command is executed, if it was not executed already.
+    /// Queues a command to be recorded, and to be executed after that. A command that does not wait for its record
+    /// ([`is_immediate`]) is executed elsewhere, and only recorded here.
     fn queue_command(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
@@ -883,7 +902,8 @@ impl Drive {
         self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
     }
 
-    /// Shows and stores everything recorded so far, after the run is over. No machine gets a command any more.
+    /// Waits until all queued entries are recorded, after the run is over. Still writes judgements and answers orders,
+    /// but executes no other command. Gives up after a time limit.
     async fn finish_backlog(&mut self) {
         let by = Instant::now() + recorder::CLOSE_TIMEOUT;
         while !self.backlog.is_empty() {
@@ -949,7 +969,7 @@ impl Drive {
         }
     }
 
-    /// Shows the judgement of a cycle and stores it with the measurement.
+    /// Writes the judgement of a cycle to a file in the folder of its measurement, and shows it.
     async fn announce(&mut self, judgement: Judgement) {
         let which = self.cycles.count_judgement(judgement.cycle);
         self.write_judgement(which, &judgement).await;
@@ -1010,8 +1030,8 @@ impl Drive {
         }
     }
 
-    /// Checks that the disk has space for the files of this cycle. If not, the cell is held before a machine moves; the
-    /// payload may be sent to the machine meanwhile.
+    /// Checks that the disk has space for the files of this cycle. If it does not, reports this to the cell, which
+    /// holds before a machine moves. Data may still be sent to the machine.
     fn check_disk_space(&mut self, cycle: u32) {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
         self.executor.spawn_computation(&mut self.computations, move || {
@@ -1034,7 +1054,7 @@ impl Drive {
         self.send_request(Device::Cmm, StationRequest::Load { cycle: number, payload: load }).await;
     }
 
-    /// Checks the points of a measurement and writes them.
+    /// Starts the gate of a measurement: the check whether its points can be used. Also writes the points to files.
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = BatchId::decode(measurement.cycle).cycle;
         let cycle = self.cycles.get(number).cloned();
@@ -1066,8 +1086,9 @@ impl Drive {
         });
     }
 
-    /// Computes off the asynchronous threads. The files are written to the disk and read back there too: those of a
-    /// fine measurement are large, and neither the loop nor the journal waits for them.
+    /// Starts the computation `work` for a cycle on a thread for blocking work. Its files are also written to the disk
+    /// and read back on this thread, because they can be large, and neither the loop nor the journal should wait for
+    /// them.
     fn start_computation(
         &mut self,
         kind: Computation,
@@ -1098,7 +1119,7 @@ impl Drive {
         self.running_computations.insert(computing.id(), (cycle, kind));
     }
 
-    /// Sends an event to the cell through the queue of the computations, as if it were the result of a computation.
+    /// Queues an event for the cell, as if it were the result of a computation of this cycle.
     fn queue_event(&mut self, cycle: u32, event: Event) {
         let computed = ComputationResult {
             cycle,
@@ -1120,7 +1141,7 @@ impl Drive {
         Notice::State { state, cycle, event: event.name().to_owned(), at_job }
     }
 
-    /// Shows an event that the cell has handled.
+    /// Shows an event to people, and updates the progress and the preview. Called after the cell has handled the event.
     fn show_event(&mut self, now: Duration, event: &Event) {
         self.progress_estimator.update_state(self.cell.state());
         if self.progress_estimator.progress().is_none_or(|progress| progress.device != Device::Cmm) {
@@ -1163,8 +1184,8 @@ fn spawn_station<D: StationDriver>(
     (asks, tokio::spawn(station.serve(asked, poll, AbortCounter::new(aborts.subscribe()), pulse.clone())))
 }
 
-/// Returns true for a command that waits neither for the disk nor for earlier records: it brings machines to rest, only
-/// reads a status, informs people, or ends the run.
+/// Returns true for a command that is executed at once, before it is recorded: it brings machines to rest, only reads a
+/// status, informs people, or ends the run.
 fn is_immediate(command: &Command) -> bool {
     matches!(
         command,
@@ -1179,7 +1200,7 @@ fn is_immediate(command: &Command) -> bool {
     )
 }
 
-/// Returns an error if the disk of a folder has less free space than needed.
+/// Returns an error if the disk of `folder` has less free space than `needed` bytes.
 fn require_free_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     // If the free space is unknown, try to write.
     let free = journal::free_bytes(folder).unwrap_or(u64::MAX);
@@ -1201,9 +1222,11 @@ fn panic_message(error: JoinError) -> String {
 /// Waits until the first entry in the queue is recorded.
 async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<(), RecordFailure> {
     match backlog.front_mut() {
-        Some(next) => (&mut next.receipt)
-            .await
-            .unwrap_or_else(|_| Err(RecordFailure::Unwritable("the thread of the journal has ended".into()))),
+        Some(next) => (&mut next.receipt).await.unwrap_or_else(|_| {
+            Err(RecordFailure::Unwritable(
+                "the part of this program that writes the record has ended; report it".into(),
+            ))
+        }),
         None => std::future::pending().await,
     }
 }
@@ -1214,7 +1237,7 @@ fn failure_message(failure: &RecordFailure) -> String {
     }
 }
 
-/// Returns a figure with its limit, as the result of a cycle contains it.
+/// Returns a judged figure with its limit as JSON, for the result file of a cycle.
 fn judged_figure(of: &ComparedFigure) -> Value {
     json!({
         "name": of.name,

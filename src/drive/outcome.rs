@@ -2,7 +2,8 @@
 
 use crate::cell::{Command, Device, Event, MachineRequest, Reconciliation};
 
-/// Returns true if an event answers a command. All other commands are complete when they are sent.
+/// Returns true if an event is expected as the answer to a command. A command without an answer (such as an alarm) is
+/// complete when it is issued.
 pub(super) fn expects_answer(command: &Command) -> bool {
     !matches!(
         command,
@@ -14,8 +15,8 @@ pub(super) fn expects_answer(command: &Command) -> bool {
     )
 }
 
-/// Returns true if an event is the outcome of a command. A START with an unknown outcome stays open until it is
-/// reconciled.
+/// Returns true if `event` is the answer to `command`. A START for which it is unknown whether the machine executes it
+/// has no answer until the job is reconciled.
 pub(super) fn answers(event: &Event, command: &Command) -> bool {
     use Command as C;
     use Event as E;
@@ -58,8 +59,8 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
     }
 }
 
-/// Returns the machine and the request of a command, as a refusal names them; `None` for a command that a machine
-/// cannot refuse.
+/// Returns the machine that gets a command, and the request by which a refusal names the command. Returns `None` for a
+/// command that no machine can refuse.
 fn machine_request(command: &Command) -> Option<(Device, MachineRequest)> {
     Some(match command {
         Command::LoadPass { .. } => (Device::Grinder, MachineRequest::Load),

@@ -33,8 +33,9 @@ pub(super) struct CommandedPass<'t> {
     pub(super) outline: Option<&'t Aperture>,
 }
 
-/// Returns the first implausible figure of a record, with its limit; `None` if there is none. `told` is the commanded
-/// pass. A figure that was not reported is not checked.
+/// Returns a text about the first implausible figure of a pass record, with its limit; `None` if there is none. `told`
+/// is the commanded pass. The figures of a pass that did not complete, and figures that were not reported, are not
+/// checked.
 pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> Option<String> {
     let CommandedPass { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
@@ -91,19 +92,19 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
         .or_else(|| contradiction(record))
 }
 
-/// Returns a contradiction between figures of a record: a wheel that cut must have removed material.
+/// Returns a text if the record reports a removed depth but a removed volume of 0; otherwise `None`.
 fn contradiction(record: &PassRecord) -> Option<String> {
     let (removed_mm3, max_depth_mm) = (record.removed_mm3?, record.max_depth_mm?);
     (removed_mm3 == 0.0 && max_depth_mm > 0.0)
         .then(|| format!("the removed volume is 0 mm³, but the largest removed depth is {max_depth_mm:.4} mm"))
 }
 
-/// Formats a figure for a message. An absurd value is not written with hundreds of digits.
+/// Formats a figure for a message, with few digits even if its value is very large.
 fn format_figure(value: f64) -> String {
     if value.abs() < 1e9 { format!("{value:.3}") } else { format!("{value:e}") }
 }
 
-/// Returns a pass record as the journal stores it.
+/// Converts a pass record into the JSON that the journal stores.
 pub(super) fn pass_record_document(record: &PassRecord) -> Value {
     json!({
         "path_mm": record.path_mm,

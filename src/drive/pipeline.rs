@@ -37,8 +37,9 @@ use super::task::{
     deviation_samples, used_deviations,
 };
 
-/// Checks if the measurement of a cycle can be used, and writes its points. `earlier` is the last measurement before
-/// it, with the number of its cycle.
+/// Checks whether the measurement of cycle `number` can be used (the gate), and writes its points to `files`. `earlier`
+/// is the last measurement before it, with the number of its cycle; a machine could have returned that result again.
+/// Returns the event for the cell and the usable points.
 pub(super) fn gate_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -93,14 +94,13 @@ pub(super) fn gate_cycle(
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
 
-/// Replaces the touches that were repeated and adds those around them. Returns the points and the number of touches
-/// found.
-///
-/// If a repeated touch misses the part, the first touch stays. The control points keep their first touches.
+/// Merges a repetition of touches into a measurement. Replaces each outlier by its repeated touch, and adds the touches
+/// around the outliers. Keeps the first touch of an outlier whose repetition missed the part, and the first touches of
+/// the control points. Returns the points, and the number of points that the repetition found.
 ///
 /// # Errors
-/// Returns a failure if the kind of coordinates differs from that of the first touches, if points are missing, or if
-/// control points have moved. The two sets of touches are then not of one measurement.
+/// One set of points are probe centres and the other contact points, points are missing, or control points have moved.
+/// The part may then have moved between the two sets.
 fn merge_repeated_touches(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -131,13 +131,12 @@ fn merge_repeated_touches(
     Ok((all, found as u32))
 }
 
-/// Compares the repeated control points with their first touches, along the normals.
-///
-/// One control point may be a wrong touch, so the second largest change decides.
+/// Checks that the part has not moved between a measurement and its repeated touches. Compares the control points with
+/// their first touches, along the normals. The second largest change counts, because one control point may be a wrong
+/// touch.
 ///
 /// # Errors
-/// Returns a failure if the change exceeds what the noise of the probe explains, or if fewer than two control points
-/// were touched.
+/// The change exceeds the limit of `again`, or fewer than two control points were touched.
 fn check_control_points(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -153,7 +152,7 @@ fn check_control_points(
     match changes_mm.get(1) {
         Some(&second_mm) if second_mm <= limit_mm => Ok(()),
         Some(&second_mm) => Err(GateFailure::Moved(format!(
-            "{} control points lie {:.2} µm and more from their first touches, limit {:.2} µm",
+            "{} control points are at least {:.2} µm from their first touches, limit {:.2} µm",
             changes_mm.iter().filter(|&&change| change > limit_mm).count(),
             1e3 * second_mm,
             1e3 * limit_mm,
@@ -166,8 +165,8 @@ fn check_control_points(
     }
 }
 
-/// Returns the touched points of the part and of the reference sphere. If the machine has no plan of this program, all
-/// touched points are of the part.
+/// Returns the touched points on the part, and those on the reference sphere. If the plan has no targets (`planned` is
+/// 0), all touched points are of the part.
 fn touched_points(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
     let taken = measurement.points.iter().filter(|p| p.status == TouchStatus::Touched).map(|p| p.position_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
@@ -217,8 +216,9 @@ fn gate_points(
     })
 }
 
-/// Returns the standard deviation of the probe's noise in mm, from the residuals on a sphere, and the relative
-/// uncertainty of this deviation. The fit uses four degrees of freedom.
+/// Estimates the noise of the probe from a fit to a sphere. `rms_mm` is the RMS of the residuals, `points` the number
+/// of points. Returns the standard deviation in mm, corrected for the four degrees of freedom of the fit, and its
+/// relative standard uncertainty.
 fn probe_noise(rms_mm: f64, points: usize) -> [f64; 2] {
     const FITTED: f64 = 4.0;
     let free = (points as f64 - FITTED).max(1.0);
@@ -236,7 +236,8 @@ pub(super) struct TouchRecord {
 }
 
 impl TouchRecord {
-    /// Adds a batch to the touches so far.
+    /// Returns the targets that were tried and found so far, with those of a new batch. `asked` are the targets of this
+    /// batch; `plan` and `measurement` are its plan and result.
     fn with_batch(so_far: Option<&UsablePoints>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
         let (mut tried, mut of) =
             so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
@@ -250,7 +251,12 @@ impl TouchRecord {
     }
 }
 
-/// Returns the points of a measurement that passed the gate earlier, from its files.
+/// Returns the usable points of a measurement that an interrupted program had accepted, from the contents of its files.
+/// `part` and `sphere` are the points, and `told` the kind of coordinates with the temperature in °C. `rounds` is the
+/// number of repetitions of touches.
+///
+/// # Errors
+/// The points do not pass the gate.
 pub(super) fn gate_recorded_points(
     task: &Task,
     part: Vec<Point>,
@@ -265,7 +271,8 @@ pub(super) fn gate_recorded_points(
 /// Maximum relative difference of a qualified probe's radius from the stated one. A larger one means another stylus.
 const MAX_PROBE_RADIUS_DIFFERENCE: f64 = 0.01;
 
-/// Returns why a result belongs to another plan or has impossible values; `None` if neither is the case.
+/// Returns a failure if a result belongs to another plan than the one sent, or if its values contradict the cell or the
+/// recipe. Returns `None` if neither is the case.
 fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
         return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
@@ -308,8 +315,8 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
 /// reports coarse steps.
 const MIN_COMPARED_TOUCHES: usize = 8;
 
-/// Returns a failure if a machine has returned its earlier result again. Two real measurements never agree in every
-/// bit.
+/// Returns a failure if the points equal those of the measurement `earlier` in every bit. Two real measurements never
+/// do, so the machine has returned its old result again.
 fn repeated_result_failure(
     task: &Task,
     earlier: Option<&(u32, Arc<UsablePoints>)>,
@@ -328,7 +335,8 @@ fn repeated_result_failure(
     })
 }
 
-/// Returns a failure if the temperature is outside the window of the recipe, or is missing when there is a window.
+/// Returns a failure if the temperature of a measurement is outside the limits of the recipe, or if it is missing
+/// although the limits or the thermal expansion require it. Returns `None` otherwise.
 fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
     if task.expansion.is_some() && measurement.temperature_c.is_none() {
         let message = "the measurement has no temperature, which the compensation of the expansion requires (part.expansion_um_m_k)";
@@ -343,9 +351,12 @@ fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFai
     }
 }
 
-/// Fits the probe radius on the reference sphere. Returns the radius, its standard uncertainty and the rms residual of
-/// the points; `None` if the sphere is not measured. Detects contact points and inches in place of centres in
-/// millimetres.
+/// Fits a sphere to the points on the reference sphere. Returns the radius of the probe, its standard uncertainty, and
+/// the RMS of the residuals, all in mm. Returns `None` if the recipe does not measure a reference sphere.
+///
+/// # Errors
+/// No sphere fits, or its radius shows that the points are contact points instead of probe centres, or inches instead
+/// of millimetres.
 fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.reference_sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
@@ -360,7 +371,8 @@ fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, G
     Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
 }
 
-/// Registers the points of a cycle and writes the result. `before` is the last judged measurement of an earlier pass.
+/// Registers the points of cycle `number`, computes its figures and its error map, and writes the results to `files`.
+/// `before` is the last judged cycle of an earlier pass. Returns the event for the cell and the results.
 pub(super) fn register_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -517,13 +529,14 @@ fn register_and_evaluate(
     })
 }
 
-/// Returns the messages for the offered parameters.
+/// Returns the message of each estimated parameter of the machine that should be corrected as a parameter: it is
+/// separable from other effects and larger than its expanded uncertainty.
 fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<Item = String> {
     told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
 }
 
-/// Returns the prior for the error field of a cycle: from passes of the same kind on earlier parts, otherwise from the
-/// previous pass of this run if it is of the same kind. Returns `None` if there is neither.
+/// Returns the prior of the error model for a cycle. Passes with a correction and passes without have different priors.
+/// The prior is from earlier parts, or else from the previous cycle `before` of this run; `None` if there is neither.
 fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> Option<Prior> {
     let is_corrected = !cycle.correction.is_zero();
     let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
@@ -532,7 +545,8 @@ fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> 
     taught.or_else(of_this_part).map(|lesson| lesson.prior())
 }
 
-/// Updates the state of the learning with a measured pass.
+/// Returns the state of the learning after a measured pass. `before` is the previous judged cycle, `error` the error
+/// map of this one, and `answer` the response of the part to the correction, if it was estimated.
 fn update_learning(
     task: &Task,
     cycle: &CycleState,
@@ -628,8 +642,8 @@ fn cell_figures(
     }
 }
 
-/// Returns the number of contributions to the uncertainty without a stated value, and the number of all. Without a
-/// locked direction the datum is no contribution.
+/// Returns two numbers of contributions to the uncertainty: those without a stated value, and all. The position of the
+/// datum counts as a contribution only if the recipe locks a direction. Returns `None` if there is no contribution.
 fn unstated_contributions(task: &Task, form: &Form) -> Option<[u32; 2]> {
     let counts = |share: &&model::BudgetEntry| {
         share.is_stated || share.source != model::UncertaintySource::Datum || task.locked_direction_sigmas().is_some()
@@ -639,7 +653,7 @@ fn unstated_contributions(task: &Task, form: &Form) -> Option<[u32; 2]> {
     (!all.is_empty()).then_some([some as u32, all.len() as u32])
 }
 
-/// Returns the rms after an independent contribution is removed in quadrature.
+/// Returns the RMS without an independent contribution: the square root of rms^2 - scatter^2, or 0 if that is negative.
 fn subtract_in_quadrature(scatter_mm: f64, rms_mm: f64) -> f64 {
     (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
 }
@@ -653,7 +667,8 @@ const _: () = {
     }
 };
 
-/// Converts the figures of the model into those of the cell.
+/// Converts the form figures of the error model into those that the cell judges. `scatter_mm` is the standard deviation
+/// of the probe's noise.
 fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFigures {
     let interval = |of: model::Interval| {
         let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
@@ -662,9 +677,11 @@ fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFi
     RecordedFormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
 }
 
-/// Returns the interval of F, the root mean square of the form without noise. With the standard deviation s of the
-/// noise of n points, and p degrees of freedom used by the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty
-/// is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
+/// Returns the interval (k = 2) of F, the root mean square of the form without the noise of the probe. `scatter_mm` is
+/// s, the standard deviation of the noise.
+///
+/// With n used points, and p = 6 degrees of freedom of the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty u
+/// is given by u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n.
 fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> RecordedInterval {
     const MOTIONS: f64 = 6.0;
     let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
@@ -702,7 +719,8 @@ fn cell_response(sense: ResponseKind) -> PartResponse {
     }
 }
 
-/// Computes the correction of the next pass and writes it.
+/// Computes the correction for the pass after cycle `number`, and writes it to `files`. Returns the event for the cell
+/// (compensated, refused or not saved) and the correction.
 pub(super) fn compensate_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -779,8 +797,8 @@ fn compute_correction(
     Ok((summary, step.correction))
 }
 
-/// Returns the estimates of the parameters that the recipe compensates. Empty for later passes of a run, because only
-/// the first pass is used for the estimate.
+/// Returns the estimates of the parameters that the recipe compensates, in the form that the cell records. Returns none
+/// for a later pass, because only the error after the first pass is used for the estimate.
 pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<RecordedParameter> {
     let Some(taken) = &task.parameter_compensation else { return Vec::new() };
     let told = cycle.parameters.iter().flat_map(|told| told.estimates.iter().enumerate());
@@ -804,7 +822,8 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// Returns the questions to a person before the next pass: parameters with an error beyond the tolerance of the recipe.
+/// Returns a question to a person for each parameter of the machine whose compensation exceeds its tolerance in the
+/// recipe. The cell asks them before the next pass.
 fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     let beyond = cycle.parameters.iter().flat_map(|told| &told.estimates).filter(|p| p.exceeds_tolerance);
     let question = |p: &compensation::EstimatedParameter| {
@@ -821,8 +840,9 @@ fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     beyond.map(question).collect()
 }
 
-/// Returns the initial state for the next part of this kind. Returns `None` if the cycle has no state of the learning,
-/// or if the part responded wrongly.
+/// Returns what a run has learned, as the initial state for the next part of this kind. `run` is the name of the run,
+/// `cycle` its last judged cycle. Returns `None` if the learning of this cycle has no state, or if the part responded
+/// wrongly to the correction.
 pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleState, PartPriors)) -> Option<Learned> {
     let known = cycle.learning.as_deref()?;
     let wrong = [PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled];
@@ -858,7 +878,8 @@ pub(super) struct MeasurementConditions {
     pub(super) temperature_c: f64,
 }
 
-/// Writes the points of a measurement, in the CMM frame, and its conditions.
+/// Writes the points of a measurement, in the CMM frame in mm, and the conditions of the measurement, such as the
+/// temperature.
 fn write_measured_points(task: &Task, files: &mut OutputFiles, points: &UsablePoints) -> Result<(), FormatError> {
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = MeasurementConditions { simulation: task.simulation, temperature_c };

@@ -17,8 +17,8 @@ pub(super) struct PreviewAccumulator {
 }
 
 impl PreviewAccumulator {
-    /// Adds new points. Points that do not continue the previous ones, or do not belong to the plan, discard everything
-    /// received so far.
+    /// Adds new points of a running measurement to the preview. If they do not continue the points before, or do not
+    /// fit the targets of `plan`, deletes the preview.
     pub(super) fn add_points(&mut self, plan: &Plan, preliminary: &PreliminaryPoints) {
         let PreliminaryPoints { job, first_index: from, points, coordinates } = preliminary;
         if *from == 0 {
@@ -49,7 +49,8 @@ impl PreviewAccumulator {
         *self = Self::default();
     }
 
-    /// Returns the statistics for display; `None` if the part has not been touched yet.
+    /// Returns the number of touches on the part, and the RMS, minimum and maximum of their deviations in µm. Returns
+    /// `None` if the part has not been touched yet.
     pub(super) fn statistics(&self) -> Option<PreviewStatistics> {
         let [least, most] = self.range_mm?;
         let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touch_count)).sqrt();
@@ -57,8 +58,8 @@ impl PreviewAccumulator {
     }
 }
 
-/// Returns the signed distance of a touch from its target along the normal, in mm. It includes the error of the part
-/// and the displacement of the part.
+/// Returns the signed distance in mm of a touched point from its target, along the normal of the target, after the ball
+/// radius is subtracted. It contains both the error of the part and its displacement in the fixture.
 fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
     (0..3).map(|k| (point.position_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
 }

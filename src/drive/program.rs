@@ -77,7 +77,8 @@ pub enum ProgramError {
 }
 
 impl Programs {
-    /// Returns the nominal surface of a part in the form that programs need.
+    /// Returns the nominal surface of a part as a height over x and y, with its outline. The paths of the wheel are
+    /// planned on these.
     ///
     /// # Errors
     /// A surface that is not a height over x and y.
@@ -85,12 +86,13 @@ impl Programs {
         nominal_height_field(nominal)
     }
 
-    /// Returns the name of a pass's program in the folder of a cycle.
+    /// Returns the file name of the program of a pass, with the extension of the dialect.
     pub(super) fn file_name(&self) -> String {
         format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
     }
 
-    /// Checks that the dialect can express the required exactness of a program.
+    /// Checks that the dialect can express a program with these settings: path tolerance, arcs, and the rotary axis if
+    /// the wheel is tilted.
     ///
     /// # Errors
     /// A requirement that the dialect cannot express.
@@ -128,7 +130,7 @@ impl Programs {
         Ok((path, summary))
     }
 
-    /// Returns the summary of a path with arcs. Returns `None` if its program has lines only.
+    /// Returns the number and length of arcs in the program of `path`. Returns `None` if the program has lines only.
     ///
     /// # Errors
     /// A requirement that the dialect cannot express.
@@ -137,24 +139,26 @@ impl Programs {
         Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
-    /// Returns the wheel with its radius corrected by the radius error that measurements have estimated.
+    /// Returns the wheel for a pass: that of the recipe, with the radius error that measurements have estimated added.
     fn wheel(&self, correction: &Correction) -> Wheel {
         self.options.wheel.with_larger_radius(self.wheel_radius_error_mm(correction))
     }
 
-    /// Returns the nominal surface relative to the zero of the machine. This zero was touched off with the lowest point
-    /// of the wheel, for the radius of the recipe. The centre of a wheel that is larger by dR is therefore already
-    /// higher by dR.
+    /// Returns the nominal surface relative to the zero of the machine, lowered by the radius error dR of the wheel.
+    ///
+    /// The zero is set by touching off with the lowest point of the wheel, while the recipe's radius is assumed. The
+    /// centre of a wheel that is larger by dR is therefore already higher by dR.
     fn nominal(&self, correction: &Correction) -> HeightField {
         self.surface_and_outline.0.clone().lowered(self.wheel_radius_error_mm(correction))
     }
 
-    /// Returns the difference of the wheel radius from that of the recipe; 0 if it is not estimated.
+    /// Returns the estimated wheel radius minus the radius in the recipe, in mm; 0 if it is not estimated.
     fn wheel_radius_error_mm(&self, correction: &Correction) -> f64 {
         correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Writes the program of a pass.
+    /// Writes the program of a pass to `file`, and returns the summary of its path. `map_identity` is written into the
+    /// program.
     ///
     /// # Errors
     /// Those of [`Programs::path`], and a file that cannot be written.
@@ -169,9 +173,15 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes the program and `toolpath_z.csv` of a pass into a folder, and copies the program into the folder where
-    /// the controller looks for programs. Returns the reason if one of the files is not written: the program is too
-    /// long, or the table cannot be computed.
+    /// Writes the program and the table `toolpath_z.csv` of a pass into `files`. Copies the program to the program
+    /// folder of the controller, if the cell file names one.
+    ///
+    /// Returns `None` if both files were written. Returns the reason if one was omitted: the program is too long, or
+    /// the table cannot be computed.
+    ///
+    /// # Errors
+    /// No path can be planned, a file cannot be written, or the program is too long for a controller with a program
+    /// folder.
     pub(super) fn save(
         &self,
         files: &mut OutputFiles,
@@ -196,8 +206,8 @@ impl Programs {
         }
     }
 
-    /// Copies a program into the folder where the controller looks for programs, under the name that the dialect
-    /// defines, and reads the copy back.
+    /// Copies a program to the program folder of the controller, under a name in the form of the dialect, and reads the
+    /// copy back. Does nothing if the cell file names no program folder.
     fn copy_to_controller(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let bytes = read_bytes(program).map_err(GcodeError::from)?;
@@ -210,7 +220,8 @@ impl Programs {
         }
     }
 
-    /// Writes the correction as an offset of Z over the axes, for controllers that compensate by a table.
+    /// Writes the correction of a pass as a table: the offset of axis Z at each node over X and Y. Controllers that
+    /// compensate by a table read this file.
     fn save_table(
         &self,
         file: &Path,
@@ -261,8 +272,9 @@ impl Programs {
     }
 }
 
-/// Returns the correction in the form that a path needs: the residual for the map, plus the compensation of setting and
-/// tilt.
+/// Returns the correction from which a path is planned. With parameter corrections, its map values are the sum of the
+/// residual map and the displacement by wheel setting and tilt. The error of the wheel radius is not in the map:
+/// [`Programs::path`] uses the corrected radius.
 fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     match &correction.set {
         None => Cow::Borrowed(correction),
@@ -270,7 +282,8 @@ fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     }
 }
 
-/// Returns the parameters that a correction compensates, one line each. Returns no line if it compensates none.
+/// Returns a line for each parameter of the machine that the correction compensates: its error, the pass since which it
+/// is compensated, and how. `wheel_radius_mm` is the radius in the recipe.
 pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
     let Some(set) = &correction.set else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);
@@ -281,10 +294,10 @@ pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radi
             ParameterKind::WheelRadius => {
                 let true_mm = wheel_radius_mm + value;
                 format!(
-                    "{said}, {true_mm:.6} mm in place of {wheel_radius_mm} mm, since pass {since}; it is not in the map"
+                    "{said}, {true_mm:.6} mm instead of {wheel_radius_mm} mm, since pass {since}; compensated by the wheel radius, not by the map"
                 )
             }
-            _ => format!("{said}, since pass {since}; its compensation is in the map that is ground"),
+            _ => format!("{said}, since pass {since}; compensated by the map"),
         }
     };
     taken.map(line).collect()

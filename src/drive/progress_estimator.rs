@@ -22,7 +22,8 @@ pub(super) struct ProgressEstimator {
 }
 
 impl ProgressEstimator {
-    /// Adds a progress report: `done` of `total` at the time `now`. `job` is the machine and the number of the cycle.
+    /// Stores a progress report of a job: `done` of `total` steps at the time `now` since the run began. `job` is the
+    /// machine and the number of the cycle. If the job is a new one or `done` decreases, forgets the earlier reports.
     pub(super) fn record_progress(&mut self, now: Duration, job: (Device, u32), done: u32, total: u32) {
         if self.job.replace(job) != Some(job) || done < self.done_and_total.0 {
             self.marks.clear();
@@ -40,7 +41,8 @@ impl ProgressEstimator {
         self.marks.push_back((now, done));
     }
 
-    /// Follows the state of the cell: a job that is held has no pace, and one that is over has no progress.
+    /// Adapts the estimate to the state of the cell. Outside of Execute the earlier reports are forgotten, because a
+    /// held job has no speed. If the job is over, its progress is forgotten too.
     pub(super) fn update_state(&mut self, state: State) {
         let at = state.phase().and_then(|phase| phase.job());
         let is_at_it = |device| matches!(at, Some((at, JobStep::Run | JobStep::Reconcile)) if at == device);

@@ -42,7 +42,8 @@ pub trait JournalSink: Send {
     fn intend(&mut self, entry: Entry) -> Result<u32, JournalError>;
     fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError>;
     fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError>;
-    /// Checks that the record is where it was written.
+    /// Returns an error if the files of the journal were removed or replaced after they were opened. The default checks
+    /// nothing.
     fn is_in_place(&mut self) -> Result<(), JournalError> {
         Ok(())
     }
@@ -100,8 +101,8 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Creates a recorder for a journal. `open` are the command numbers in the journal of the commands that have no
-    /// outcome yet. The recorder refers to these commands by the numbers 1, 2, 3, in this order.
+    /// Creates a recorder for a journal. `open` are the journal's numbers of the commands without an outcome. The
+    /// recorder names these commands by the intent numbers 1, 2, 3, in this order. `beside` executes the writing.
     pub(super) fn new(journal: Box<dyn JournalSink>, open: &[u32], beside: &BlockingExecutor) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
@@ -123,7 +124,7 @@ impl Recorder {
         &self.folder
     }
 
-    /// Waits for a failure to write a record.
+    /// Waits until a record cannot be written, and returns the failure.
     pub(super) async fn next_failure(&mut self) -> RecordFailure {
         match self.failures.recv().await {
             Some(failure) => failure,
@@ -131,28 +132,34 @@ impl Recorder {
         }
     }
 
-    /// Records an event.
+    /// Queues an event to be recorded, and returns a receipt. The receipt completes when the event is on the disk or
+    /// cannot be written.
     pub(super) fn append(&self, entry: Entry) -> RecordReceipt {
         self.enqueue(JournalTask::Append(Box::new(entry)))
     }
 
-    /// Records a command before it is executed. Returns the number by which [`Recorder::append_outcome`] refers to it.
+    /// Queues a command to be recorded before it is executed (an intent). Returns the number by which
+    /// [`Recorder::append_outcome`] refers to it, and a receipt that completes when it is on the disk or cannot be
+    /// written.
     pub(super) fn append_intent(&mut self, entry: Entry) -> (u64, RecordReceipt) {
         self.intent_count += 1;
         (self.intent_count, self.enqueue(JournalTask::Intent(self.intent_count, Box::new(entry))))
     }
 
-    /// Records the outcome of an intent.
+    /// Queues the outcome of the command with the number `intent`, and returns a receipt that completes when it is on
+    /// the disk or cannot be written.
     pub(super) fn append_outcome(&self, intent: u64, entry: Entry) -> RecordReceipt {
         self.enqueue(JournalTask::Outcome(intent, Box::new(entry)))
     }
 
-    /// Records files of the run folder.
+    /// Queues files of the run folder to be recorded, with their lengths and hashes. Returns a receipt that completes
+    /// when this is on the disk or cannot be written.
     pub(super) fn append_artefacts(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> RecordReceipt {
         self.enqueue(JournalTask::Artefacts(files, now, cycle))
     }
 
-    /// Writes the last record, within a bounded time.
+    /// Writes the end of the record, with `ending` as its content, and closes the journal. Returns an error if it is
+    /// not written within [`CLOSE_TIMEOUT`].
     pub(super) async fn close(&mut self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
         let closed = tokio::time::timeout(CLOSE_TIMEOUT, self.enqueue(JournalTask::Close(now, cycle, ending))).await;
         self.abandoned.store(true, Ordering::Release);
@@ -211,8 +218,11 @@ impl JournalWriter {
         }
     }
 
-    /// Writes a job, with as many attempts as necessary. Reports the failure to the loop, and again as long as it
-    /// lasts, because an earlier report may be about an earlier job.
+    /// Writes an entry to the journal, and retries as long as it fails. Reports the failure to the loop at the first
+    /// attempt and at every tenth one, because an earlier report may be about an earlier entry.
+    ///
+    /// # Errors
+    /// The failure cannot pass by itself, or the run has ended meanwhile.
     async fn write_with_retry(&mut self, job: &JournalTask) -> Result<(), JournalError> {
         let mut tries = 0_u32;
         loop {
@@ -270,13 +280,13 @@ impl JournalWriter {
     }
 }
 
-/// Returns the time since the run began in the unit of the journal, ns.
+/// Converts a time since the run began into nanoseconds, the unit of the journal.
 pub(super) fn nanoseconds(now: Duration) -> u64 {
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Writes files of a run folder to the disk and reads them back, for [`Recorder::append_artefacts`]. Blocks, and takes
-/// long for large files.
+/// Writes files of a run folder to the disk and reads them back. Returns the length and the hash of each, for
+/// [`Recorder::append_artefacts`]. Blocks the thread, and takes long for large files.
 pub(super) fn sync_and_hash(folder: &Path, names: &[String]) -> Result<Vec<Artefact>, RecordFailure> {
     names.iter().map(|name| Artefact::from_file(folder, name).map_err(record_failure)).collect()
 }
@@ -297,13 +307,14 @@ impl OutputFiles {
         Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new() }
     }
 
-    /// Sets the folder that [`OutputFiles::switch_to_final_subfolder`] switches to.
+    /// Sets the subfolder `settled` for the results on which the cell decides.
+    /// [`OutputFiles::switch_to_final_subfolder`] switches to it.
     pub(super) fn with_final_subfolder(self, settled: String) -> Self {
         Self { final_subfolder: Some(settled), ..self }
     }
 
-    /// Switches to the folder of the final result, on which the cell decides, and creates it. Does nothing if there is
-    /// no such folder.
+    /// Switches to the subfolder that [`OutputFiles::with_final_subfolder`] has set, and creates it. Does nothing if
+    /// none was set.
     pub(super) fn switch_to_final_subfolder(&mut self) -> Result<(), FormatError> {
         let Some(settled) = self.final_subfolder.take() else { return Ok(()) };
         self.subfolder = settled;
@@ -314,7 +325,7 @@ impl OutputFiles {
         self.run_folder.join(&self.subfolder)
     }
 
-    /// Stores the name of a file that is about to be written, and returns its path.
+    /// Adds a file, which the caller is about to write, to the list of files of this computation. Returns its path.
     pub(super) fn add_file(&mut self, name: &str) -> PathBuf {
         let name = if self.subfolder.is_empty() { name.to_owned() } else { format!("{}/{name}", self.subfolder) };
         let path = self.run_folder.join(&name);
@@ -322,12 +333,12 @@ impl OutputFiles {
         path
     }
 
-    /// Returns the names of all planned files, below the folder of the run.
+    /// Returns the names of all files that were added, relative to the run folder. Some of them may not exist.
     pub(super) fn file_names(&self) -> &[String] {
         &self.file_names
     }
 
-    /// Returns the names of the files that exist.
+    /// Returns the names of the added files that exist, relative to the run folder.
     pub(super) fn into_existing(self) -> Vec<String> {
         let Self { run_folder: run, file_names: mut names, .. } = self;
         names.retain(|name| run.join(name).is_file());
@@ -341,7 +352,8 @@ pub(super) enum ComputationError<T> {
     Failed(T),
 }
 
-/// Classifies an error: it is a write error if its cause is an error of the operating system.
+/// Converts the error of a computation. If an error of the operating system caused it, the result was not saved
+/// (`NotSaved`); otherwise the computation itself failed (`Failed`).
 pub(super) fn classify_error<E: std::error::Error + 'static>(error: E) -> ComputationError<String> {
     let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(&error);
     while let Some(next) = cause {
@@ -364,7 +376,7 @@ fn record_failure(error: JournalError) -> RecordFailure {
     }
 }
 
-/// Creates an entry for an event.
+/// Creates a journal entry. `now` is the time since the run began, and `actor` the name and the place of its origin.
 pub(super) fn entry(kind: RecordKind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
     let (actor, station) = actor;
     Entry { actor, station, ..Entry::new(kind, nanoseconds(now), cycle, payload) }

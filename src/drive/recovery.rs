@@ -47,7 +47,8 @@ pub enum RecoveryError {
 }
 
 impl RecoveryStep {
-    /// Returns the next step for a machine in a state, or `None` if it is idle. A machine that moves is stopped.
+    /// Returns the next step that brings a machine from `state` nearer to idle; `None` if it is idle. The step for a
+    /// finished job is Acknowledge, for an aborted or faulted machine Clear, and otherwise Stop.
     pub fn for_state(state: MachineState) -> Option<Self> {
         match state {
             MachineState::Idle => None,
@@ -66,7 +67,7 @@ impl RecoveryStep {
         }
     }
 
-    /// Returns the effect of the step on a machine, including what is lost by it, for people.
+    /// Returns a text for people about the effect of this step on `device`, including what is lost.
     pub fn consequence(self, device: Device) -> &'static str {
         match (self, device) {
             (Self::Stop, _) => "ends its job in order, clear of the part, or withdraws its preparation",
@@ -87,9 +88,9 @@ pub async fn read_status<M: Machine>(machine: &mut M) -> Result<Status, Recovery
     Ok(machine.status().await?)
 }
 
-/// Sends one step to a machine if its status is still as a person has seen it. Returns the status when the machine has
-/// come to rest. The step is recorded before it is sent, and its outcome after. `by` is the person who decided, and the
-/// place.
+/// Sends one step to a machine, and returns the status after the machine has come to rest. Sends nothing if the status
+/// differs from `seen`, which a person has seen. `limit` is the maximum time until the machine is at rest, `by` the
+/// person who decided. Records the step before it is sent, and its outcome after it.
 ///
 /// # Errors
 /// A machine that cannot be reached, belongs to another client, has changed, refuses, or does not come to rest within
@@ -131,8 +132,8 @@ pub async fn execute_step<M: Machine>(
     ended
 }
 
-/// Claims the machine for this program. If a previous client ended a moment ago, the machine still belongs to it, so
-/// the claim is retried for [`OWNER_RELEASE_TIME`].
+/// Claims the machine for this program. Retries for [`OWNER_RELEASE_TIME`] while the machine still belongs to another
+/// client, because this client may have ended a moment ago.
 async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     let by = Instant::now() + OWNER_RELEASE_TIME;
     loop {
@@ -145,7 +146,7 @@ async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError
     }
 }
 
-/// Describes a machine in short: its state, its job, and the result that it holds.
+/// Returns a text with the state of a machine, its job, its fault, and the result of a finished job.
 pub fn describe_status(status: &Status) -> String {
     let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
     let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
@@ -154,7 +155,8 @@ pub fn describe_status(status: &Status) -> String {
     format!("{}{job}{fault}{result}", status.state)
 }
 
-/// Waits until a machine is at rest, and returns its status.
+/// Reads the status of a machine until it is at rest, and returns this status. Returns an error if the machine is still
+/// in motion after `limit`.
 async fn wait_until_at_rest<M: Machine>(
     machine: &mut M,
     device: Device,

@@ -82,7 +82,8 @@ pub enum ReplayError {
 }
 
 impl InterruptedRun {
-    /// Reads the record of a run and replays it, for the plan and the task with which the run began.
+    /// Reads the record of an interrupted run and repeats its decisions and computations. `plan` and `task` must be
+    /// those with which the run began. Returns the state in which the run was interrupted.
     ///
     /// # Errors
     /// A record that cannot be read, a disk that fails, or the first difference from the decisions of this program.
@@ -95,7 +96,7 @@ impl InterruptedRun {
         replay.finish()
     }
 
-    /// Returns a run in which nothing has happened yet.
+    /// Returns the state of a run before its first event.
     pub(super) fn new(plan: CellPlan) -> Self {
         Self {
             cell: Cell::new(plan),
@@ -111,7 +112,8 @@ impl InterruptedRun {
         }
     }
 
-    /// Returns the last preparation of a machine with its cycle, and whether the machine may still be at that job.
+    /// Returns the cycle and the data of the last START that was prepared for a machine; `None` if there was none. The
+    /// flag is true if the machine may still execute this job.
     pub(super) fn last_preparation(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
         let intent = self.armed[device as usize].clone();
         let Some(intent) = intent.and_then(|value| serde_json::from_value::<StartIntent>(value).ok()) else {
@@ -224,7 +226,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Applies the effect of a command on the state of this program. Sends nothing to a machine.
+    /// Repeats what a command changed in this program, such as the plan of a cycle. Sends nothing to a machine.
     fn apply_command(&mut self, command: &Command) {
         let (cycles, task) = (&mut self.replayed.cycles, self.task);
         match command {
@@ -239,7 +241,8 @@ impl<'t> Replay<'t> {
         }
     }
 
-    /// Compares a recorded command with the command that is due.
+    /// Checks that a recorded command is the next one that the cell issues in the replay. `id` is its number in the
+    /// journal. Returns an error if the two commands differ.
     fn compare_command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
         let Some(command) = self.due_commands.pop_front() else {
@@ -258,7 +261,8 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Repeats a computation from recorded data.
+    /// Repeats the computation whose result is `event`, from recorded data, and stores the result. For a gate, only
+    /// reads the accepted points. Does nothing for other events.
     fn repeat_computation(&mut self, event: &Event) -> Result<(), ReplayError> {
         let (number, kind) = match event {
             Event::Collected { cycle, gate: GateResult::Passed, .. } => (*cycle, Computation::Gate),
@@ -300,7 +304,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Returns the points of a measurement from its recorded files.
+    /// Returns the usable points of the measurement of cycle `number`, from its recorded files.
     fn read_points(&self, number: u32) -> Result<super::task::UsablePoints, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
             Some(file) => {
@@ -322,14 +326,15 @@ impl<'t> Replay<'t> {
             .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))
     }
 
-    /// Returns the newest recorded document of a name in a cycle.
+    /// Reads the newest recorded JSON file `name` of cycle `number`; `None` if there is none.
     fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
         let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
         let bytes = file.read(self.run_folder)?;
         serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
     }
 
-    /// Compares the files of a repeated computation with the recorded ones.
+    /// Compares the files of a repeated computation, in the folder `scratch`, with the recorded files of cycle
+    /// `number`. Returns an error for the first difference.
     fn compare_files(&self, number: u32, scratch: &Path, files: &OutputFiles) -> Result<(), ReplayError> {
         // A file of this format contains the time of its writing.
         let dated = |name: &str| name.ends_with(".x3p");
@@ -352,7 +357,8 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Checks that the last preparation of each machine agrees with its cycle, and counts the files in the run folder.
+    /// Completes the replay: checks that the last START prepared for each machine agrees with the pass or plan of its
+    /// cycle, and finds the files in the run folder that are not recorded.
     fn finish(mut self) -> Result<InterruptedRun, ReplayError> {
         for device in Device::BOTH {
             self.check_preparation(device)?;
@@ -373,8 +379,9 @@ impl<'t> Replay<'t> {
         Ok(self.replayed)
     }
 
-    /// Counts the attempt to which an existing file belongs, so that the next attempt does not overwrite the file. Adds
-    /// the file to the unrecorded files if it is not on record.
+    /// Registers a file that exists in the run folder. The next attempt of its computation then gets a higher number
+    /// than `attempt`, so that it does not overwrite the file. A file that is not recorded is added to the unrecorded
+    /// files.
     fn add_existing_file(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
         if name == "result.json" || name.starts_with('.') {
             return;

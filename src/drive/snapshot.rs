@@ -39,7 +39,7 @@ impl Drive {
     }
 }
 
-/// Returns the next action of a person.
+/// Returns what a person has to do next. `waits_for` are the notes of the machines on why they wait.
 fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
     if let (State::Execute(_), Some(device)) = (cell.state(), cell.clear_confirmation_device()) {
         return NextStep::SeeClear { device };

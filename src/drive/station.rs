@@ -85,7 +85,8 @@ pub(super) trait StationDriver: Send + 'static {
     type Machine: Machine;
     const DEVICE: Device;
     fn machine(&mut self) -> &mut Self::Machine;
-    /// Transfers the payloads and returns the digest of their identities.
+    /// Transfers a payload (the pass or the measuring plan) to the machine. Returns the digest of the identities of its
+    /// contents, by which the machine names it. `interrupt` cancels the transfer.
     fn load(
         &mut self,
         load: &MachinePayload,
@@ -165,7 +166,8 @@ impl AbortCounter {
         Self { ordered_count: ordered, handled_count: 0 }
     }
 
-    /// Waits until an abort was ordered that this station has not handled yet.
+    /// Waits until an abort is ordered that this station has not handled. Never returns if no abort can be ordered any
+    /// more.
     async fn wait_for_abort(&mut self) {
         let taken = self.handled_count;
         if self.ordered_count.wait_for(|ordered| *ordered > taken).await.is_err() {
@@ -279,7 +281,8 @@ const MIN_COMPLETE_SHARE: f64 = 0.95;
 const MIN_PROGRESS_INTERVAL: Duration = Duration::from_millis(250);
 
 impl<B: StationDriver> MachineTask<B> {
-    /// Creates the task of a machine for a job. With the intent of an interrupted run, the job can be reconciled.
+    /// Creates the task of a machine for the run `job`. `intent` is the last START of an interrupted run with its
+    /// cycle; with it, the station can reconcile that job.
     pub(super) fn new(
         driver: B,
         job: u32,
@@ -302,8 +305,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Restores the last preparation into the driver. The machine may still run this job, which was started before this
-    /// program was restarted.
+    /// Gives the driver the last prepared job of an interrupted run. The machine may still execute it, because only
+    /// this program was restarted.
     pub(super) fn restore_preparation(mut self) -> Self {
         if let Some(armed) = &self.armed {
             self.driver.machine().restore(armed);
@@ -311,8 +314,9 @@ impl<B: StationDriver> MachineTask<B> {
         self
     }
 
-    /// Serves requests until no sender is left. If the task panics, which is a fault of this program, reports this as
-    /// an event. The run then continues without communication with this machine.
+    /// Serves the requests of the drive, and polls the machine, until all senders of `asks` are gone. If the task
+    /// panics, which is a fault of this program, sends [`Event::StationFailed`]. The run then continues without
+    /// communication with this machine.
     pub(super) async fn serve(
         self,
         asks: mpsc::Receiver<StationRequest>,
@@ -447,7 +451,8 @@ impl<B: StationDriver> MachineTask<B> {
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
-    /// Returns the occupation of a machine at the connection. Withdraws a preparation of a client that is gone.
+    /// Returns whether a machine that was just connected is idle, busy, or must be cleared. A machine that an earlier
+    /// client has prepared, but not started, gets STOP and is then idle.
     async fn occupation(&mut self, status: &Status) -> Occupation {
         match status.state {
             MachineState::Idle => Occupation::Idle,
@@ -560,8 +565,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Refuses a command that was not sent, because the link was lost after the cell had issued it. So the command
-    /// cannot move the machine later.
+    /// Reports a command as refused that the station did not send, because the link was lost after the cell had issued
+    /// it. It is not sent later either, so it cannot move the machine.
     async fn refuse_unsent(&mut self, what: MachineRequest) {
         let why = "the link is lost, and the command was not sent".to_owned();
         self.report(Event::Refused { device: B::DEVICE, what, why }).await;
@@ -627,7 +632,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Connects a machine before an abort, if this program has not connected it since its restart.
+    /// Connects a machine before an abort, if it was not connected since the restart of this program. Returns an error
+    /// if the machine has a job of another run or refuses the connection. A lost link is no error here.
     async fn connect_for_abort(&mut self) -> Result<(), String> {
         let met = async {
             self.driver.machine().connect().await?;
@@ -737,7 +743,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports an error of a request as an event: a lost link, a fault of the machine, or a refusal.
+    /// Reports the failure of the request `what` as events. Reports a lost link first. A fault of the machine is
+    /// reported as a fault, any other failure as a refusal.
     async fn report_failure(&mut self, what: MachineRequest, error: DeviceError) {
         if error.is_link() {
             self.report_link_lost(&error).await;
@@ -767,7 +774,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Polls the status, or tries to reach a lost machine.
+    /// Reads the status of the machine and reports its changes. If the link is lost, tries to connect again instead.
     async fn poll(&mut self) {
         if self.observed.link_lost {
             return self.reconnect().await;
@@ -782,7 +789,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reads preliminary points of a running job. The interrupt ends the transfer as soon as an order arrives.
+    /// Reads the points that the machine has measured so far in a running job. The next order interrupts this transfer.
     async fn read_ahead(&mut self) {
         let Some(armed) = self.armed.as_ref().filter(|_| self.observed.running && !self.observed.end_reported) else {
             return;
@@ -793,7 +800,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports changes of the notes for a person.
+    /// Reports the notes of a machine for people, such as why it waits, if they have changed.
     async fn report_notes(&mut self) {
         let notes = self.driver.machine().notes();
         let new: Vec<String> = notes.iter().filter(|message| !self.reported_notes.contains(message)).cloned().collect();
@@ -834,7 +841,7 @@ impl<B: StationDriver> MachineTask<B> {
         self.observed.next_attempt = Some(Instant::now() + pause.min(MAX_RETRY_INTERVAL));
     }
 
-    /// Reports the changes since the last status.
+    /// Compares the status with the one before, and reports each change as an event.
     async fn report_changes(&mut self, status: &Status) {
         let before = self.observed.state.replace(status.state);
         self.report_mode(status).await;
@@ -874,7 +881,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports when a machine that had the job of this run reports no job or another job, and no end.
+    /// Reports that a machine has lost the job of this run: it reported this job before, and now reports none or
+    /// another one, without an end of the job.
     async fn report_absence(&mut self, status: &Status) {
         let ObservedState { running, end_reported: ended, stopping, clearing, aborting, .. } = self.observed;
         if !running || ended || stopping || clearing || aborting {
@@ -896,8 +904,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports a contradiction in the status of a machine: it reports HELD but makes progress, or it accepted a STOP
-    /// and continues.
+    /// Reports a contradiction in the status of a machine. It reports HELD, but its progress increases; or it has
+    /// accepted STOP, but does not stop.
     async fn report_contradiction(&mut self, before: Option<MachineState>, status: &Status) {
         let device = B::DEVICE;
         let is_held = status.state == MachineState::Held && before == Some(MachineState::Held);
@@ -918,13 +926,13 @@ impl<B: StationDriver> MachineTask<B> {
         let is_late = self.observed.stop_accepted_at.is_some_and(|taken| taken.elapsed() > STOP_TIMEOUT);
         if self.observed.stopping && is_late && status.state == MachineState::Execute {
             self.observed.stop_accepted_at = None;
-            let why = format!("it took the STOP, but is still EXECUTE {} s later", STOP_TIMEOUT.as_secs());
+            let why = format!("it accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
             self.report(Event::Refused { device, what: MachineRequest::Stop, why }).await;
         }
     }
 
-    /// Raises a doubt about a pass that the grinder reports as complete before [`MIN_COMPLETE_SHARE`] of the path is
-    /// travelled.
+    /// Reports a pass as doubtful if the grinder calls it complete at a progress below the share
+    /// [`MIN_COMPLETE_SHARE`].
     async fn check_early_end(&mut self, status: &Status) {
         let (Device::Grinder, Outcome::Complete, Some((done, total))) = (B::DEVICE, status.outcome, status.progress)
         else {
@@ -936,7 +944,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports when a machine leaves automatic mode, and when it returns.
+    /// Reports if a machine has changed to manual mode, or back to automatic mode.
     async fn report_mode(&mut self, status: &Status) {
         let Some(manual) = status.automatic.map(|automatic| !automatic) else { return };
         if std::mem::replace(&mut self.observed.manual, manual) == manual {
@@ -952,7 +960,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.report(event).await;
     }
 
-    /// Reports when a machine without a job is no longer clear of the part: a person has moved it.
+    /// Reports if a machine without a running job is no longer clear of the part, for example because a person has
+    /// moved it.
     async fn report_clear(&mut self, status: &Status) {
         let Some(clear) = status.clear_of_part else { return };
         let before = self.observed.clear.replace(clear);
@@ -978,7 +987,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.report(event).await;
     }
 
-    /// Reports when a signal leaves its range, and when all signals have been in range for a while.
+    /// Reports if a signal of the machine has left its range. Also reports when all signals have been in their ranges
+    /// for the time [`SIGNAL_SETTLING_TIME`].
     async fn report_signals(&mut self, status: &Status) {
         let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::problem).collect();
         let (device, condition) = (B::DEVICE, Condition::Signals);
@@ -1006,7 +1016,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports that the job is over. The record of a pass is read first.
+    /// Reports the end of a job as an event. For a pass, first reads its pass record.
     async fn finish_job(&mut self, status: &Status) {
         if self.observed.end_reported && !self.observed.stopping {
             return;
@@ -1025,8 +1035,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.report_end(job_result(status.outcome)).await;
     }
 
-    /// Reads the record of a finished pass and sends it to the drive. Does nothing for a CMM. A record that does not
-    /// belong to this job is reported as doubtful.
+    /// Reads the pass record of the finished pass from the grinder, and sends it to the drive. Does nothing for a CMM.
+    /// A record that cannot be read, or that belongs to another job, is reported as doubtful.
     ///
     /// # Errors
     /// Returns an error if the link is lost. The loss has then been reported.
@@ -1080,7 +1090,8 @@ fn job_result(outcome: Outcome) -> JobResult {
     }
 }
 
-/// Describes a fault of a machine for people.
+/// Returns the text of a fault for people. For a collision of the probe, the text tells a person to check the position
+/// of the part first.
 fn fault_message(device: Device, fault: Fault) -> String {
     match (device, fault) {
         // A probe that meets material where only air should be is not at fault: the part is in another place.
@@ -1093,7 +1104,8 @@ fn fault_message(device: Device, fault: Fault) -> String {
     }
 }
 
-/// Returns the reason if a result arrived but cannot be used. Returns `None` if it did not arrive.
+/// Returns a gate failure if a measurement arrived, but its data is invalid or belongs to another job. Returns `None`
+/// for every other error.
 fn gate_failure(error: &DeviceError) -> Option<GateFailure> {
     match error {
         DeviceError::NotFinite { .. }
@@ -1128,7 +1140,7 @@ pub(super) struct StartIntent {
 }
 
 impl StartIntent {
-    /// Restores the preparation.
+    /// Converts the recorded data of a START into the driver's data of this prepared job.
     pub(super) fn to_armed(&self) -> Armed {
         let job = Job { job: self.job, cycle: self.cycle, digest: self.digest };
         Armed { job, start_sequence: self.start_sequence, token: self.token, boot_id: self.boot_id }

@@ -135,13 +135,15 @@ impl AdaptiveOptions {
     /// Ratio of an rms limit to a PV limit that is equally hard to meet.
     const RMS_TO_PV_RATIO: f64 = 0.2;
 
-    /// Returns the probability with which one evaluation may err: a share of the accepted risk. It is at most that of
-    /// the final judgement, so that a part that an evaluation finds in tolerance is accepted.
+    /// Returns the accepted probability of a wrong decision for one evaluation of an adaptive measurement. It is the
+    /// accepted risk divided by the maximum number of evaluations. It is at most 1 minus the required probability of
+    /// the tolerance, so that a part that an evaluation accepts is also accepted by the final judgement.
     pub fn decision_risk(&self) -> f64 {
         (self.accepted_risk / Self::MAX_DECISIONS).min(1.0 - self.tolerance.probability)
     }
 
-    /// Returns the criteria by which an adaptive measurement stops. `may_grind` is true if a further pass is allowed.
+    /// Returns the criteria by which an adaptive measurement stops. `may_grind` is true if a further pass is allowed,
+    /// so that the measurement must also be sufficient for a correction.
     pub fn stopping_criteria(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
@@ -206,7 +208,7 @@ pub(super) struct CycleState {
 }
 
 impl CycleState {
-    /// Returns the state of a cycle at its start: only the correction of its pass is known.
+    /// Returns the state of a cycle before its pass. `correction` is that of this pass.
     pub(super) fn new(correction: Correction) -> Self {
         Self {
             correction: Arc::new(correction),
@@ -232,7 +234,7 @@ impl CycleState {
         self.judgement_count > 0
     }
 
-    /// Stores the result of a computation.
+    /// Stores the result of a computation in this cycle.
     pub(super) fn store(&mut self, product: ComputationProduct) {
         match product {
             ComputationProduct::Points(points) => self.points = Some(Arc::new(points)),
@@ -339,8 +341,8 @@ pub(super) struct UsablePoints {
 }
 
 impl Task {
-    /// Sets the state that was learned from an earlier part as the initial state of this run. The first pass is ground
-    /// with its correction.
+    /// Begins the learning of this run with the state `learned`, from an earlier part or from other cells. The first
+    /// pass is ground with the correction in this state.
     ///
     /// # Errors
     /// Returns an error if the first correction exceeds the limits of this run. The task is then unchanged.
@@ -358,14 +360,15 @@ impl Task {
         within.map(|_| ())
     }
 
-    /// Builds the initial state of this task from the results of other cells, as far as the machines are alike. Returns
-    /// `None` if they contribute nothing.
+    /// Combines the results `others` of other cells into an initial state for this task, weighted by the similarity of
+    /// the machines (`alike`). Returns `None` if they contribute nothing.
     pub fn learned_from_others(&self, others: &[(CellRun, Learned)], alike: &MachineSimilarity) -> Option<Learned> {
         let of_this = (self.simulation, self.setting.clone());
         Learned::from_others(others, alike, of_this, (&self.new_learning(), self.zero_correction()))
     }
 
-    /// Writes correction and program of a first pass that starts from a learned state; returns the names of the files.
+    /// Writes the correction and the program of the first pass into `folder`, for a run that begins with a learned
+    /// state. Returns the names of the files.
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
@@ -378,7 +381,8 @@ impl Task {
         Ok(files.into_existing())
     }
 
-    /// Returns the correction of the first pass: none, or that of an earlier part.
+    /// Returns the correction of the first pass: that of the learned state with which the run begins, or a correction
+    /// of 0.
     pub fn first_correction(&self) -> Correction {
         let none = self.zero_correction();
         match &self.learned {
@@ -392,7 +396,7 @@ impl Task {
         Correction::zero(grid, self.correction_limits.allowance_mm)
     }
 
-    /// Returns the estimated disk space of a cycle, including the journal.
+    /// Returns the estimated disk space, in bytes, for the files and the journal of one cycle.
     pub fn cycle_bytes(&self) -> u64 {
         let (points, nodes) = (self.targets.len() as u64, self.zero_correction().grid.len() as u64);
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
@@ -411,12 +415,14 @@ impl Task {
         }
     }
 
-    /// Returns the rms of the scallops, as far as it is known; 0 if not.
+    /// Returns the root mean square of the scallops (the ridges between the tracks of the wheel) in mm; 0 if it is
+    /// unknown.
     pub(super) fn scallops_rms_mm(&self) -> f64 {
         self.scallops.map_or(0.0, |scallops| scallops.rms_mm)
     }
 
-    /// Returns the state of the learning before the first pass.
+    /// Returns the state of the learning before the first pass: that of an earlier part if the run begins with one,
+    /// otherwise a new one.
     pub(super) fn initial_learning(&self) -> LearningState {
         self.learned.as_ref().map_or_else(|| self.new_learning(), |learned| learned.known.for_next_part())
     }
@@ -430,9 +436,9 @@ impl Task {
     /// Registers points to the nominal surface, offset by `probe_radius_mm`. Returns the registration and the options
     /// used.
     ///
-    /// If the surface does not determine a direction of the pose, the position that a search finds in this direction is
-    /// arbitrary, and a correction would be ground at that position. In this case the registration is repeated from the
-    /// fixture pose.
+    /// Starts with a search or at the fixture pose, as the task sets. If a search finds a pose of which the surface
+    /// does not determine a direction, the position in this direction is arbitrary, and a correction would be ground
+    /// there. The registration is then repeated from the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -444,7 +450,8 @@ impl Task {
         self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
-    /// Registers points as [`Self::register`] does. If `start_at_fixture` is true, starts from the fixture pose.
+    /// Registers points as [`Self::register`] does, but starts at the fixture pose if `start_at_fixture` is true, and
+    /// with a search otherwise.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -467,8 +474,9 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
-    /// Returns the standard uncertainties of the pose in the fixture, if it locks any direction; 0 for a direction
-    /// whose uncertainty is not stated. Order: x, y, z in mm, rx, ry, rz in rad.
+    /// Returns the standard uncertainties of the pose of the part in the fixture, in the order x, y, z in mm and rx,
+    /// ry, rz in rad. The value of a locked direction without a stated uncertainty is 0. Returns `None` if no direction
+    /// is locked.
     pub fn locked_direction_sigmas(&self) -> Option<[f64; 6]> {
         let [shift_mm, turn_rad] = self.locked_sigmas.unwrap_or_default();
         let of = |k: usize| if k < 3 { shift_mm } else { turn_rad };
@@ -476,7 +484,8 @@ impl Task {
         locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
     }
 
-    /// Returns the options for the estimate of machine parameters. `told` are the parameter corrections of the pass.
+    /// Returns the options for the estimation of machine parameters. `told` are the parameter corrections of the pass
+    /// that was measured.
     pub fn parameter_options(&self, told: Option<&ParameterCorrections>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration_options.locked.map(|locked| !locked),
@@ -490,18 +499,18 @@ impl Task {
         }
     }
 
-    /// Returns the radius of the wheel for a pass: that of the recipe plus the correction in `told`, the parameter
-    /// corrections of the pass.
+    /// Returns the wheel radius in mm with which a pass is ground: that of the recipe plus the radius correction in
+    /// `told`, the parameter corrections of the pass.
     pub fn wheel_radius_mm(&self, told: Option<&ParameterCorrections>) -> f64 {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Returns the identity of the map of a pass.
+    /// Returns the SHA-256 that identifies the correction map of a pass.
     pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
         self.payloads(correction).0.identity()
     }
 
-    /// Returns the payloads of a pass: the map and the parameters of the pass.
+    /// Returns what the grinder receives for a pass: the correction map and the parameters of the pass.
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
         let map = CorrectionMap {
             grid: correction.grid,
@@ -513,24 +522,24 @@ impl Task {
         (map, Pass { wheel_radius_mm, ..pass })
     }
 
-    /// Creates the plan: the reference sphere first, then the part at the last measured pose and at the level to which
-    /// it was ground.
+    /// Creates the complete measuring plan: the reference sphere first, then all targets on the part. `cmm_from_model`
+    /// is the last measured pose, and `level_mm` the height of the ground surface above the nominal one.
     ///
-    /// If `seated_anew`, the part may have been clamped again. A few targets that are as far apart as possible then
-    /// come first, at low speed, to detect a displaced part.
+    /// If `seated_anew` is true, the part may have been clamped again. A few targets that are as far apart as possible
+    /// then come first, at low speed, to detect a displaced part.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let first = if seated_anew { farthest_points(&self.target_places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
         self.plan_by_index(level_mm, cmm_from_model, (first, rest), true)
     }
 
-    /// Returns the targets in the form that the model of the error needs.
+    /// Returns the position and the normal of each target, for the error model.
     pub(super) fn target_places(&self) -> Vec<(Point, Vector)> {
         self.targets.iter().map(|target| (target.point, target.normal)).collect()
     }
 
-    /// Creates a plan of some targets, given by their indices. The targets in `first` are touched at low speed. The
-    /// reference sphere, if `with_sphere`, comes between `first` and `rest`.
+    /// Creates a plan with the targets of the task whose indices are in `first` and `rest`. The targets in `first` are
+    /// touched at low speed. If `with_sphere` is true, the reference sphere comes between `first` and `rest`.
     pub(super) fn plan_by_index(
         &self,
         level_mm: f64,
@@ -542,7 +551,7 @@ impl Task {
         self.plan_targets(level_mm, cmm_from_model, (first, rest), with_sphere)
     }
 
-    /// Creates a plan as [`Self::plan_by_index`] does, for targets that need not belong to the pattern.
+    /// Creates a plan as [`Self::plan_by_index`] does, for given targets. They need not be targets of the task.
     pub(super) fn plan_targets(
         &self,
         level_mm: f64,
@@ -572,7 +581,8 @@ impl Task {
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
 
-    /// Writes the correction of a pass, with the identity of the map of `base`, the correction that it replaces.
+    /// Writes the correction of a pass to `correction.csv`. The file also states the identity of the map of `base`, the
+    /// earlier correction that it replaces.
     pub(super) fn save_correction(
         &self,
         files: &mut OutputFiles,
@@ -585,8 +595,8 @@ impl Task {
         write_correction(&files.add_file("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
-    /// Writes the program of the next pass, if there is one. Returns the reason if a part of it is missing. A pass can
-    /// be ground without it, because the grinder gets the map.
+    /// Writes the program of the next pass. Returns `None` if it is complete. Returns the reason if this program cannot
+    /// plan it, or if a file of it was omitted: the grinder can then still grind from the correction map.
     ///
     /// # Errors
     /// A surface that the wheel cannot grind, limits of the grinder that the path exceeds, files that cannot be
@@ -604,7 +614,7 @@ impl Task {
     }
 }
 
-/// Returns the grid of the corrections of a part, from its minimum and maximum x and y.
+/// Returns the grid for the corrections of a part whose minimum and maximum are `x_mm` and `y_mm`.
 pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
     let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
     Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {
@@ -620,12 +630,12 @@ const CAREFUL_TARGETS: usize = 9;
 /// Speed for [`CAREFUL_TARGETS`], as a share of the recipe's speed.
 const CAREFUL_SPEED_SHARE: f64 = 0.2;
 
-/// Returns the points used in a registration.
+/// Returns the deviations of the points that a registration used. Outliers and points off the part are omitted.
 pub(super) fn used_deviations(found: &Registration) -> impl Iterator<Item = &Deviation> {
     found.deviations.iter().filter(|d| d.status == PointStatus::Inlier)
 }
 
-/// Returns the deviations of the points used in a registration, with their x and y in the model frame.
+/// Returns the deviations of the points that a registration used, each with its x and y in the model frame.
 pub(super) fn deviation_samples(found: &Registration) -> Vec<DeviationSample> {
     used_deviations(found)
         .map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm })

@@ -31,13 +31,14 @@ pub struct Table {
 }
 
 impl Table {
-    /// Returns the units of x, y and z.
+    /// Returns the units of x, y and z. x and y have the unit [`Self::unit`], or else millimetres. z has the unit
+    /// [`Self::height_unit`], or else that of x and y.
     pub(super) fn units(&self) -> [Unit; 3] {
         let unit = self.unit.unwrap_or_default();
         [unit, unit, self.height_unit.unwrap_or(unit)]
     }
 
-    /// Converts coordinates from the units of the table to millimetres, in place.
+    /// Converts `points` from the units of this table to millimetres, in place.
     pub(super) fn to_mm(&self, points: &mut [Point]) {
         let units_mm = self.units().map(Unit::in_mm);
         if units_mm != [1.0; 3] {
@@ -125,13 +126,17 @@ impl Columns {
         })
     }
 
-    /// Returns true if all columns are given by number: then no header is needed.
+    /// Returns true if x, y and z are all given by the number of their column, so that no header is needed.
     pub(super) fn are_numbers(&self) -> bool {
         self.0.iter().all(|column| matches!(column, Column::Numbered(_)))
     }
 
-    /// Returns the indices, from 0, of the columns x, y and z in a table of `count` columns with the header `names`.
-    /// The error is a reason for [`FormatError::HeaderNames`].
+    /// Returns the indices, from 0, of the columns x, y and z in a table with `count` columns, whose header has the
+    /// names `names`.
+    ///
+    /// # Errors
+    /// A column number above `count`; a column name that `names` contains not exactly once; the same column for two
+    /// axes. The text continues a sentence about the header, as the `reason` of [`FormatError::HeaderNames`] does.
     pub(super) fn places(&self, names: &[String], count: usize) -> Result<[usize; 3], String> {
         let mut places = [0; 3];
         for (place, column) in places.iter_mut().zip(&self.0) {
@@ -152,8 +157,8 @@ impl Columns {
 }
 
 impl Column {
-    /// Returns the indices of the columns with this name, compared with and without the unit in a name. The list is
-    /// empty for a column that is given by its number.
+    /// Returns the indices in `names` of all columns with the name of this column. A unit in a name of `names` is
+    /// ignored: `x` finds `x [mm]` too. Returns an empty list if this column is given by its number.
     fn among(&self, names: &[String]) -> Vec<usize> {
         let Self::Named(wanted) = self else { return Vec::new() };
         let is = |name: &String| name.trim() == wanted || split_unit(name).0 == wanted;
@@ -201,7 +206,7 @@ impl Unit {
         }
     }
 
-    /// Returns the words for the unit, in lower case; the first one is its name in settings.
+    /// Returns all words that name this unit, in lower case. The first one is the word used in settings files.
     fn words(self) -> &'static [&'static str] {
         match self {
             Self::Nanometre => &["nm", "nanometre", "nanometres", "nanometer", "nanometers"],
@@ -223,7 +228,7 @@ impl Unit {
         }
     }
 
-    /// Returns true if a word in lower case names this unit.
+    /// Returns true if `word` names this unit. `word` must be in lower case.
     pub(super) fn is(self, word: &str) -> bool {
         self.words().contains(&word)
     }
@@ -260,7 +265,8 @@ pub(super) enum Group {
 impl Group {
     const ALL: [Self; 3] = [Self::Plain, Self::Measured, Self::Nominal];
 
-    /// Returns the words that state the group, in the languages that machines print.
+    /// Returns the words in the name of a column that state this group of points, such as `act` or `soll`, in the
+    /// languages that machines print.
     fn words(self) -> &'static [&'static str] {
         match self {
             Self::Plain => &["coord", "coordinate", "coordinates", "pos", "position", "koordinate", "koord"],
@@ -319,8 +325,10 @@ impl fmt::Display for Group {
     }
 }
 
-/// Returns the axis, 0 to 2, and the group that a column's name states (lower case, without its unit); `None` for any
-/// other column.
+/// Returns the axis (0 for x, 1 for y, 2 for z) and the group of points that the name of a column states. `name` must
+/// be in lower case and without a unit.
+///
+/// Returns `None` if the name has no axis, has two axes or two groups, or has any other word.
 fn axis_of(name: &str) -> Option<(usize, Group)> {
     let mut axis = None;
     let mut group = Group::Plain;
@@ -365,8 +373,9 @@ const NON_COORDINATE_WORDS: [&str; 41] = [
     "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
 ];
 
-/// Returns the axis (0 to 2) that the name of a column contains, and the rest of the name; `None` if there is no axis
-/// or no rest. In a name of one word, the axis is the first or the last letter. The name is in lower case.
+/// Returns the axis (0 for x, 1 for y, 2 for z) that the name of a column contains, and the rest of the name; `None` if
+/// the name has no axis, or nothing else. `name` must be in lower case. If it is one word, its first or last letter is
+/// the axis.
 fn axis_in_name(name: &str) -> Option<(usize, String)> {
     let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
     let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
@@ -408,13 +417,17 @@ impl Axes {
         &self.groups[group as usize]
     }
 
-    /// Returns true if the header names x, y and z of at least one group of points, known or unknown.
+    /// Returns true if the header names x, y and z of at least one group of points. The group can be one of [`Group`],
+    /// or an unknown word that the names of all three axes contain.
     pub(super) fn are_named(&self) -> bool {
         self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
 
-    /// Returns the indices of the columns x, y and z. The error is the reason why the names do not determine them.
-    /// Columns of nominal points are rejected if `of_nominal` is false.
+    /// Returns the indices of the columns x, y and z. `of_nominal` is true if nominal points are wanted; if it is
+    /// false, columns of nominal points are rejected.
+    ///
+    /// # Errors
+    /// The reason why the names of the columns do not determine x, y and z.
     pub(super) fn chosen(&self, of_nominal: bool) -> Result<[usize; 3], String> {
         let there: Vec<Group> = Group::ALL
             .into_iter()
@@ -446,7 +459,8 @@ impl Axes {
     }
 }
 
-/// Returns text of a file, decoded as UTF-8 or else as Latin-1; many instruments write the micro sign in Latin-1.
+/// Decodes `bytes` as UTF-8, or as Latin-1 if they are not valid UTF-8: many instruments write the micro sign in
+/// Latin-1.
 pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     match std::str::from_utf8(bytes) {
         Ok(text) => Cow::Borrowed(text),
@@ -454,7 +468,8 @@ pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// Splits a column's name in lower case into the name itself and the unit that it states; `None` if it states no unit.
+/// Splits `name`, the name of a column in lower case, into the name without its unit, and the unit. The unit is `None`,
+/// and the name is complete, if it states no unit.
 pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
     let name = name.trim();
     for (open, close) in [('[', ']'), ('(', ')')] {
@@ -483,16 +498,16 @@ fn is_millimetre(unit: &str) -> bool {
     Unit::Millimetre.is(unit)
 }
 
-/// Returns true if a word in lower case is a unit of length.
+/// Returns true if `word` names a unit of length. `word` must be in lower case.
 pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
-/// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches"; `None`
-/// if it states no unit.
+/// Returns the unit that a title or a comment states, as in "units: inch", "units/inch" or "all dimensions in inches".
+/// Returns `None` if it states no unit. `text` must be in lower case.
 ///
-/// A statement such as "units: inch" has priority over a single word of a sentence. A single word must have at least
-/// four letters, because a shorter word can mean anything.
+/// A statement such as "units: inch" has priority over a single word of a sentence. A single word is used only if it
+/// has at least four letters, because a shorter word can mean anything, and if it does not mean millimetres.
 fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
     unit_statement(text).or_else(|| {
@@ -511,7 +526,7 @@ pub(super) struct StatedUnits {
 }
 
 impl StatedUnits {
-    /// Finds the units in a text.
+    /// Finds the units that a title or a comment states.
     pub(super) fn found_in(text: &str) -> Self {
         let text = text.to_lowercase();
         match height_unit(&text) {
@@ -524,7 +539,8 @@ impl StatedUnits {
     }
 }
 
-/// Returns the byte range of the unit of the heights in a text in lower case; `None` if the text states no such unit.
+/// Returns the byte range, in `text`, of the unit of the heights: of "um" in "heights in um". Returns `None` if the
+/// text states no unit for the heights. `text` must be in lower case.
 fn height_unit(text: &str) -> Option<Range<usize>> {
     const HEIGHTS: [&str; 10] =
         ["z", "height", "heights", "höhe", "höhen", "hoehe", "sag", "hauteur", "hauteurs", "altura"];
@@ -578,8 +594,8 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
-/// Returns the unit that follows the word "unit" or "units"; `None` if there is none. After a colon, `=` or `/`, an
-/// unknown text is returned too, because it is meant as a unit.
+/// Returns the unit that follows the word "unit" or "units" in `text`, which must be in lower case; `None` if no unit
+/// follows. After a colon, `=` or `/`, a text that is no known unit is returned too, because it is meant as a unit.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind
@@ -597,7 +613,8 @@ fn unit_statement(text: &str) -> Option<String> {
         .next()
 }
 
-/// Rejects a file whose header states a unit other than `unit` for all coordinates, or other than `height_unit` for z.
+/// Rejects a file if `header`, the text in line number `line`, states a unit other than `unit` for all coordinates, or
+/// other than `height_unit` for z.
 pub(super) fn check_stated_unit(
     path: &Path,
     line: u64,

@@ -19,7 +19,8 @@ const INCH_MM: f64 = 25.4;
 /// Words that begin a DMIS file.
 const BEGINNINGS: [&[u8]; 5] = [b"DMISMN/", b"DMISMD/", b"FILNAM/", b"UNITS/", b"$$"];
 
-/// Returns true if the first non-blank line of a file is DMIS.
+/// Returns true if `head`, the beginning of a file, starts with a DMIS statement or a DMIS comment (`$$`). Blanks and a
+/// byte order mark before it are ignored.
 pub(super) fn is_dmis(head: &[u8]) -> bool {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
     BEGINNINGS.iter().any(|word| head.get(..word.len()).is_some_and(|begins| begins.eq_ignore_ascii_case(word)))
@@ -41,18 +42,21 @@ struct Reading {
     is_ended: bool,
 }
 
-/// Reads what a file states about its measurement, such as the plan and the cycle.
+/// Reads what a DMIS file states about its measurement, such as the plan and the cycle. `path` only names the file in
+/// messages.
 ///
 /// # Errors
-/// A statement with an impossible value.
+/// Those of [`parse`], except that a file without points is accepted.
 pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     read(path, text).map(|reading| reading.statements)
 }
 
-/// Reads the points of a file.
+/// Reads the points of a DMIS file. If the file does not state whether its coordinates are centres or contacts,
+/// `content` decides. `path` only names the file in messages.
 ///
 /// # Errors
-/// A file without its end, its unit or its points; text in place of a number, with its line.
+/// A file without `ENDFIL`, without a point, or without `UNITS` before its first point; a point that is not cartesian
+/// or has text in place of a number; a statement with an impossible value.
 pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let Reading { points, names, statements, .. } = read(path, text)?;
     if points.is_empty() {
@@ -70,7 +74,8 @@ pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     })
 }
 
-/// Returns the number of the target from the name of its feature: 17 for `P17`; `None` for any other name.
+/// Returns the number of the target in the measuring plan, from the name of its feature: 17 for `P17`. Returns `None`
+/// for a name of any other form.
 pub(super) fn index_of(name: &str) -> Option<u32> {
     let digits = name.trim().strip_prefix(['P', 'p'])?;
     digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok()).flatten()
@@ -92,7 +97,8 @@ fn read(path: &Path, text: &[u8]) -> Result<Reading, FormatError> {
     Ok(reading)
 }
 
-/// Joins the lines of a text into statements; comments are omitted.
+/// Splits the text of a DMIS file into statements. A `$` at the end of a line joins it to the next line. Comments are
+/// omitted.
 fn statements(text: &str) -> Vec<Statement> {
     let (mut all, mut begun): (Vec<Statement>, Option<Statement>) = (Vec::new(), None);
     for (line, number) in text.lines().zip(1..) {
@@ -152,8 +158,8 @@ impl Reading {
         Ok(())
     }
 
-    /// Reads a text that the measuring program wrote into the file, such as `OUTFIL,'plan: 5f3c...'`; a text without a
-    /// colon is ignored.
+    /// Reads `after`, the text after `TEXT/` that the measuring program wrote into the file, such as `OUTFIL,'plan:
+    /// 5f3c...'`. A text that has no colon between its quotes is ignored.
     fn written(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
         let quoted = after.split_once('\'').and_then(|(_, rest)| rest.rsplit_once('\''));
         match quoted.and_then(|(text, _)| text.split_once(':')) {

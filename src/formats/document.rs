@@ -117,7 +117,8 @@ pub struct StandardUncertainty {
 }
 
 impl<'a> RegistrationDocument<'a> {
-    /// Builds the document from the result of a registration and its inputs.
+    /// Builds the content of `registration.json` from a registration. `options` are the options with which it was
+    /// computed, `nominal` and `measured_file` its inputs.
     pub fn new(
         registration: &'a Registration,
         options: &RegistrationOptions,
@@ -170,10 +171,10 @@ impl<'a> RegistrationDocument<'a> {
         }
     }
 
-    /// Checks that every number is finite: JSON has no NaN, and would contain `null` instead of a number.
+    /// Checks that every number of the document is finite, because JSON has neither NaN nor infinity.
     ///
     /// # Errors
-    /// Name of the value that is not finite, in words.
+    /// The description of the first value that is not finite, such as "the pose".
     pub fn check(&self) -> Result<(), &'static str> {
         let finite = |numbers: &[f64]| numbers.iter().all(|v| v.is_finite());
         let step = |i: &Iteration| finite(&[i.objective_mm2, i.step, i.ball_radius]);

@@ -18,13 +18,13 @@ pub enum FormatError {
     #[error("{path}: cannot be read: {source}; check the name and the permissions")]
     Unreadable { path: PathBuf, source: io::Error },
     /// The file has more bytes, points or triangles (`unit` says which) than are read.
-    #[error("{path}: {found} is more than the limit of {limit} {unit}; thin out the file or split it")]
+    #[error("{path}: {found} {unit}, more than the limit of {limit}; reduce the file, or split it")]
     TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },
     /// The file has no content at all.
     #[error("{path}: the file is empty, expected {expected}; export it again")]
     Empty { path: PathBuf, expected: &'static str },
     /// The file is well formed, but contains no data.
-    #[error("{path}: a header but no {expected} after it; export the file again with its data")]
+    #[error("{path}: the file has no {expected}; export it again with its data")]
     NoData { path: PathBuf, expected: &'static str },
     /// A byte that does not occur in a text file.
     #[error(
@@ -50,13 +50,13 @@ pub enum FormatError {
     NotFinite { path: PathBuf, line: u64, column: usize, found: String },
     /// A number that is too large for a coordinate of a part.
     #[error(
-        "{path}, line {line}, column {column}: expected at most {LIMIT_MM:e} mm in size, found `{found}`; correct the number \
+        "{path}, line {line}, column {column}: expected a number of at most {LIMIT_MM:e} mm, found `{found}`; correct the number \
          or the unit"
     )]
     OutOfRange { path: PathBuf, line: u64, column: usize, found: String },
     /// A comma that separates either decimals or thousands: ambiguous.
     #[error(
-        "{path}, line {line}, column {column}: `{found}` has either a decimal comma or a thousands comma; write all \
+        "{path}, line {line}, column {column}: the comma of `{found}` can be a decimal mark or a thousands separator; write all \
          numbers with a decimal point and without thousands separators"
     )]
     AmbiguousComma { path: PathBuf, line: u64, column: usize, found: String },
@@ -118,12 +118,12 @@ pub enum FormatError {
     Unexpected { path: PathBuf, place: String, expected: String, found: String },
     /// A face that refers to a vertex that does not exist.
     #[error(
-        "{path}, {place}: face names vertex {index}, but there are {vertices}, counted from 0; export the mesh again"
+        "{path}, {place}: a face has the vertex {index}, but there are {vertices} vertices, counted from 0; export the mesh again"
     )]
     IndexOutOfRange { path: PathBuf, place: String, index: f64, vertices: u64 },
     /// A vertex that is not a valid position.
     #[error(
-        "{path}, {place}: expected {what} as a finite number of at most {LIMIT_MM:e} mm, found {value}; repair the mesh or the \
+        "{path}, {place}: expected {what} as a finite number of at most {LIMIT_MM:e} mm, found {value}; correct the mesh or its \
          unit"
     )]
     BadCoordinate { path: PathBuf, place: String, what: &'static str, value: f64 },
@@ -152,25 +152,29 @@ pub enum FormatError {
     )]
     NoLateralScale { path: PathBuf, found: f64 },
     /// A file could not be written; an existing file of that name is unchanged.
-    #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the free space")]
+    #[error("{path}: {action} failed: {source}; check the name, the permissions and the free space")]
     Unwritable { path: PathBuf, action: &'static str, source: io::Error },
     /// A row to be written holds NaN or an infinity.
-    #[error("{path}: row {row} of the result has {value}, which is not a finite number; nothing was written")]
+    #[error(
+        "{path}: row {row} of the result has {value}, which is not a finite number; nothing was written; report this fault with the input files"
+    )]
     RowNotFinite { path: PathBuf, row: usize, value: f64 },
     /// A value that JSON cannot express.
-    #[error("{path}: cannot be written as JSON: {source}")]
+    #[error("{path}: cannot be written as JSON: {source}; report this fault with the input files")]
     Json { path: PathBuf, source: serde_json::Error },
     /// A statement such as `# cycle: 3` with an impossible value.
     #[error("{path}, line {line}: `{key}` is `{found}`, expected {expected}; correct the line")]
     Statement { path: PathBuf, line: u64, key: &'static str, found: String, expected: &'static str },
     /// The file contradicts another file: the cell file or the plan.
-    #[error("{path}: in the file {key} is {found}, in the {by} {expected}; correct one of them")]
+    #[error("{path}: {key}: {found} in this file, but {expected} in the {by}; correct one of them")]
     Contradiction { path: PathBuf, key: &'static str, found: String, by: &'static str, expected: String },
     /// A target number that the plan does not have, or that occurred before.
     #[error("{path}, line {line}: index `{found}` {why}; export the measurement of this plan")]
     Index { path: PathBuf, line: u64, found: String, why: &'static str },
     /// More than one probe in the same file.
-    #[error("{path}, line {line}: probe `{found}`, the lines above have `{first}`; export one file per probe")]
+    #[error(
+        "{path}, line {line}: the probe is `{found}`, but `{first}` in the lines above; export one file for each probe"
+    )]
     ProbeVaries { path: PathBuf, line: u64, found: String, first: String },
     /// A file of reference points that cannot be understood.
     #[error("{path}, line {line}: expected {expected}, found {found}; correct the file of reference points")]
@@ -184,18 +188,20 @@ pub enum FormatError {
 }
 
 impl FormatError {
-    /// Returns true if the only fault of the file is that it ends too early.
+    /// Returns true for an error that means only that the file is empty or ends too early. Everything up to its end is
+    /// valid.
     pub fn is_cut(&self) -> bool {
         matches!(self, Self::Cut { .. } | Self::CutLine { .. } | Self::Empty { .. })
     }
 }
 
-/// Returns a piece of a file in backquotes, or the word `nothing` if the piece is empty.
+/// Returns `found`, a piece of a file, in backquotes, or the word `nothing` if it is empty.
 fn quoted(found: &str) -> String {
     if found.is_empty() { "nothing".to_owned() } else { format!("`{found}`") }
 }
 
-/// Returns the beginning of a piece of a file for a message: at most 40 characters, all printable.
+/// Returns the first 40 characters of a piece of a file, for a message. Control characters are escaped. `...` marks a
+/// longer piece.
 pub(super) fn excerpt(bytes: &[u8]) -> String {
     const LONGEST: usize = 40;
     let text = String::from_utf8_lossy(&bytes[..bytes.len().min(4 * LONGEST)]);
@@ -206,7 +212,7 @@ pub(super) fn excerpt(bytes: &[u8]) -> String {
     short
 }
 
-/// Returns a character unchanged, or escaped if it could disturb a terminal.
+/// Returns `c` unchanged, or its escape sequence if it is a control character, which could disturb a terminal.
 fn printable(c: char) -> impl Iterator<Item = char> {
     let escaped = if c.is_control() { Some(c.escape_default()) } else { None };
     let plain = if c.is_control() { None } else { Some(c) };

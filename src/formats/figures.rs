@@ -71,10 +71,9 @@ struct TermDocument {
 pub type CycleFigures<'a> =
     (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
-/// Writes `figures.json`: the figures of the form, the figures of the points and the slopes of the map. Each figure is
-/// written with `taken_out`, the terms that were removed before it was computed.
-///
-/// For figures that do not exist, the file gives the reason.
+/// Writes `figures.json` to `path`: the figures of the form, of the points, and the slopes of the map. `taken_out`
+/// names the terms, such as piston and tilt, that were removed before these figures were computed; the file states them
+/// for each figure. For figures that do not exist, the file gives the reason.
 ///
 /// # Errors
 /// A file that cannot be written.

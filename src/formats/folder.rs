@@ -17,7 +17,8 @@ pub struct ResultFolder {
 }
 
 impl ResultFolder {
-    /// Creates a folder and its parents if they do not exist, and checks that a file can be created in it.
+    /// Creates the folder `path` and its missing parents, and checks that a file can be created in it. Folders that
+    /// were created are removed when the value is dropped, unless [`Self::keep`] is called.
     ///
     /// # Errors
     /// A folder that cannot be created or written to.
@@ -41,7 +42,7 @@ impl ResultFolder {
         &self.path
     }
 
-    /// Keeps the folder, because it now contains a result.
+    /// Keeps the folder after the value is dropped, because it now contains a result.
     pub fn keep(mut self) {
         self.created.clear();
     }
@@ -56,11 +57,10 @@ impl Drop for ResultFolder {
     }
 }
 
-/// Removes the file of a socket; leaves any other file of that name unchanged. The caller must know that no program
-/// listens on the socket.
+/// Removes the socket at `path`. The caller must know that no program listens on it.
 ///
 /// # Errors
-/// A folder that is not writable; a file of that name that is not a socket.
+/// Nothing at `path`; something that is not a socket, which stays unchanged; a folder that is not writable.
 pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     if !is_socket(path)? {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
@@ -68,11 +68,11 @@ pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     fs::remove_file(path)
 }
 
-/// Creates a link to a device, and replaces a link of an earlier simulation; leaves anything else of that name
-/// unchanged.
+/// Creates the symbolic link `link` to `device`. Replaces a link that an earlier simulation left there.
 ///
 /// # Errors
-/// A folder that is not writable; something of that name that is not a link.
+/// Something at `link` that is not a link, which stays unchanged; a folder that is not writable; a system without such
+/// links (Windows).
 pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     if fs::symlink_metadata(link).is_ok() {
         remove_link(link)?;
@@ -80,10 +80,10 @@ pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     link_to(device, link)
 }
 
-/// Removes a link; leaves anything else of that name unchanged.
+/// Removes the symbolic link `link`, but not the file to which it points.
 ///
 /// # Errors
-/// A folder that is not writable; something of that name that is not a link.
+/// Nothing at `link`; something that is not a link, which stays unchanged; a folder that is not writable.
 pub fn remove_link(link: &Path) -> std::io::Result<()> {
     if !fs::symlink_metadata(link)?.file_type().is_symlink() {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
@@ -96,10 +96,11 @@ pub fn remove_link(link: &Path) -> std::io::Result<()> {
 pub struct ScratchFolder(PathBuf);
 
 impl ScratchFolder {
-    /// Reserves a path for the folder and removes what an earlier run left there. The writer creates the folder.
+    /// Reserves `path` for a temporary folder, and deletes a folder that an earlier run left at `path`. The folder
+    /// itself is not created: the caller does that.
     ///
     /// # Errors
-    /// Existing content that cannot be removed.
+    /// A folder at `path` that cannot be deleted.
     pub fn at(path: PathBuf) -> Result<Self, FormatError> {
         match fs::remove_dir_all(&path) {
             Err(source) if source.kind() != io::ErrorKind::NotFound => {
@@ -109,7 +110,7 @@ impl ScratchFolder {
         }
     }
 
-    /// Returns the path.
+    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -122,8 +123,8 @@ impl Drop for ScratchFolder {
     }
 }
 
-/// Returns the sorted names of the files in a folder, if the folder exists. First removes unfinished files that a
-/// terminated program left under a temporary name: nothing refers to them.
+/// Returns the sorted names of the files in a folder; `None` if the folder does not exist or cannot be read. First
+/// deletes the unfinished files (`.name.tmp`) that a terminated program left, because nothing refers to them.
 pub fn finished_files(folder: &Path) -> Option<Vec<String>> {
     let entries = fs::read_dir(folder).ok()?.flatten().filter(|entry| entry.path().is_file());
     let mut names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();

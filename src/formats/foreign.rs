@@ -50,8 +50,8 @@ const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"BEGIN PGM", "a program in Klartext", "give the measured points"),
 ];
 
-/// Detects, from the first bytes of a file, a format that this program does not read; `None` if there is no such
-/// format.
+/// Detects, from the first bytes of a file, a known format that this program does not read. Returns the name of the
+/// format with a remedy; `None` if no such format is detected.
 pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     let plain = narrowed(head);
     let text = plain.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&plain).trim_ascii_start();
@@ -60,13 +60,14 @@ pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     begins.or_else(|| packed(head)).or_else(|| by_lines(text)).or_else(|| surface_data(head))
 }
 
-/// Rejects a file if its first bytes show a format that this program does not read.
+/// Rejects a file if its first bytes belong to a known format that this program does not read.
 pub(super) fn check_is_ours(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     let Some(Foreign { found, remedy }) = foreign(head) else { return Ok(()) };
     Err(FormatError::WrongKind { path: path.to_owned(), expected: EXPECTED, found, remedy })
 }
 
-/// Returns true if text has two bytes per character, with or without a byte order mark.
+/// Returns true if `head`, the beginning of a file, is text with two bytes per character (UTF-16), with or without a
+/// byte order mark.
 pub(super) fn is_utf16(head: &[u8]) -> bool {
     /// Number of characters that are checked.
     const LOOKED_AT: usize = 200;
@@ -79,13 +80,14 @@ pub(super) fn is_utf16(head: &[u8]) -> bool {
     head.len() > 3 && (is_wide(0) || is_wide(1))
 }
 
-/// Returns the first bytes of a file. If they are text with two bytes per character, only its ASCII characters are
-/// returned, one byte each.
+/// Returns `head`, the beginning of a file, unchanged. For text with two bytes per character (UTF-16), returns only its
+/// ASCII characters, one byte each.
 fn narrowed(head: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     if is_utf16(head) { head.iter().copied().filter(|b| (1..0x80).contains(b)).collect() } else { head.into() }
 }
 
-/// Detects the content of a zip container by the names of its first entries; X3P is a zip container too.
+/// Detects a format in a zip container, such as an Excel workbook, by the names of the first entries. Returns `None` if
+/// `head` is not a zip container, if its content is unknown, or if it is X3P, which this program reads.
 fn packed(head: &[u8]) -> Option<Foreign> {
     const LOCAL: &[u8] = b"PK\x03\x04";
     /// Offsets in the local header of an entry: of the length of the name, and of the name itself.
@@ -114,7 +116,8 @@ fn packed(head: &[u8]) -> Option<Foreign> {
     found.map(|(found, remedy)| Foreign { found, remedy })
 }
 
-/// Detects, from the first lines of a text, a format that this program does not read.
+/// Detects a text format that this program does not read by the first lines of the text, such as IGES; `None` if no
+/// such format is detected.
 fn by_lines(text: &[u8]) -> Option<Foreign> {
     /// Column of the section letter in a line of IGES.
     const SECTION: usize = 72;
@@ -152,7 +155,7 @@ fn by_lines(text: &[u8]) -> Option<Foreign> {
     Some(Foreign { found, remedy })
 }
 
-/// Detects surface data files of versions whose heights have another meaning than in version 1.0.
+/// Detects SDF files of a version in which heights have another meaning than in version 1.0; `None` for any other file.
 fn surface_data(head: &[u8]) -> Option<Foreign> {
     const AGAIN: &str = "export it as SDF of version 1.0 (ISO), or as X3P";
     let version = head.get(1..8).filter(|_| matches!(head[0], b'a' | b'b' | b'A' | b'B'))?.to_ascii_uppercase();

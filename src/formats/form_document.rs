@@ -56,10 +56,11 @@ struct FormDocument<'a> {
     frame_covariance: [[f64; 6]; 6],
 }
 
-/// Writes `model.json`, and `form.csv` with one row per measured point that was used, in the order given.
+/// Writes the result of the form model into `folder`: the parameters and figures to `model.json`, and the form at each
+/// measured point that was used to `form.csv`, in the order given.
 ///
 /// # Errors
-/// A folder that is not writable.
+/// A file that cannot be written.
 pub fn save_form(
     folder: &Path,
     form: &Form,

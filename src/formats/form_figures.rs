@@ -35,8 +35,11 @@ const RMS_TOTAL: &str = "of the form without piston and tilt";
 const RMS_IRREGULARITY: &str = "of the form without piston, tilt and power";
 const RMS_VARYING: &str = "of the part of the irregularity that is not symmetric about the middle";
 
-/// Returns the figures of a form, in the order of a report: in micrometres, those of ISO 10110-5 in nanometres, slopes
-/// in microradians.
+/// Returns the figures of a form, in the order of a report, each with its median and its credible interval. `raw` holds
+/// the same figures of the measured deviations, and `slope` the slopes of the error map. `taken_out` names the terms
+/// removed before.
+///
+/// PV and RMS are in micrometres, slopes in microradians, and figures of ISO 10110-5 in nanometres.
 pub(super) fn form_figure_rows(
     form: &Form,
     raw: Option<&DeviationFigures>,
@@ -98,7 +101,8 @@ fn values(of: Interval) -> [f64; 3] {
     [of.median_mm, of.low_mm, of.high_mm]
 }
 
-/// Returns the ISO 10110-5 indication that the form meets in each of its values with a probability of 97.5 %.
+/// Returns the ISO 10110-5 indication, for a drawing, that the form meets. It consists of the upper limits of the
+/// credible intervals, so that the form meets each of its values with a probability of 97.5 %.
 pub(super) fn notation(of: &IsoFigures, wavelength_nm: f64) -> String {
     let most = |of: Interval| 1e6 * of.high_mm;
     iso_10110_notation(

@@ -26,12 +26,13 @@ pub struct HeightMap {
 }
 
 impl HeightMap {
-    /// Creates a map from samples on a grid; `None` is a sample that was not measured.
+    /// Creates a map from `samples`, the heights in millimetres on `grid`, row by row with x fastest. `None` is a
+    /// sample that was not measured. `path` only names the file in messages.
     ///
     /// # Errors
     /// An axis without samples; more than 50 million samples, or a number of samples that differs from the grid; a
     /// spacing that is not above 0; a position or a height that is NaN, infinite or beyond 1e7 mm; no measured sample
-    /// at all. `path` only names the file in messages.
+    /// at all.
     pub fn new(path: &Path, grid: Grid, samples: impl IntoIterator<Item = Option<f64>>) -> Result<Self, FormatError> {
         let Grid { columns, rows, first_mm, spacing_mm } = grid;
         let unexpected = |place: String, expected: &str, found: String| FormatError::Unexpected {
@@ -94,7 +95,7 @@ impl HeightMap {
         high - low
     }
 
-    /// Returns the root mean square of the measured heights about their mean, in millimetres.
+    /// Returns the root mean square of the measured heights minus their mean (the standard deviation), in millimetres.
     pub fn rms_mm(&self) -> f64 {
         let count = self.measured_count() as f64;
         let mean = self.measured().map(|(_, z)| z).sum::<f64>() / count;
@@ -117,21 +118,28 @@ pub(super) struct MapFormat {
 }
 
 impl MapFormat {
-    /// Reads the points of a file.
+    /// Reads the measured points of the map in the file `path`.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is not valid; heights that look like marks of missing samples ([`check_marks`]).
     pub(super) fn read_points(&self, path: &Path) -> Result<MapPoints, FormatError> {
         let map = (self.read)(path)?;
         check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
     }
 
-    /// Parses the points in the bytes of a file.
+    /// Reads the measured points of a map from the bytes of its file; `path` only names the file in messages.
+    ///
+    /// # Errors
+    /// Bytes that are not valid; heights that look like marks of missing samples ([`check_marks`]).
     pub(super) fn parse_points(&self, path: &Path, bytes: &[u8]) -> Result<MapPoints, FormatError> {
         let map = (self.parse)(path, bytes)?;
         check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
     }
 }
 
-/// Rejects a map in which several heights far from all others are exactly equal, such as -9999: some programs write
-/// this value for samples that were not measured. A real surface that far away would have different heights.
+/// Rejects a map in which the lowest or the highest height, such as -9999, occurs more than once and is far from all
+/// others. Some programs write such a value for samples that were not measured. A real surface that far away would have
+/// different heights.
 fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Result<(), FormatError> {
     const FAR: f64 = 10.0;
     let (low, high) = heights_mm.clone().fold((f64::MAX, f64::MIN), |(low, high), z| (low.min(z), high.max(z)));
@@ -164,7 +172,7 @@ impl From<HeightMap> for MapPoints {
     }
 }
 
-/// Rejects a grid without samples or with too many, before memory is reserved for it.
+/// Rejects a grid without samples, or with more than [`MAX_SAMPLES`], before memory is reserved for it.
 pub(super) fn check_size(path: &Path, columns: u64, rows: u64) -> Result<(), FormatError> {
     let samples = columns.saturating_mul(rows);
     match samples {

@@ -16,7 +16,7 @@ pub struct JsonlAppender {
 }
 
 impl JsonlAppender {
-    /// Opens a file, or creates it; existing content is preserved.
+    /// Opens a file for appending, or creates it. Existing content is preserved.
     ///
     /// # Errors
     /// A file that is not writable.
@@ -27,7 +27,8 @@ impl JsonlAppender {
         Ok(Self { file: Arc::new(Mutex::new(file)) })
     }
 
-    /// Appends a line in one write. If the disk is full the line is lost: logging an event must not stop the program.
+    /// Appends `line` as one line of JSON, in one write. Errors are ignored, for example if the disk is full: a lost
+    /// line of a log must not stop the program.
     pub fn append(&self, line: &impl Serialize) {
         let Ok(mut text) = serde_json::to_string(line) else { return };
         text.push('\n');

@@ -23,7 +23,7 @@ impl Separator {
     /// separator.
     const ALL: [Self; 4] = [Self::Tab, Self::Semicolon, Self::Comma, Self::Blank];
 
-    /// Returns the byte that separates columns; for blanks, one of the two possible bytes.
+    /// Returns the byte that separates columns. For [`Self::Blank`] this is the blank, although a tab separates too.
     pub(super) fn byte(self) -> u8 {
         match self {
             Self::Comma => b',',
@@ -33,7 +33,7 @@ impl Separator {
         }
     }
 
-    /// Returns true if a byte can surround a field without belonging to it.
+    /// Returns true if `byte` is padding: it can stand before or after a field without belonging to it.
     pub(super) fn pads(self, byte: u8) -> bool {
         byte == b' ' || (byte == b'\t' && self != Self::Tab)
     }
@@ -47,7 +47,8 @@ impl Separator {
         }
     }
 
-    /// Returns a field without the blanks that group its thousands, if neither blanks nor commas separate columns.
+    /// Returns the number in a field without the blanks between its thousands (`1 234` becomes `1234`), if a tab or a
+    /// semicolon separates columns. Returns any other field unchanged.
     pub(super) fn ungrouped(self, field: &[u8]) -> Cow<'_, [u8]> {
         let may = matches!(self, Self::Tab | Self::Semicolon);
         may.then(|| without_blanks(field)).flatten().map_or(Cow::Borrowed(field), Cow::Owned)
@@ -108,7 +109,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Returns the x, y and z fields of a line and its number of columns.
+    /// Returns the fields x, y and z of a line, and the number of columns of the line. A missing field is empty.
     pub(super) fn pick<'a>(&self, line: &'a [u8]) -> ([&'a [u8]; 3], usize) {
         let mut picked = [&line[..0]; 3];
         let mut count = 0;
@@ -121,9 +122,11 @@ impl Layout {
         (picked, count)
     }
 
-    /// Determines the decimal mark from the first lines that show it.
+    /// Determines the decimal mark from `text`, which begins with the first line of data, and stores it in
+    /// `self.decimal`. The first number that shows the mark decides.
     ///
-    /// Errors: the first number with a comma, if no line shows whether commas separate decimals or thousands.
+    /// # Errors
+    /// The first number with a comma, if no number shows whether commas are decimal marks or separate thousands.
     pub(super) fn settle_decimal(&mut self, path: &Path, text: &[u8]) -> Result<(), FormatError> {
         if self.separator == Separator::Comma && !text.contains(&b'"') {
             return Ok(());
@@ -151,7 +154,7 @@ impl Layout {
     }
 }
 
-/// Returns true if a line is a comment.
+/// Returns true if a line is a comment: it begins with `#` or `//`, after blanks.
 pub(super) fn is_comment(line: &[u8]) -> bool {
     let line = line.trim_ascii_start();
     line.starts_with(b"#") || line.starts_with(b"//")
@@ -185,7 +188,12 @@ impl<'p> Preamble<'p> {
         header.map_or(Vec::new(), |(_, line)| names(line, separator))
     }
 
-    /// Reads the next line and returns the layout if it is the first line with data.
+    /// Reads the next line of the file; `number` is its line number. Returns the layout of the table if this line
+    /// contains the first point, and `None` if it is above the data.
+    ///
+    /// # Errors
+    /// A line that is neither a point nor a possible line above the data; a unit other than that in which the table is
+    /// read; columns that are not clear.
     pub(super) fn read_line(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
         let content = line.trim_ascii();
         if content.is_empty() || (number == 1 && is_separator_line(content)) {
@@ -207,7 +215,7 @@ impl<'p> Preamble<'p> {
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
     }
 
-    /// Reads a line without a point: the header, a title, a line of units, or an error.
+    /// Reads a line without a point: stores it as a header, a title or a line of units; any other line is an error.
     fn read_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::new(line, likely).collect();
@@ -234,7 +242,7 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// Returns the error for a line that is not a point.
+    /// Returns the error for a line that is not a point: too few columns, or the first field that is not a number.
     fn no_point(&self, line: &[u8], number: u64) -> FormatError {
         let path = self.path.to_owned();
         let fields: Vec<&[u8]> = Fields::new(line, likely_separator(line)).collect();
@@ -245,7 +253,7 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Returns the reason why no point was found in the text read.
+    /// Returns the error for a text in which no point was found.
     pub(super) fn without_points(mut self) -> FormatError {
         let path = self.path.to_owned();
         match (self.title.take(), &self.header) {
@@ -256,7 +264,7 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Returns true if a line names coordinates.
+    /// Returns true if `header` can be the header of the table: it names x, y and z, or the columns that a person gave.
     fn is_understood(&self, header: &[u8]) -> bool {
         let names = names(header, likely_separator(header));
         match &self.table.columns {
@@ -266,7 +274,8 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Rejects `found`, a unit that a table states, unless it is `unit`, the unit in which the table is read.
+    /// Rejects `found`, the unit that line number `line` states, unless it is `unit`, the unit in which the table is
+    /// read.
     fn check_unit(&self, line: u64, found: String, unit: Unit) -> Result<(), FormatError> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
@@ -299,8 +308,9 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(line, found, unit))
     }
 
-    /// Rejects units in the line below the header that differ from those in which the table is read. If the line does
-    /// not have one unit per column, each of its units is compared with the unit of x and y.
+    /// Rejects units in the line below the header that differ from those in which the table is read. `count` is the
+    /// number of columns of the table. If the line does not have one unit per column, each of its units is compared
+    /// with the unit of x and y.
     fn check_unit_line(&self, columns: [usize; 3], count: usize) -> Result<(), FormatError> {
         let Some((line, units)) = &self.units else { return Ok(()) };
         let of_axes = self.table.units();
@@ -316,7 +326,8 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(*line, found.clone(), unit))
     }
 
-    /// Stores the units of a line below a header; returns false if the line is not a line of units.
+    /// Stores the units of a line below a header. Returns false, and stores nothing, if a field is neither empty nor a
+    /// unit of length, if all fields are empty, or if there is a line of units already.
     fn take_units(&mut self, fields: &[&[u8]], number: u64) -> bool {
         let unit = |field: &&[u8]| text_of(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
         let units: Vec<String> = fields.iter().map(unit).collect();
@@ -341,8 +352,14 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// Returns the columns that hold x, y and z: those that the header names, or, in a table without names, the only
-    /// three or those before unit normals.
+    /// Returns the indices of the columns x, y and z. They are the columns that a person gave, or those that the header
+    /// names. In a table without names they are its only three columns, or the first three of six if unit normals
+    /// follow.
+    ///
+    /// `data` is the first line with a point, `count` its number of columns and `data_line` its line number.
+    ///
+    /// # Errors
+    /// Columns that are not clear; a header with another number of columns than the data, or with another unit.
     fn columns(
         &self,
         separator: Separator,
@@ -398,7 +415,7 @@ impl<'p> Preamble<'p> {
     }
 }
 
-/// Returns true if the last three of six columns are a unit vector.
+/// Returns true if the last three of the six columns of a line are a vector of length 1.
 fn has_normal(line: &[u8], separator: Separator) -> bool {
     const OFF: f64 = 1e-3;
     let last = Fields::new(line, separator).skip(3);
@@ -407,8 +424,8 @@ fn has_normal(line: &[u8], separator: Separator) -> bool {
     squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
 }
 
-/// Returns the separator with which a line contains a point: preferably three numbers at the start, or else three
-/// numbers anywhere; `None` if the line contains no point.
+/// Returns the separator with which a line contains a point. The first three fields are numbers with it, or else any
+/// three fields. Returns `None` if the line contains no point.
 fn data_separator(line: &[u8]) -> Option<Separator> {
     let numbers = |separator: Separator, first: usize| {
         let fields = Fields::new(line, separator).take(first);
@@ -418,13 +435,14 @@ fn data_separator(line: &[u8]) -> Option<Separator> {
     first_three.or_else(|| Separator::ALL.into_iter().find(|&separator| numbers(separator, usize::MAX) >= 3))
 }
 
-/// Returns the separator that a line of words appears to have.
+/// Returns the first of tab, semicolon and comma that a line contains, or else the blank.
 fn likely_separator(line: &[u8]) -> Separator {
     let there = |separator: &Separator| line.contains(&separator.byte());
     Separator::ALL.into_iter().find(there).unwrap_or(Separator::Blank)
 }
 
-/// Returns the names of the columns in lower case; a unit separated by a blank belongs to the name before it.
+/// Returns the names of the columns in a header, converted to lower case. A unit in brackets that a blank separates
+/// belongs to the name before it.
 fn names(header: &[u8], separator: Separator) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for field in Fields::new(header, separator) {
@@ -437,13 +455,14 @@ fn names(header: &[u8], separator: Separator) -> Vec<String> {
     names
 }
 
-/// Returns true if a line states the separator, as Excel writes it: `sep=;`.
+/// Returns true if a line only states the separator of the table, as Excel writes it: `sep=;`.
 pub(super) fn is_separator_line(line: &[u8]) -> bool {
     let line = line.trim_ascii();
     line.len() <= 5 && line.get(..4).is_some_and(|word| word.eq_ignore_ascii_case(b"sep="))
 }
 
-/// Returns true if all lines have only empty columns, or only an old end-of-file mark.
+/// Returns true if `lines` contains only separators, quotes, blanks and end-of-file marks of old systems, and so no
+/// data.
 pub(super) fn are_empty_rows(lines: &[u8], separator: Separator) -> bool {
     lines.iter().all(|b| b"\"\x1a \t\r\n".contains(b) || separator.separates(*b))
 }

@@ -88,16 +88,18 @@ pub enum LearnedError {
 }
 
 impl Learned {
-    /// Creates the knowledge that a run leaves to the next part.
+    /// Creates the knowledge that the run named `run` leaves to the next part. `correction` is the correction of its
+    /// next pass, and `known` its state of learning. `setting` names what all passes have in common, and `simulation`
+    /// is true if they were simulated.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         let (fields, kind, taught_by) = (PartPriors::default(), None, None);
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
     /// Returns the knowledge for the first part of a recipe on a machine that has not ground this recipe yet. It is
-    /// computed from `others`, the results of other machines, as far as machines are similar (`alike`). Returns `None`
-    /// if these results give no information. `fresh` and `none` are the state and the correction of a machine without
-    /// knowledge.
+    /// computed from `others`, the knowledge of runs on other machines, as far as machines are similar (`alike`).
+    /// `fresh` and `none` are the state of learning and the correction of a machine without knowledge. Returns `None`
+    /// if `others` give no information.
     ///
     /// The wheel and the setting of another machine differ from those of this machine. Therefore the correction by
     /// parameters of the other machine becomes part of the map.
@@ -118,23 +120,25 @@ impl Learned {
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
-    /// Returns the same knowledge with the kind that other cells must share.
+    /// Returns the same knowledge with the kind of its passes. Another cell can begin with it only if its passes have
+    /// the same kind.
     #[must_use]
     pub fn with_kind(self, kind: String) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
-    /// Returns the same knowledge with the priors of the error fields.
+    /// Returns the same knowledge with `fields`, the prior distributions of the error fields.
     #[must_use]
     pub fn with_fields(self, fields: PartPriors) -> Self {
         Self { fields, ..self }
     }
 
-    /// Reads the knowledge that a run left, together with the bytes of the file; returns `None` if there is none, or
-    /// none for this setting.
+    /// Reads the knowledge that a run left in its folder `run`, and returns it with the bytes of its file. Returns
+    /// `None` if the file does not exist, has another layout, or is for another `setting` or another value of
+    /// `simulation`.
     ///
     /// # Errors
-    /// A file that cannot be read or is not one of Regrind's; numbers that are impossible.
+    /// A file that cannot be read, is too large, is not written by Regrind, or has an impossible number.
     pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
         let broken = |why| LearnedError::Broken { path: path.clone(), why };
@@ -156,10 +160,12 @@ impl Learned {
         Self::from_saved(&path, &text).map(|learned| Some((learned, text)))
     }
 
-    /// Reads the knowledge of another cell's run, of this kind and simulation; `from` names its origin.
+    /// Reads the knowledge of a run of another cell from the `text` of its file. `from` only names the file in
+    /// messages.
     ///
     /// # Errors
-    /// A text that is not one of Regrind's, that is of another kind, or that has impossible numbers.
+    /// A text that Regrind did not write; passes of another kind than `kind` or another value of `simulation`;
+    /// knowledge that is itself from other cells; an impossible number, or a state that cannot be transferred.
     pub fn read_other(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
         let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
@@ -174,10 +180,11 @@ impl Learned {
         }
     }
 
-    /// Reads the copy that a run saved of its start; `path` names the file in messages.
+    /// Parses the knowledge from the `text` of its file, such as the copy that a run saves at its start. `path` only
+    /// names the file in messages.
     ///
     /// # Errors
-    /// A text that is not one of Regrind's, or that has impossible numbers.
+    /// A text that Regrind did not write, or that has an impossible number.
     pub fn from_saved(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
         let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
         let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
@@ -187,7 +194,7 @@ impl Learned {
         }
     }
 
-    /// Returns the first impossible value, in words.
+    /// Returns a description of the first impossible value; `None` if there is none.
     fn flaw(&self) -> Option<String> {
         let Correction { grid, values_mm, level_mm, .. } = &self.correction;
         if !grid.is_valid() || values_mm.len() != grid.len() {
@@ -212,8 +219,8 @@ impl Learned {
         (!self.known.is_valid()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
-    /// Returns the correction for the first pass of another part, resampled to the grid of `none`. It compensates the
-    /// error that repeated in every pass of this part.
+    /// Returns the correction for the first pass of the next part, resampled to the grid of `none`, a correction of 0.
+    /// It compensates the error that repeated in every pass of the last part.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
         let set = self.correction.set.as_ref().map(|set| ParameterCorrections {

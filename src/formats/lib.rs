@@ -102,8 +102,8 @@ enum Kind {
     Map(&'static MapFormat),
 }
 
-/// Reads a nominal surface as [`read_nominal_as`] does, and returns it with a SHA-256. The hash covers the bytes of the
-/// file and, if `table` states columns or units, these too: other columns are another surface.
+/// Reads a nominal surface as [`read_nominal_as`] does, and returns it with its SHA-256. The hash covers the bytes of
+/// the file, and the columns and units that `table` gives, because other columns are another surface.
 ///
 /// # Errors
 /// The same as for [`read_nominal_as`].
@@ -134,12 +134,13 @@ pub fn read_nominal_with_identity(
     }
 }
 
-/// Reads a nominal surface: points as text or PLY, a mesh as PLY or STL, or a TOML definition.
+/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), or the text of a TOML definition.
 ///
 /// The content decides the format. The extension decides only if the content is ambiguous.
 ///
 /// # Errors
-/// The errors of the format found.
+/// A file that cannot be read, or that is not valid in its format; a measured map; a format that this program does not
+/// read.
 pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
     read_nominal_as(path, &Table::default())
 }
@@ -178,10 +179,12 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
 /// Reads measured points, in millimetres and in the order of the file, from text, the vertices of a PLY file, or the
 /// measured samples of a map: X3P, SDF or MetroPro.
 ///
-/// The points of a map lie on the surface. The centres of a probe lie above it.
+/// The points of a map lie on the surface. Centres of a probe lie above it; the file does not show which of them it
+/// has.
 ///
 /// # Errors
-/// The errors of the format found; a file that is STL or TOML.
+/// A file that cannot be read, or that is not valid in its format; an STL or TOML file; a format that this program does
+/// not read.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
@@ -221,7 +224,8 @@ pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, Fo
     }
 }
 
-/// Rejects columns and a unit for a file that is not a table.
+/// Rejects a file that is not a table of points if `table` gives columns or a unit, because the file states both
+/// itself.
 fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
     if matches!(kind, Kind::Text) || *table == Table::default() {
         return Ok(());
@@ -234,7 +238,10 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
     })
 }
 
-/// Determines the kind of a file from its beginning, and from its extension if the beginning is ambiguous.
+/// Determines the format of a file from its beginning, and from its extension if the beginning is ambiguous.
+///
+/// # Errors
+/// A file that cannot be read; a known format that this program does not read.
 fn kind(path: &Path) -> Result<Kind, FormatError> {
     let opened = whole::open(path)?;
     let (head, length) = (&opened.head[..], opened.length);
@@ -263,13 +270,14 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     })
 }
 
-/// Returns the first line that is neither blank nor a comment.
+/// Returns the first line that is neither blank nor a comment (`#`), without blanks at its ends; `None` if there is
+/// none.
 fn first_words(head: &[u8]) -> Option<&[u8]> {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
     head.split(|&b| b == b'\n').map(<[u8]>::trim_ascii).find(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
-/// Returns true if a file begins with `[table]` or `key = value`.
+/// Returns true if the first line that is neither blank nor a comment is TOML: `[table]` or `key = value`.
 fn is_toml(head: &[u8]) -> bool {
     let Some(line) = first_words(head) else { return false };
     let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.".contains(b);

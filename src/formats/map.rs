@@ -21,11 +21,12 @@ pub struct ErrorMapOrigin {
     pub ground_with: Option<[u8; 32]>,
 }
 
-/// Writes `error_map.csv`: `x_mm,y_mm,error_mm,sigma_mm,valid`, one row per node, row by row with x fastest.
+/// Writes `map` to `path` (`error_map.csv`): `x_mm,y_mm,error_mm,sigma_mm,valid`, one row per node, row by row with x
+/// fastest.
 ///
 /// A positive error is proud. `sigma_mm` is the standard uncertainty of the error due to the noise of the points, 0 if
 /// unknown. If `valid` is 0, nothing was measured at the node, and its values are those of the nearest measured node.
-/// Comments give the origin of the measurement.
+/// Comments give the origin of the measurement, and `SIMULATION` if `simulation` is true.
 ///
 /// # Errors
 /// The same as for [`super::write_deviations`].
@@ -65,30 +66,31 @@ pub struct MapNode {
 }
 
 impl MapNode {
-    /// Returns x, y and the error.
+    /// Returns x, y and the error of the node, in millimetres.
     pub fn error(&self) -> [f64; 3] {
         [self.at_mm[0], self.at_mm[1], self.error_mm]
     }
 
-    /// Returns x, y and the standard uncertainty of the error.
+    /// Returns x, y and the standard uncertainty of the error of the node, in millimetres.
     pub fn sigma(&self) -> [f64; 3] {
         [self.at_mm[0], self.at_mm[1], self.sigma_mm]
     }
 }
 
-/// Reads a file that [`write_error_map`] wrote: returns every measured node.
+/// Reads a file that [`write_error_map`] wrote. Returns its measured nodes, without those that were not measured.
 ///
 /// # Errors
-/// A file that cannot be read, other columns, rows that are not finite numbers.
+/// A file that cannot be read; other columns; a row that is not finite numbers.
 pub fn read_error_map(path: &Path) -> Result<Vec<MapNode>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     parse_error_map(path, &std::fs::read_to_string(path).map_err(unreadable)?)
 }
 
-/// Parses an error map from its text; the path names the file in messages.
+/// Parses the text of a file that [`write_error_map`] wrote. Returns its measured nodes. `path` only names the file in
+/// messages.
 ///
 /// # Errors
-/// Other columns, rows that are not finite numbers.
+/// Other columns; a row that is not finite numbers.
 pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatError> {
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
     let unexpected = |found: &str, line: u64, expected: &str| FormatError::Unexpected {
@@ -110,7 +112,7 @@ pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatEr
     Ok(nodes)
 }
 
-/// Reads a row of an error map: `Some(None)` for a node without a measurement, `None` for an invalid row.
+/// Parses a row of an error map. Returns `Some(None)` for a node that was not measured, and `None` for an invalid row.
 fn node(row: &str) -> Option<Option<MapNode>> {
     let cells: Vec<&str> = row.split(',').map(str::trim).collect();
     let [x, y, error, sigma, valid] = cells[..] else { return None };
@@ -134,8 +136,9 @@ pub struct CorrectionIdentities {
     pub replaces: [u8; 32],
 }
 
-/// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, the map as sent to the grinder. Comments give the part, the
-/// cycle, the level, the identities and the parameters that are compensated in addition.
+/// Writes `correction` to `path` (`correction.csv`): `x_mm,y_mm,correction_mm`, as sent to the grinder. Comments give
+/// the part, the cycle, the level, the identities, and `parameters`, descriptions of the machine parameters that are
+/// compensated too.
 ///
 /// # Errors
 /// The same as for [`super::write_deviations`].

@@ -9,12 +9,12 @@ use super::{metropro, sdf, whole, x3p};
 /// All formats of maps. A new format needs its own source file and an entry here.
 const FORMATS: [MapFormat; 3] = [x3p::FORMAT, sdf::FORMAT, metropro::FORMAT];
 
-/// Returns the format that the first bytes belong to; `None` if the file is not a map.
+/// Returns the map format (X3P, SDF or MetroPro) whose first bytes `head` has; `None` for any other file.
 pub(super) fn map_format(head: &[u8]) -> Option<&'static MapFormat> {
     FORMATS.iter().find(|format| (format.begins)(head))
 }
 
-/// Returns true if a file is a map of heights, whose points lie on the surface: X3P, SDF or MetroPro.
+/// Returns true if a file is a map of heights (X3P, SDF or MetroPro), judged by its first bytes.
 ///
 /// # Errors
 /// A file that cannot be read.

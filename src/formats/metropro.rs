@@ -61,7 +61,7 @@ pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
     HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [1e3 * pitch_m; 2] }, samples)
 }
 
-/// Returns true if a file begins like MetroPro.
+/// Returns true if `head`, the beginning of a file, has the magic number of MetroPro.
 fn is_metropro(head: &[u8]) -> bool {
     HEADERS.iter().any(|(magic, ..)| head.starts_with(&magic.to_be_bytes()))
 }
@@ -121,7 +121,10 @@ impl Header {
         })
     }
 
-    /// Returns the height of one step of the phase in millimetres.
+    /// Returns the height, in millimetres, of one unit of the phase values.
+    ///
+    /// # Errors
+    /// An unknown phase resolution; a scale factor, wavelength or obliquity factor that is 0 or not finite.
     fn unit_mm(&self, path: &Path) -> Result<f64, FormatError> {
         let unexpected = |place: &str, expected: &str, found: String| FormatError::Unexpected {
             path: path.to_owned(),

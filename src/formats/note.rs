@@ -66,8 +66,8 @@ impl fmt::Display for PointNote {
                     ),
                     None => write!(
                         f,
-                        "so a cut in its last number `{found}` would not show; it was read as the point ({x}, {y}, \
-                         {z}) mm; check that the file is complete"
+                        "so its last number `{found}` may be cut; it was read as the point ({x}, {y}, {z}) mm; check \
+                         that the file is complete"
                     ),
                 }
             }

@@ -33,10 +33,13 @@ pub(super) enum Evidence {
     Nothing,
 }
 
-/// Returns the value of a field, in millimetres.
+/// Parses a coordinate. Its value is not converted to another unit. `decimal` is the decimal mark of the file.
 ///
 /// A field can have a sign, digits with at most one decimal mark, and an exponent of ten. Thousands separators (the
 /// other mark) are accepted only if the decimal mark is present too, so that 2,512 is never accepted silently.
+///
+/// # Errors
+/// A field that is not a number, is not finite, exceeds [`LIMIT_MM`], or has the other decimal mark.
 pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFault> {
     let value = match (decimal, field.contains(&b','), field.contains(&b'.')) {
         (Decimal::Point, false, _) | (Decimal::Comma, false, false) => plain(field)?,
@@ -54,18 +57,19 @@ pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFa
     if is_believable(value) { Ok(value) } else { Err(NumberFault::OutOfRange) }
 }
 
-/// Returns true if a value is possible as a coordinate: not NaN, not infinite, not above the limit.
+/// Returns true if a value can be a coordinate: its magnitude is at most [`LIMIT_MM`], and it is not NaN.
 #[inline]
 pub(super) fn is_believable(value: f64) -> bool {
     value.abs() <= LIMIT_MM
 }
 
-/// Reads a number that may be NaN or infinite, for columns whose values are not used.
+/// Parses a number with a decimal point, which can be NaN or infinite; `None` if the field is not such a number.
 pub(super) fn any_number(field: &[u8]) -> Option<f64> {
     fast_float2::parse(field).ok()
 }
 
-/// Returns true if a field is a number in any notation, including NaN and infinity.
+/// Returns true if a field is a number with any decimal mark, with or without thousands separators; NaN and infinity
+/// too.
 pub(super) fn looks_numeric(field: &[u8]) -> bool {
     any_number(field).is_some() || plain_with_point(field, b',', None).is_ok() || {
         let grouped = |mark, group| plain_with_point(field, mark, Some(group)).is_ok();
@@ -73,12 +77,13 @@ pub(super) fn looks_numeric(field: &[u8]) -> bool {
     }
 }
 
-/// Returns true if a field has both a point and a comma: one is the decimal mark, the other separates thousands.
+/// Returns true if a text has both a point and a comma, so that one is the decimal mark and the other separates
+/// thousands.
 pub(super) fn has_both_marks(text: &[u8]) -> bool {
     text.contains(&b'.') && text.contains(&b',')
 }
 
-/// Returns the number of digits after the decimal mark of a number, and the number of digits in its exponent.
+/// Returns two counts for a number: its digits after the decimal mark, and the digits of its exponent.
 pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     let begins = |is: fn(&u8) -> bool| field.iter().rposition(is).map(|at| &field[at + 1..]);
     let digits = |text: Option<&[u8]>| {
@@ -89,7 +94,8 @@ pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     [digits(begins(|b| matches!(b, b'.' | b','))), digits(begins(|b| matches!(b, b'e' | b'E')))]
 }
 
-/// Returns the evidence in a field for the decimal mark.
+/// Returns what a field shows about the decimal mark of its file: which mark it is, that a comma can mean both, or
+/// nothing.
 pub(super) fn evidence(field: &[u8]) -> Evidence {
     let last = |mark: u8| field.iter().rposition(|&b| b == mark);
     let count = |mark: u8| field.iter().filter(|&&b| b == mark).count();
@@ -104,10 +110,10 @@ pub(super) fn evidence(field: &[u8]) -> Evidence {
     }
 }
 
-/// Returns a number without the blanks that group its thousands, as in 1 234,56; `None` if there are no grouping
-/// blanks.
+/// Returns a number without the blanks between its thousands: 1234,56 for 1 234,56. Returns `None` if the field has no
+/// such blanks.
 ///
-/// A grouping blank is a plain blank, a no-break space (U+00A0) or a narrow no-break space (U+202F).
+/// A plain blank, a no-break space (U+00A0) and a narrow no-break space (U+202F) are accepted.
 pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     let text = std::str::from_utf8(field).ok().filter(|text| text.len() <= LONGEST_MARKED)?;
     let is_blank = |c: char| matches!(c, ' ' | '\u{a0}' | '\u{202f}');
@@ -119,7 +125,10 @@ pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     Some(marked.bytes().filter(|&b| b != b' ').chain(fraction.bytes()).collect())
 }
 
-/// Reads a number in plain notation with a decimal point.
+/// Parses a number with a decimal point and without thousands separators.
+///
+/// # Errors
+/// [`NumberFault::Text`] if it is not a number; [`NumberFault::NotFinite`] for a NaN or infinity in letters.
 fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     let value: f64 = fast_float2::parse(field).map_err(|_| NumberFault::Text)?;
     let spelt_out = field.iter().any(|b| matches!(b, b'n' | b'N'));
@@ -127,7 +136,8 @@ fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
 }
 
-/// Reads a number with the decimal mark `mark` and, if `group` is given, with the thousands separator `group`.
+/// Parses a number that contains the decimal mark `mark`. If `group` is given, the digits before the mark must be in
+/// groups of three, separated by `group`.
 fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
     let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
     let (whole, fraction) = (&field[..at], &field[at + 1..]);
@@ -144,7 +154,7 @@ fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, Nu
     plain(&text[..length])
 }
 
-/// Returns true if the digits are in groups of three, as in -1,234,567.
+/// Returns true if `whole` is a whole number in groups of three digits, such as -1,234,567, separated by `group`.
 fn is_grouped(whole: &[u8], group: u8) -> bool {
     let digits = whole.strip_prefix(b"-").or(whole.strip_prefix(b"+")).unwrap_or(whole);
     let mut parts = digits.split(|&b| b == group);
@@ -154,7 +164,7 @@ fn is_grouped(whole: &[u8], group: u8) -> bool {
     well_begun && rest.peek().is_some() && rest.all(|part| part.len() == 3 && part.iter().all(u8::is_ascii_digit))
 }
 
-/// Returns true if the comma of a field such as 2,512 is either a decimal mark or a thousands separator.
+/// Returns true if the commas of a field, such as 2,512, can be decimal marks or thousands separators.
 fn is_one_group(field: &[u8]) -> bool {
     is_grouped(field, b',')
 }

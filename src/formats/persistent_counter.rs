@@ -11,7 +11,8 @@ pub struct PersistentCounter {
 }
 
 impl PersistentCounter {
-    /// Locks the number for this program until the value is dropped; returns `None` if another program holds the lock.
+    /// Opens the file of a number, or creates it, and locks it until the value is dropped. Returns `None` if another
+    /// program holds the lock.
     ///
     /// # Errors
     /// A file that cannot be created, written or locked.
@@ -24,7 +25,7 @@ impl PersistentCounter {
         }
     }
 
-    /// Reads the number; returns `None` if none was written yet, or if the content is not a number.
+    /// Returns the number in the file; `None` if the file is empty or its content is not a number.
     ///
     /// # Errors
     /// A file that cannot be read.
@@ -37,7 +38,7 @@ impl PersistentCounter {
         }
     }
 
-    /// Writes a new number.
+    /// Overwrites the number in the file.
     ///
     /// # Errors
     /// A file that cannot be written, for example because the disk is full.

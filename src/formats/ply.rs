@@ -44,8 +44,8 @@ pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
     parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses a PLY file, and rejects a comment that states a unit other than `units`: the unit of all coordinates, and the
-/// unit of z. The coordinates are not converted.
+/// Parses a PLY file. `units` are the units in which its coordinates are read: of all coordinates, and of z. A comment
+/// that states another unit is rejected. The coordinates are not converted.
 pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
     let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];
@@ -56,7 +56,7 @@ pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Resul
     }
 }
 
-/// Returns true if a file begins like PLY.
+/// Returns true if `head`, the beginning of a file, begins with the word `ply`.
 pub(super) fn is_ply(head: &[u8]) -> bool {
     head.strip_prefix(b"ply").is_some_and(|rest| rest.trim_ascii_start().len() < rest.len() || rest.is_empty())
 }
@@ -130,13 +130,13 @@ impl Element {
         self.properties.iter().position(|property| property.name == name)
     }
 
-    /// Returns the indices of three scalar properties; `None` if one of them does not exist.
+    /// Returns the indices of the three properties with these names; `None` if one of them does not exist or is a list.
     fn triple(&self, names: [&str; 3]) -> Option<[usize; 3]> {
         let found = names.map(|name| self.position(name).filter(|&at| self.properties[at].list.is_none()));
         if let [Some(a), Some(b), Some(c)] = found { Some([a, b, c]) } else { None }
     }
 
-    /// Returns the minimum number of bytes of one item.
+    /// Returns the smallest number of bytes that one item of this element can have in a file.
     fn min_size(&self, encoding: Encoding) -> usize {
         let size = |p: &Property| if encoding == Encoding::Ascii { 2 } else { p.list.unwrap_or(p.scalar).size() };
         self.properties.iter().map(size).sum::<usize>().max(1)
@@ -183,7 +183,10 @@ impl Header {
         Ok(header)
     }
 
-    /// Reads the next line of the header, which must have its line end.
+    /// Returns the next line of the header. `rest` is the file after the lines that were read.
+    ///
+    /// # Errors
+    /// A line without a line end; a line or a header that is too long.
     fn next_line<'b>(&mut self, path: &Path, rest: &'b [u8]) -> Result<&'b [u8], FormatError> {
         let most = rest.len().min(LONGEST_LINE);
         let end = rest[..most].iter().position(|&b| b == b'\n');
@@ -208,7 +211,10 @@ impl Header {
         Ok(line)
     }
 
-    /// Reads a line that declares an element or a property; the error is the expected text.
+    /// Reads a line of the header that declares an element or a property. `words` are the words of the line.
+    ///
+    /// # Errors
+    /// A line that is not valid; the text names what was expected.
     fn declare(&mut self, words: &[&[u8]]) -> Result<(), &'static str> {
         let text = |word: &[u8]| String::from_utf8_lossy(word).into_owned();
         let (name, list, scalar) = match *words {
@@ -234,7 +240,8 @@ impl Header {
         Ok(())
     }
 
-    /// Checks that the header declares one element vertex with x, y and z, and vertex indices of an integer type.
+    /// Checks that the header declares exactly one element `vertex` with x, y and z, and that vertex indices of faces
+    /// have an integer type.
     fn check(&self, path: &Path) -> Result<(), FormatError> {
         let fault = |expected: &str, found: &str| FormatError::Unexpected {
             path: path.to_owned(),
@@ -265,7 +272,10 @@ impl Header {
         }
     }
 
-    /// Reads all elements in the order in which they were declared.
+    /// Reads the data of all elements, in the order of their declarations. Faces of area 0 are omitted and counted.
+    ///
+    /// # Errors
+    /// Data that are not valid, that end too early, or that do not end after the last element.
     fn read(&self, path: &Path, source: &mut impl Source) -> Result<PlyFile, FormatError> {
         let mut file = PlyFile::default();
         let vertices = self.elements.iter().find(|e| e.name == "vertex").map_or(0, |e| e.count);
@@ -310,7 +320,7 @@ impl Encoding {
     }
 }
 
-/// Returns the property of an element face that lists its vertex indices; `None` if there is none.
+/// Returns the property `vertex_indices` or `vertex_index` of an element `face`; `None` if it has no such list.
 fn indices_of(face: &Element) -> Option<&Property> {
     let is_indices = |p: &&Property| p.list.is_some() && matches!(p.name.as_str(), "vertex_indices" | "vertex_index");
     face.properties.iter().find(is_indices)
@@ -325,8 +335,11 @@ struct Reading<'a> {
 }
 
 impl Reading<'_> {
-    /// Reads all items: calls `value` with the index of the property and each of its values, and `done` with the index
-    /// of the item at its end.
+    /// Reads all items of this element. Calls `value` for each number, with the index of its property and the number.
+    /// Calls `done` at the end of each item, with the index of the item.
+    ///
+    /// # Errors
+    /// Data that are not valid or end too early; the first error of `value` or `done`.
     fn each<S: Source>(
         &self,
         source: &mut S,
@@ -451,7 +464,7 @@ trait Source {
     fn begin_item(&mut self) -> Result<(), Fault>;
     fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault>;
     fn end_item(&mut self) -> Result<(), Fault>;
-    /// Checks that no content remains.
+    /// Returns an error if content remains after the last value.
     fn finish(&mut self) -> Result<(), Fault>;
     fn remaining(&self) -> usize;
     fn place(&self) -> String;
@@ -545,7 +558,7 @@ impl<'a> Words<'a> {
         Self { rest, line: &[], ended: true, number: header_lines }
     }
 
-    /// Advances to the next line that has words; returns true if there is one.
+    /// Moves to the next line that is not blank. Returns false if there is none.
     fn next_line(&mut self) -> bool {
         while !self.rest.is_empty() {
             let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());

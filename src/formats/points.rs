@@ -35,11 +35,11 @@ const SHARE: usize = 256 << 10;
 ///
 /// One point per line. Columns are separated by comma, semicolon, tab or blanks: the first point determines the
 /// separator, and all lines must use it. Blank lines and lines that begin with `#` or `//` are skipped. A header, or a
-/// comment that serves as one, names x, y and z once each. If a table has columns of both nominal and measured points,
-/// a person must choose. A table without a header has three columns, or six with unit normals after the points. Lines
-/// above a header are titles. Decimal commas are accepted if the comma does not separate columns. Thousands separators
-/// are accepted if the number also has its decimal mark. Blanks between thousands are accepted if a tab or a semicolon
-/// separates columns.
+/// comment that serves as one, names x, y and z once each. A table with columns of both nominal and measured points is
+/// rejected, unless a person chooses ([`read_points_with_notes`]). A table without a header has three columns, or six
+/// with unit normals after the points. Lines above a header are titles. Decimal commas are accepted if the comma does
+/// not separate columns. Thousands separators are accepted if the number also has its decimal mark. Blanks between
+/// thousands are accepted if a tab or a semicolon separates columns.
 ///
 /// # Errors
 /// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; a coordinate
@@ -79,7 +79,7 @@ pub fn read_points_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<N
     Cloud::new(path, length, table).read(file)
 }
 
-/// Reads a point cloud from a stream of text; `path` only names the file in messages.
+/// Reads a point cloud from a stream of text, in millimetres. `path` only names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_points`].
@@ -87,8 +87,12 @@ pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<
     Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
-/// Reads a point cloud with the columns, the units and the decimal mark that the cell states. If `decimal` is `None`,
-/// the decimal mark is detected.
+/// Parses a point cloud from the `text` of a file, and converts it to millimetres. `table` gives the columns and units,
+/// and `decimal` the decimal mark; if `decimal` is `None`, the mark is detected. `path` only names the file in
+/// messages.
+///
+/// # Errors
+/// The same as for [`read_points`]; columns that do not exist.
 pub(super) fn parse_points_with(
     path: &Path,
     text: &[u8],
@@ -125,8 +129,8 @@ struct Grouped {
 }
 
 impl Grouped {
-    /// Records a line if one of its coordinates has a separator between thousands. Does nothing if two such lines are
-    /// recorded already. `lines_before` is the number of lines before it in the text.
+    /// Counts a line in which a coordinate has thousands separators, and keeps the first such number. `lines_before` is
+    /// the number of lines before it in the text. Lines after the second one are not counted.
     fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
         if self.lines > 1 || !has_both_marks(line) {
             return;
@@ -139,7 +143,7 @@ impl Grouped {
         }
     }
 
-    /// Adds the numbers found in a share that follows `lines_before` lines.
+    /// Adds the numbers with thousands separators of `share`, a part of the text that follows `lines_before` lines.
     fn add(&mut self, share: Self, lines_before: u64) {
         self.lines += share.lines;
         let first = share.first.map(|(line, found, value)| (line + lines_before, found, value));
@@ -156,7 +160,8 @@ struct Batch {
 }
 
 impl Batch {
-    /// Fills the batch with the rest of the previous one and with more of the stream; returns the number of bytes read.
+    /// Fills this batch with `left_over`, the unread rest of the previous batch, and then from `reader`. Returns the
+    /// number of bytes from `reader`.
     fn read(&mut self, left_over: &[u8], reader: &mut impl Read) -> std::io::Result<usize> {
         self.bytes.resize(BATCH, 0);
         self.bytes[..left_over.len()].copy_from_slice(left_over);
@@ -209,8 +214,8 @@ impl<'p> Cloud<'p> {
         Ok(NotedPoints { notes, points: self.finish()? })
     }
 
-    /// Returns notes on what the file leaves ambiguous; `text` is the end of the file, in whole lines except perhaps
-    /// the last.
+    /// Returns notes on what the file leaves ambiguous. `text` is the last part of the file; its last line can be
+    /// incomplete.
     fn notes(&mut self, text: &[u8]) -> Vec<PointNote> {
         let mut notes = Vec::new();
         if let (1, Some((before, found, value_mm))) = (self.grouped.lines, self.grouped.first.take()) {
@@ -220,8 +225,8 @@ impl<'p> Cloud<'p> {
         notes
     }
 
-    /// Reports a last line that ends after a digit without a line end, and whether it has fewer digits than the lines
-    /// above.
+    /// Returns a note if the last line has a point but no line end: the file may be cut. The note states whether its
+    /// last number has fewer digits than those of the lines above. Otherwise returns `None`.
     fn note_of_end(&self, text: &[u8]) -> Option<PointNote> {
         /// Number of lines above whose digits are compared with the last line, and the minimum number required.
         const ABOVE: usize = 1000;
@@ -242,7 +247,10 @@ impl<'p> Cloud<'p> {
         Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
 
-    /// Returns the length of the whole lines in a full batch, or an error if the last line is too long.
+    /// Returns the length of the complete lines at the beginning of a full batch, in bytes.
+    ///
+    /// # Errors
+    /// A last line that is longer than any line may be; an earlier error in the lines before it.
     fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
         let text = &batch.bytes[batch.begin..];
         let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
@@ -255,7 +263,11 @@ impl<'p> Cloud<'p> {
         Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
     }
 
-    /// Parses whole lines; only the very last line of the file can lack its line end.
+    /// Parses `text`, which ends with a complete line unless it is the end of the file. `bytes_so_far` is the number of
+    /// bytes of the file up to its end.
+    ///
+    /// # Errors
+    /// The first line that is not valid; too many points; too much text before the first point.
     fn parse_lines(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
         let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
@@ -295,7 +307,8 @@ impl<'p> Cloud<'p> {
         if found > limit { Err(too_many()) } else { Ok(()) }
     }
 
-    /// Reads the lines above the first point, and returns the rest, which begins with that point.
+    /// Reads the lines above the first point until the layout is known. Returns the rest of `text`, which begins with
+    /// the first point, or is empty if there is no point in it.
     fn take_preamble<'t>(&mut self, text: &'t [u8]) -> Result<&'t [u8], FormatError> {
         let mut rest = text;
         while self.layout.is_none() && !rest.is_empty() {
@@ -324,7 +337,7 @@ impl<'p> Cloud<'p> {
         Err(self.preamble.without_points())
     }
 
-    /// Rejects a file that begins with nothing but comments.
+    /// Rejects a file in which the first `bytes` bytes have no point and are more than one batch.
     fn check_preamble(&self, bytes: u64) -> Result<(), FormatError> {
         let (path, limit, unit) = (self.path, BATCH as u64 - 1, "bytes before the first point");
         let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit };
@@ -337,7 +350,8 @@ impl<'p> Cloud<'p> {
         if bytes > limit { Err(too_large()) } else { Ok(()) }
     }
 
-    /// Distinguishes text from other content by the first bytes.
+    /// Checks that `head`, the beginning of a file, is text with one byte per character and with lines that end with LF
+    /// or CR LF.
     fn check_head(&self, head: &[u8]) -> Result<(), FormatError> {
         check_is_ours(self.path, head)?;
         if is_utf16(head) {
@@ -355,13 +369,13 @@ impl<'p> Cloud<'p> {
     }
 }
 
-/// Removes the end-of-file marks of old systems from the end of a text.
+/// Returns `text` without the end-of-file marks (0x1A) of old systems at its end.
 fn without_end_of_file(text: &[u8]) -> &[u8] {
     let end = text.iter().rposition(|b| *b != 0x1a && !b.is_ascii_whitespace()).map_or(0, |at| at + 1);
     if text[end..].contains(&0x1a) { &text[..end] } else { text }
 }
 
-/// Reads until the buffer is full or the stream ends; returns the number of bytes read.
+/// Reads from `reader` until `buffer` is full or the stream ends. Returns the number of bytes read.
 pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result<usize> {
     let mut filled = 0;
     while filled < buffer.len() {
@@ -375,8 +389,8 @@ pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result
     Ok(filled)
 }
 
-/// Returns the number of points to reserve memory for, estimated from the part of the file that is read; never more
-/// than the file can hold.
+/// Returns the number of points for which memory is reserved. It is estimated from `found`, the points in the first
+/// `bytes_so_far` bytes of a file of `length` bytes, and limited to a quarter of the maximum.
 fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     let ratio = length.max(bytes_so_far) as f64 / bytes_so_far.max(1) as f64;
     // Without this bound, a batch of very short points would reserve many times the memory that a file with a long tail
@@ -384,7 +398,7 @@ fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     ((found as f64 * ratio * 1.02) as usize).min(MAX_POINTS as usize / 4)
 }
 
-/// Splits text into shares of whole lines, one for each thread.
+/// Splits text into shares of whole lines, which threads parse in parallel.
 fn split_at_lines(text: &[u8]) -> Vec<&[u8]> {
     let mut shares = Vec::with_capacity(text.len() / SHARE + 1);
     let mut rest = text;
@@ -398,7 +412,7 @@ fn split_at_lines(text: &[u8]) -> Vec<&[u8]> {
     shares
 }
 
-/// Returns the first line without its end, its length with the end, and whether it has one.
+/// Returns the first line of `text` without its line end, its length with the line end, and true if it has a line end.
 fn first_line(text: &[u8]) -> (&[u8], usize, bool) {
     match text.iter().position(|&b| b == b'\n') {
         Some(end) => (text[..end].strip_suffix(b"\r").unwrap_or(&text[..end]), end + 1, true),
@@ -438,7 +452,8 @@ fn read_share(text: &[u8], layout: &Layout) -> Share {
     share
 }
 
-/// Reads a line of three plain numbers, perhaps with more columns, and its line end; returns `None` for anything else.
+/// Parses the first line of `text` if its first three columns are plain numbers and it has a line end. Returns the
+/// point and the length of the line. Returns `None` for any other line, which [`careful_line`] then reads.
 #[inline]
 fn quick_line(text: &[u8], layout: &Layout) -> Option<(Point, usize)> {
     let separator = layout.separator;
@@ -478,8 +493,8 @@ fn skip_separator(text: &[u8], at: usize, separator: Separator) -> Option<usize>
     (text.get(end) == Some(&separator.byte())).then(|| skip_padding(text, end + 1, separator))
 }
 
-/// Returns the end of a line after counting its columns; returns `None` if the count is wrong or the columns are not
-/// plain.
+/// Returns the position after the last column of a line; `at` is the position after its third column. Returns `None` if
+/// the line has too few columns, or a column with quotes or control characters.
 fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
     for _ in 3..layout.count {
         at = skip_separator(text, at, layout.separator)?;
@@ -494,7 +509,7 @@ fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
     Some(skip_padding(text, at, layout.separator))
 }
 
-/// Rejects a line with content that no line can have.
+/// Rejects a line that is longer than [`LONGEST_LINE`] or has a zero byte. `number` is its line number.
 fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> {
     if line.len() > LONGEST_LINE {
         return Err(FormatError::LineTooLong { path: path.to_owned(), line: number, limit_bytes: LONGEST_LINE });
@@ -505,7 +520,12 @@ fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> 
     Ok(())
 }
 
-/// Reads any line: returns a point, `None` for a blank line or a comment, or the error to report.
+/// Parses any line of data. Returns `None` for a blank line or a comment. `number` is its line number, and `ended` is
+/// true if it has a line end.
+///
+/// # Errors
+/// Another number of columns than in `layout`; a coordinate that is not a number; a line that is cut at the end of the
+/// file.
 fn careful_line(
     path: &Path,
     number: u64,

@@ -25,24 +25,27 @@ const NAMESPACE: &str = "http://qifstandards.org/xsd/qif3";
 /// Prefix of the names of Regrind's attributes.
 const OURS: &str = "regrind ";
 
-/// Returns true if a file is XML.
+/// Returns true if `head`, the beginning of a file, begins like an XML document.
 pub(super) fn is_xml(head: &[u8]) -> bool {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
     head.starts_with(b"<?xml") || head.starts_with(b"<QIFDocument") || head.starts_with(b"<!--")
 }
 
-/// Reads what a document states about its measurement, such as the plan and the cycle.
+/// Reads what a QIF document states about its measurement in attributes named `regrind ...`, such as the plan and the
+/// cycle.
 ///
 /// # Errors
-/// A file that is not a document of QIF 3; a statement with an impossible value.
+/// A file that is not a QIF 3 document; a statement with an impossible value.
 pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     with_root(path, text, |root| Qif { path, root }.statements())
 }
 
-/// Reads the points of a document.
+/// Reads the points of a QIF document. If the document does not state whether its coordinates are centres or contacts,
+/// `content` decides. `path` only names the file in messages.
 ///
 /// # Errors
-/// A file that is not a document of QIF 3; no unit, no points; text in place of a number, with its line.
+/// A file that is not a QIF 3 document; a document without a unit or without points; text in place of a number;
+/// statements that contradict each other or `content`.
 pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     with_root(path, text, |root| Qif { path, root }.points(content))
 }
@@ -137,7 +140,10 @@ impl Qif<'_, '_, '_> {
         self.root.descendants().filter(move |node| node.has_tag_name((NAMESPACE, name)))
     }
 
-    /// Returns the length of the unit, in millimetres.
+    /// Returns the unit of length of the document, in millimetres.
+    ///
+    /// # Errors
+    /// A document without a unit of length, or with one that is not a multiple of the metre.
     fn unit_mm(&self) -> Result<f64, FormatError> {
         let missing = || FormatError::Missing {
             path: self.path.to_owned(),
@@ -203,8 +209,11 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Stores whether the points of a set are contacts or centres, and the radius of the probe; rejects a set that
-    /// differs from the sets before it.
+    /// Stores, from `set`, whether its points are contacts or centres, and the radius of the probe. `unit_mm` is the
+    /// unit of the document in millimetres.
+    ///
+    /// # Errors
+    /// A set that differs from the sets before it; a value that is not valid.
     fn what_they_are(&self, set: Node<'_, '_>, unit_mm: f64, found: &mut QifPoints) -> Result<(), FormatError> {
         if let Some(compensated) = child(set, "Compensated") {
             let says = match compensated.text().unwrap_or_default().trim() {
@@ -231,7 +240,8 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Reads measured point features, each with the name of its item.
+    /// Reads the points of all measured point features, and the name of the feature item of each. `unit_mm` is the unit
+    /// of the document in millimetres.
     fn features(&self, unit_mm: f64) -> Result<QifPoints, FormatError> {
         let name = |node: Node<'_, '_>| child(node, "FeatureName").and_then(|name| name.text()).map(str::to_owned);
         let items = self.named("PointFeatureItem");

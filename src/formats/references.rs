@@ -38,25 +38,28 @@ pub struct References {
 }
 
 impl References {
-    /// Returns the name of a point, or its number if it has no name.
+    /// Returns the name of the reference point with this index (from 0). Without a name, returns its number, such as
+    /// `number 1`.
     pub fn name(&self, index: usize) -> String {
         self.points.get(index).and_then(|p| p.name.clone()).unwrap_or_else(|| format!("number {}", index + 1))
     }
 }
 
-/// Reads reference points from YAML (`.yaml`, `.yml`) or from any point file.
+/// Reads reference points from a YAML file (`.yaml`, `.yml`) or from any point file.
 ///
-/// `group` names the list in a YAML file with several; without it the file must contain exactly one.
+/// A YAML file can have several named lists of points; `group` names the one to read. If `group` is `None`, the file
+/// must have exactly one list.
 ///
 /// # Errors
-/// A file that cannot be read; a group that does not exist; a point whose coordinates are not finite numbers in
-/// millimetres.
+/// A file that cannot be read; a list that does not exist; a point whose coordinates are not finite numbers in
+/// millimetres; a name that occurs twice.
 pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, FormatError> {
     let bytes = whole::open(path)?.read_all(path, MAX_BYTES)?;
     parse_references(path, &bytes, group)
 }
 
-/// Reads reference points from the bytes of a file; `path` determines the format and names the file in messages.
+/// Reads reference points from the `bytes` of a file. The extension of `path` shows whether they are YAML; `path` also
+/// names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_references`].
@@ -115,7 +118,11 @@ fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Refer
     }
 }
 
-/// Returns the group of points: the one with the given name, the only one, or the whole file.
+/// Returns the node of the list of points named `group`, or of the only list if `group` is `None`. A file without names
+/// is one list itself.
+///
+/// # Errors
+/// No list, or more than one, that fits.
 fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, FormatError> {
     let Tree::Mapping(pairs) = &root.content else { return Ok(root) };
     let named: Vec<(&str, &Node)> = pairs
@@ -137,7 +144,7 @@ fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n 
     }
 }
 
-/// Returns the position in a node: three numbers, or a list that begins with them.
+/// Returns the position that a node holds: a list of three numbers, or a list whose first entry is such a list.
 fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     let mut inner = node;
     while let Tree::List(nodes) = &inner.content
@@ -156,7 +163,7 @@ fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     Ok(Point::new(number(x)?, number(y)?, number(z)?))
 }
 
-/// Builds the tree of a YAML file; only the first document is used.
+/// Parses a YAML file into a tree of nodes. Only the first document in the file is used.
 fn tree(path: &Path, text: &str) -> Result<Node, FormatError> {
     let mut open: Vec<Node> = Vec::new();
     for event in Parser::new_from_str(text) {

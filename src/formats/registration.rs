@@ -35,10 +35,10 @@ pub struct DeviationRow {
     pub used: bool,
 }
 
-/// Writes `deviations.csv`: `x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used`, then one row per measured point in the order
-/// given.
+/// Writes `rows` to `path` (`deviations.csv`): the header `x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used`, then one row per
+/// measured point in the order given.
 ///
-/// Numbers are written so that reading them returns the same bits; `used` is 1 or 0.
+/// `used` is 1 or 0. The numbers have enough digits that reading them gives exactly the same values.
 ///
 /// # Errors
 /// A row that contains NaN or an infinity; a file that cannot be written. An existing file of that name is then
@@ -104,9 +104,9 @@ pub fn write_column(path: impl AsRef<Path>, header: &str, values: &[f64]) -> Res
     write_rows(path.as_ref(), header, values, |value| ([*value], None))
 }
 
-/// Writes a value as indented JSON.
+/// Writes a value as indented JSON to `path`, completely or not at all.
 ///
-/// JSON has no NaN: a field that is NaN becomes `null`. The caller must make sure that there is none.
+/// JSON has no NaN: a number that is NaN or infinite becomes `null`. The caller must make sure that there is none.
 ///
 /// # Errors
 /// A value that JSON cannot express, such as a map whose keys are not text; a file that cannot be written.
@@ -147,7 +147,11 @@ pub fn try_writing(folder: &Path) -> Result<(), FormatError> {
     Draft::create(&folder.join("probe")).map(drop)
 }
 
-/// Writes rows of N numbers, optionally with a flag.
+/// Writes a header and `rows`, comma-separated, to `path`. `cells` returns the numbers of a row, and optionally a flag,
+/// which is written last as 1 or 0.
+///
+/// # Errors
+/// A row with NaN or an infinity; a file that cannot be written.
 pub(super) fn write_rows<T: Sync, const N: usize>(
     path: &Path,
     header: &str,
@@ -204,7 +208,7 @@ impl<'p> Draft<'p> {
         Self::create_by(path, |temporary| OpenOptions::new().write(true).create_new(true).open(temporary))
     }
 
-    /// Creates a draft that only its owner can read.
+    /// Creates a draft of the file `path` that only its owner can read.
     fn create_private(path: &'p Path) -> Result<Self, FormatError> {
         Self::create_by(path, system::create_owners)
     }
@@ -238,7 +242,7 @@ impl<'p> Draft<'p> {
         self.file.write_all(bytes).map_err(failed)
     }
 
-    /// Flushes the bytes to the disk, renames the file, then flushes the new name to the disk.
+    /// Flushes the bytes to the disk, renames the draft to the name of the file, then flushes the new name to the disk.
     pub(super) fn publish(mut self) -> Result<(), FormatError> {
         let failed = self.failed("flushing it to the disk");
         self.file.flush().map_err(&failed)?;
@@ -258,7 +262,7 @@ impl Drop for Draft<'_> {
     }
 }
 
-/// Flushes the folder of a path to the disk, so that a rename of the path is durable.
+/// Flushes the folder that contains `path` to the disk, so that a new name of the file lasts after a power failure.
 ///
 /// # Errors
 /// A folder that cannot be flushed to the disk.

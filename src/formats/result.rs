@@ -124,10 +124,12 @@ pub struct ResultFile {
     pub statements: Statements,
 }
 
-/// Checks that the last line of a text has a line end. Without one, the file may be cut in its last number.
+/// Checks that the last line of `text`, a result file, has a line end. Without one, the file may be cut in its last
+/// number. Formats that have another end mark (PLY, maps, QIF, DMIS) are always accepted. `path` only names the file in
+/// messages.
 ///
 /// # Errors
-/// A last line that is cut.
+/// A last line without a line end.
 pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
     // An XML or DMIS document has its own end mark.
     let is_document = ply::is_ply(text) || map_format(text).is_some() || qif::is_xml(text) || dmis::is_dmis(text);
@@ -139,18 +141,19 @@ pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
     Err(FormatError::CutLine { path: path.to_owned(), line, found })
 }
 
-/// Reads the bytes of a result file.
+/// Reads all bytes of a result file.
 ///
 /// # Errors
-/// A file that is not readable or too large.
+/// A file that cannot be read, or that is larger than 512 MiB.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
     whole::open(path)?.read_all(path, MAX_BYTES)
 }
 
-/// Reads the statements of a file, without its points.
+/// Reads what a result file states about its measurement, such as the part and the cycle, without its points. `path`
+/// only names the file in messages.
 ///
 /// # Errors
-/// A statement with an impossible value.
+/// A statement with an impossible value; a QIF or DMIS file that is not valid.
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     if map_format(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
@@ -183,7 +186,11 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
 }
 
 impl Statements {
-    /// Reads one statement; any other comment is ignored.
+    /// Stores the statement `value` of the property `key`, such as the cycle. Ignores any other key, because it is a
+    /// comment. `line` is the line number.
+    ///
+    /// # Errors
+    /// A value that is impossible for this property.
     pub(super) fn read_statement(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
         let wrong = |key, expected| FormatError::Statement {
             path: path.to_owned(),
@@ -233,10 +240,11 @@ impl Statements {
     }
 }
 
-/// Parses the text of a result file; `path` only names the file in messages.
+/// Parses the `text` of a result file. `content` gives the properties that the cell states about its files. `path` only
+/// names the file in messages.
 ///
 /// # Errors
-/// The same as for [`super::read_points`]; statements and columns that contradict the cell or each other.
+/// The same as for [`super::read_points`]; statements and columns that contradict `content` or each other.
 pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
@@ -337,8 +345,8 @@ struct OtherColumns {
     probe_radius_mm: Option<f64>,
 }
 
-/// Returns the indices of the other columns that the header names: index, name, enabled, radius and diameter of the
-/// probe.
+/// Returns the index in `names` of each column other than the coordinates: index, name, enabled, radius and diameter of
+/// the probe. `None` for a column that the header does not name.
 fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
     let wanted: [&[&str]; 5] = [
         &["index", "target"],
@@ -351,7 +359,10 @@ fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
 }
 
 impl OtherColumns {
-    /// Reads the lines again for the columns that the header names; the points come from the same lines.
+    /// Reads the columns other than the coordinates from the `text` of a table. `points` is the number of its points.
+    ///
+    /// # Errors
+    /// An index that is not a whole number; more than one probe; a probe of an impossible size.
     fn read(
         path: &Path,
         text: &[u8],
@@ -410,7 +421,10 @@ impl OtherColumns {
     }
 }
 
-/// Reads the size of a probe in the number notation of the file, or else with a decimal point.
+/// Parses the size of a probe, in millimetres, with the decimal mark of the file, or else with a decimal point.
+///
+/// # Errors
+/// A text that is not a number above 0.
 fn probe_size_mm(path: &Path, layout: &Layout, text: &[u8]) -> Result<f64, FormatError> {
     let size_mm = coordinate(&layout.separator.ungrouped(text), layout.decimal)
         .or_else(|_| coordinate(text, Decimal::Point))
@@ -438,7 +452,8 @@ fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, FormatError
     })
 }
 
-/// Stores the first probe of a file, and rejects any other one.
+/// Stores `field`, the text for the size of the probe in a row, if it is the first one. Rejects a text that differs
+/// from the first one.
 fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), FormatError> {
     match first {
         Some(first) if first != field => {

@@ -56,7 +56,7 @@ fn check_version(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     Err(unexpected(path, "byte 0", "aISO-1.0 or bISO-1.0", excerpt(&head[..head.len().min(8)])))
 }
 
-/// Returns true if a file begins like SDF.
+/// Returns true if `head`, the beginning of a file, is that of SDF version 1.0, binary or text.
 fn is_sdf(head: &[u8]) -> bool {
     let version = head.get(..8).unwrap_or_default();
     matches!(version.first(), Some(b'a' | b'b')) && version[1..] == b"ISO-1.0"[..]
@@ -141,7 +141,8 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     header.map(path, raw.chunks_exact(size).map(|at| Ok(binary_value(kind, at))))
 }
 
-/// Reads a height; returns `None` if it was not measured.
+/// Parses a height as a number of steps; `at` holds its bytes, and `kind` is the data type of SDF, 0 to 7. Returns
+/// `None` if it was not measured.
 fn binary_value(kind: u8, at: &[u8]) -> Option<f64> {
     let two = || at.first_chunk().copied().unwrap_or_default();
     let four = || at.first_chunk().copied().unwrap_or_default();

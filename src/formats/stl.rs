@@ -63,7 +63,8 @@ pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     }
 }
 
-/// Returns true if the beginning and the length of a file prove that it is STL.
+/// Returns true if a file with the beginning `head` and `length` bytes is STL: it begins like ascii STL, or its length
+/// matches the facet count of a binary header.
 pub(super) fn is_stl(head: &[u8], length: u64) -> bool {
     looks_ascii(head) || (facets(head).is_some_and(|n| n > 0) && binary_length(head) == Some(length))
 }
@@ -99,7 +100,7 @@ fn kind(path: &Path, head: &[u8], length: u64) -> Result<Kind, FormatError> {
     })
 }
 
-/// Returns the number of facets that a binary header announces.
+/// Returns the number of facets that a binary header states; `None` if `head` is shorter than a binary header.
 fn facets(head: &[u8]) -> Option<u32> {
     head.get(80..BINARY_HEADER).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes)
 }
@@ -108,7 +109,7 @@ fn binary_length(head: &[u8]) -> Option<u64> {
     facets(head).map(|n| BINARY_HEADER as u64 + u64::from(n) * BINARY_FACET as u64)
 }
 
-/// Returns true if a file begins with `solid` and continues as text.
+/// Returns true if `head`, the beginning of a file, is the word `solid` followed by text without control characters.
 fn looks_ascii(head: &[u8]) -> bool {
     let text = head.trim_ascii_start();
     let solid = text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
@@ -164,7 +165,10 @@ struct Words<'a> {
 }
 
 impl<'a> Words<'a> {
-    /// Returns the next word; `expected` is used in the message if there is none.
+    /// Returns the next word. `expected` names, in the message, what should be there.
+    ///
+    /// # Errors
+    /// The end of the file.
     fn next(&mut self, expected: &str) -> Result<&'a [u8], FormatError> {
         let blanks = self.rest.iter().take_while(|b| b.is_ascii_whitespace()).count();
         self.line += self.rest[..blanks].iter().filter(|&&b| b == b'\n').count() as u64;
@@ -178,7 +182,10 @@ impl<'a> Words<'a> {
         Ok(&word[..end])
     }
 
-    /// Reads a word that must be one of `wanted`, and returns its index in `wanted`.
+    /// Reads the next word, and returns its index in `wanted`. Capital and small letters are equal.
+    ///
+    /// # Errors
+    /// A word that is not in `wanted`.
     fn one_of(&mut self, wanted: [&str; 3]) -> Result<usize, FormatError> {
         let word = self.next(wanted[0])?;
         let found = wanted.iter().position(|w| word.eq_ignore_ascii_case(w.as_bytes()));
@@ -191,8 +198,8 @@ impl<'a> Words<'a> {
         if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
     }
 
-    /// Returns the error for `word`. If it is the beginning of one of the `wanted` words at the end of the file, the
-    /// error is that the file is cut.
+    /// Returns the error for `word`, which is not one of `wanted`. At the end of the file, the beginning of one of
+    /// these words means that the file is cut.
     fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
         let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));
@@ -202,13 +209,13 @@ impl<'a> Words<'a> {
         FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(word) }
     }
 
-    /// Skips the name after `solid` and `endsolid`.
+    /// Skips the rest of the line: the name of the solid after `solid` and `endsolid`.
     fn skip_line(&mut self) {
         let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
         self.rest = &self.rest[end..];
     }
 
-    /// Reads a facet after its first word.
+    /// Reads the rest of a facet, after the word `facet`, and returns its corners.
     fn facet(&mut self) -> Result<[Point; 3], FormatError> {
         self.expect("normal")?;
         for _ in 0..3 {

@@ -23,7 +23,10 @@ pub(super) struct Opened {
     pub(super) head: Vec<u8>,
 }
 
-/// Opens a file and reads its beginning.
+/// Opens a file and reads its first bytes, at most 64 KiB.
+///
+/// # Errors
+/// A file that cannot be read.
 pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let mut file = system::open_to_read(path).map_err(unreadable)?;
@@ -34,16 +37,19 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     Ok(Opened { file, length, head })
 }
 
-/// Reads a complete file, if it has at most `limit` bytes.
+/// Reads all bytes of a file.
 ///
 /// # Errors
-/// A file that cannot be read or is too large.
+/// A file that cannot be read, or that has more than `limit` bytes.
 pub fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     open(path)?.read_all(path, limit)
 }
 
 impl Opened {
-    /// Returns all bytes of the file, if there are at most `limit`.
+    /// Returns all bytes of the file; `path` only names it in messages.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or that has more than `limit` bytes.
     pub(super) fn read_all(mut self, path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
         let too_large = |found| FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "bytes" };
         if self.length > limit {
@@ -57,8 +63,8 @@ impl Opened {
         if found > limit { Err(too_large(found)) } else { Ok(self.head) }
     }
 
-    /// Parses the beginning of the file first and then the whole file, so that a gigabyte of invalid content costs
-    /// neither time nor memory.
+    /// Parses a file with the function `parse`. Calls it first with the first 64 KiB of a longer file. A fault found
+    /// there is returned at once, so that a gigabyte of invalid content costs neither time nor memory.
     pub(super) fn parse<T>(
         self,
         path: &Path,
@@ -74,7 +80,7 @@ impl Opened {
     }
 }
 
-/// Returns true if three corners form a triangle of area 0.
+/// Returns true if the triangle with these corners has an area of 0.
 pub(super) fn is_degenerate(corners: [&Point; 3]) -> bool {
     let [a, b, c] = corners;
     (b - a).cross(&(c - a)).norm_squared() == 0.0

@@ -14,8 +14,8 @@ pub(super) struct Beyond {
     pub(super) found: String,
 }
 
-/// Returns the first limit that a document exceeds; `None` if it exceeds none. The document is scanned once and need
-/// not be XML.
+/// Returns the first limit for XML documents that `text` exceeds (attributes, namespaces or nested elements); `None` if
+/// it exceeds none. The text is scanned once and need not be valid XML.
 pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     let bytes = text.as_bytes();
     let (mut at, mut depth, mut namespaces) = (0, 0_usize, 0);

@@ -25,7 +25,7 @@ pub struct Artefact {
 }
 
 impl Artefact {
-    /// Syncs a file that was written into a run folder to the disk, and returns its name, length and hash. This takes
+    /// Flushes the file `name` of a run folder to the disk, reads it, and returns its name, length and hash. This takes
     /// time for a large file.
     ///
     /// # Errors
@@ -36,7 +36,7 @@ impl Artefact {
         describe(&path, name)
     }
 
-    /// Reads a file of the run folder, and returns its content if it matches the recorded length and hash.
+    /// Returns the content of the file in the run folder `folder`, if its length and its hash are those on record.
     ///
     /// # Errors
     /// The file cannot be read; [`JournalError::OtherFile`] if its content differs from the record.
@@ -51,8 +51,10 @@ impl Artefact {
     }
 }
 
-/// Returns the path of a file within a run folder. Rejects a name that can lead out of the folder, and the names of the
-/// journal's own files.
+/// Returns the path of the file `name` in a run folder.
+///
+/// # Errors
+/// [`JournalError::Name`] for a name that can lead out of the folder, or that is a file of the journal itself.
 pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalError> {
     let plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     let own = [DATABASE, ANCHOR, LOCK].contains(&name) || name.starts_with(&format!("{DATABASE}-"));
@@ -62,8 +64,8 @@ pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalE
     Ok(folder.join(name))
 }
 
-/// Returns the name of a file while it is incomplete. A temporary file left by a crash stays until the next write
-/// overwrites it.
+/// Returns the temporary name of a file while it is written. A temporary file that a crash left stays until the next
+/// write of the same file overwrites it.
 pub(super) fn temporary_name(name: &str) -> String {
     format!(".{name}.tmp")
 }
@@ -92,7 +94,7 @@ fn fill(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Reads a file and returns its name, length and hash.
+/// Reads the file at `path`, and returns its length, its hash and the given `name`.
 pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError> {
     let failed = JournalError::file(path, "reading it");
     let mut file = File::open(path).map_err(&failed)?;
@@ -111,7 +113,7 @@ pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError
     Ok(Artefact { name: name.to_owned(), bytes, sha256: hex(&digest.finalize()) })
 }
 
-/// Syncs to the disk a file that another part of the program wrote, and its folder.
+/// Flushes a file that another part of the program wrote, and the folder that contains it, to the disk.
 pub(super) fn sync_file(path: &Path) -> Result<(), JournalError> {
     system::sync_file(path).map_err(JournalError::file(path, "flushing it to the disk"))?;
     path.parent().map_or(Ok(()), sync_folder)

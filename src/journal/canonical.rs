@@ -50,7 +50,7 @@ fn write_value(text: &mut String, value: &Value) {
     }
 }
 
-/// Appends a string in its JSON form.
+/// Appends a string to `text` as JSON: in quotes and with escapes.
 pub(super) fn write_string(text: &mut String, string: &str) {
     let is_plain = |byte: u8| byte >= 0x20 && byte != b'"' && byte != b'\\';
     if string.bytes().all(is_plain) {
@@ -66,8 +66,8 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Returns the hash of a record: the SHA-256 of [`DOMAIN`], the hash of the record before, a line feed, and the text of
-/// this record without hashes.
+/// Returns the hash of a record: the SHA-256 of [`DOMAIN`], the hash `prev_hash` of the record before, a line feed, and
+/// `text`, the text of this record without hashes. It has 64 lowercase hexadecimal digits.
 pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     let mut digest = Sha256::new();
     for part in [DOMAIN, prev_hash, "\n", text] {
@@ -76,7 +76,8 @@ pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     hex(&digest.finalize())
 }
 
-/// Returns the `N` bytes of `2 N` hexadecimal digits. Accepts lowercase digits only, so that one value has one text.
+/// Converts `2 N` lowercase hexadecimal digits to `N` bytes. Returns `None` for another number of digits or other
+/// characters. Uppercase digits are rejected, so that each value has only one text.
 pub(super) fn unhex<const N: usize>(digits: &str) -> Option<[u8; N]> {
     let nibble = |digit: u8| match digit {
         b'0'..=b'9' => Some(digit - b'0'),

@@ -2,15 +2,16 @@
 
 use std::time::SystemTime;
 
-/// Returns a time of day in UTC, RFC 3339, always with nine digits after the decimal point, so that the texts sort in
-/// the order of their times.
+/// Formats a time as UTC (RFC 3339), always with nine digits after the decimal point, so that the texts sort in the
+/// order of their times.
 ///
-/// Returns the beginning of 1970 for every earlier time, which a clock that was never set can show.
+/// A time before 1970, which a clock that was never set can show, is replaced by the beginning of 1970.
 pub fn utc(at: SystemTime) -> String {
     humantime::format_rfc3339_nanos(at.max(SystemTime::UNIX_EPOCH)).to_string()
 }
 
-/// Returns a time of day in the format of [`utc`], without fractions of a second.
+/// Formats a time as UTC (RFC 3339) without fractions of a second. A time before 1970 is replaced by the beginning of
+/// 1970.
 pub fn utc_to_the_second(at: SystemTime) -> String {
     humantime::format_rfc3339_seconds(at.max(SystemTime::UNIX_EPOCH)).to_string()
 }

@@ -12,9 +12,9 @@ use super::verify::Anchor;
 use super::{ANCHOR, open, system};
 
 impl Record {
-    /// Parses a record from its hashed text, its own hash and the hash of the record before it. Returns `None` if the
-    /// text is not byte for byte a text that the journal writes. Does not check that the hash matches the text:
-    /// `verify` does.
+    /// Parses a record from its hashed text ([`Record::text`]), and adds the given hashes: its own and that of the
+    /// record before it. Returns `None` if the text is not byte for byte a text that the journal writes. Does not check
+    /// that the hash matches the text: [`verify`](super::verify()) does.
     pub fn from_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
         let value: Value = serde_json::from_str(text).ok()?;
         let word = |key: &str| value[key].as_str().map(str::to_owned);
@@ -42,11 +42,11 @@ impl Record {
     }
 }
 
-/// Creates a run folder and writes the given records and anchor into it. The records are stored as given: `verify`
-/// checks whether they are authentic. [`restore_file`] adds the recorded files.
+/// Creates a run folder, and writes `records` and `anchor` into it as they are. [`verify`](super::verify()) checks
+/// whether they are authentic, and [`restore_file`] adds the recorded files.
 ///
 /// # Errors
-/// The folder is in use or cannot be written; two records have the same number, or a number is missing between two.
+/// The folder is not empty or cannot be written; the numbers of the records do not follow each other.
 pub fn restore(
     folder: &Path,
     records: impl IntoIterator<Item = Record>,
@@ -72,7 +72,7 @@ pub fn restore(
     }
 }
 
-/// Writes a recorded file back into a run folder.
+/// Writes a recorded file with its `content` back into a run folder, under the name on record.
 ///
 /// # Errors
 /// The name leads out of the folder or is a file of the journal itself, or the folder cannot be written.

@@ -33,8 +33,8 @@ pub enum JournalError {
     Busy { path: PathBuf },
     /// Another run has the machine.
     #[error(
-        "{address}: another run uses this machine: {holder}; wait for it, or stop it with `regrind stop` and its \
-         folder"
+        "{address}: another run uses this machine: {holder}; wait until it ends, or stop it with `regrind stop` and \
+         the folder of that run"
     )]
     MachineTaken { address: String, holder: String },
     /// The folder for the locks of machines is not safe to use: another user could have created it.
@@ -71,8 +71,8 @@ pub enum JournalError {
     Broken { path: PathBuf, seq: u64, what: String },
     /// The record is intact, but it is not signed with one of the given keys.
     #[error(
-        "{path}: the record is complete, but its author is not proven: {what}; give the keys of all users of the \
-         run, or omit --key, which proves no author"
+        "{path}: the record is intact, but its author is not proven: {what}; give with --key the public keys of all \
+         who signed the run, or omit --key: then the author is not checked"
     )]
     NoAuthor { path: PathBuf, what: String },
     /// The content of a recorded file differs from the record.
@@ -95,15 +95,17 @@ pub enum JournalError {
     Key { path: PathBuf, what: &'static str },
     /// Other users can read or exchange the audit key.
     #[error(
-        "{path}: others can read or replace this audit key ({how}): {remedy}, and make another key if others may \
-         have this one"
+        "{path}: other users can read or replace this audit key ({how}); {remedy}; if somebody may have a copy of \
+         it, make another one with `regrind audit key`"
     )]
     KeyIsOpen { path: PathBuf, how: String, remedy: String },
     /// The name could lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
     Name { name: String },
     /// The file is already on record with a different content.
-    #[error("{path}: this file is on record with another content; recorded files are never overwritten")]
+    #[error(
+        "{path}: this file is on record with another content; recorded files are never overwritten; write it under another name"
+    )]
     Recorded { path: PathBuf },
     /// The entry is not allowed at this place of the journal.
     #[error("a record of kind {kind} {what}; this is a fault of the program: report it")]
@@ -114,13 +116,13 @@ pub enum JournalError {
 }
 
 impl JournalError {
-    /// Returns true if the disk is full.
+    /// Returns true if the error is a full disk.
     pub fn is_disk_full(&self) -> bool {
         matches!(self, Self::DiskFull { .. })
     }
 
-    /// Returns true if the same write can succeed later: the disk is full, busy or out of reach, and the entry itself
-    /// is valid.
+    /// Returns true if the same write can succeed later, because its cause can pass: the disk is full, busy or out of
+    /// reach, or a file of the journal is missing.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. } | Self::Gone { .. })
     }

@@ -28,15 +28,15 @@ const MAX_BYTES: u64 = 4096;
 pub struct PublicKey([u8; 32]);
 
 impl PublicKey {
-    /// Returns the fingerprint that two people compare: the first 16 hexadecimal digits of the SHA-256 of the key, in
-    /// groups of four.
+    /// Returns the fingerprint of the key, which two people can compare: the first 16 hexadecimal digits of the SHA-256
+    /// of the key, in groups of four.
     pub fn fingerprint(&self) -> String {
         let digits = hex(&Sha256::digest(self.0)[..8]);
         (0..4).map(|k| &digits[4 * k..4 * k + 4]).collect::<Vec<_>>().join(" ")
     }
 
-    /// Returns true if the owner of this key signed a message: Ed25519 after RFC 8032. The signature has 128 lowercase
-    /// hexadecimal digits.
+    /// Returns true if `signature` is the signature of `message` by the owner of this key (Ed25519, RFC 8032). It must
+    /// have 128 lowercase hexadecimal digits; any other text gives false.
     pub fn has_signed(&self, message: &[u8], signature: &str) -> bool {
         let Some(signature) = unhex::<64>(signature).map(Signature::new) else { return false };
         ed25519_compact::PublicKey::new(self.0).verify(message, &signature).is_ok()
@@ -98,7 +98,7 @@ impl Debug for AuditKey {
 }
 
 impl AuditKey {
-    /// Returns a new key from the random numbers of the operating system.
+    /// Creates a new key from random numbers of the operating system.
     pub fn new() -> Self {
         Self::from_seed(rand::random())
     }
@@ -107,22 +107,22 @@ impl AuditKey {
         Self { pair: KeyPair::from_seed(Seed::new(seed)) }
     }
 
-    /// Returns the public half.
+    /// Returns the public key that belongs to this key.
     pub fn public(&self) -> PublicKey {
         PublicKey(*self.pair.pk)
     }
 
-    /// Signs a message and returns the signature as 128 hexadecimal digits. Deterministic: the same message always
-    /// gives the same signature. The first line of each message states its purpose, so that a signature for one purpose
-    /// is never valid for another.
+    /// Returns the signature of a message (Ed25519) as 128 hexadecimal digits. The same message always gives the same
+    /// signature. The first line of `message` must state its purpose, so that a signature for one purpose is not valid
+    /// for another.
     pub fn sign(&self, message: &[u8]) -> String {
         hex(self.pair.sk.sign(message, None).as_ref())
     }
 
-    /// Reads the key from a file.
+    /// Reads the key from its file.
     ///
     /// # Errors
-    /// The file does not exist, other users can read or exchange it, or it contains no valid key.
+    /// The file does not exist; other users can read the file, or replace it in its folder; it contains no valid key.
     pub fn read(path: &Path) -> Result<Self, JournalError> {
         let failed = JournalError::file(path, "reading it");
         let broken = |what| JournalError::Key { path: path.to_owned(), what };
@@ -153,11 +153,11 @@ impl AuditKey {
         }
     }
 
-    /// Creates a key and its file, which only the owner can read. Creates the folder if it does not exist. Never
-    /// overwrites an existing file.
+    /// Creates a new key, and writes it to the file `path`, which only the owner can read. Creates the folder of the
+    /// file if it does not exist.
     ///
     /// # Errors
-    /// A file of that name exists, the folder cannot be written, or the disk is full.
+    /// A file of that name exists, and stays unchanged; the folder cannot be written; the disk is full.
     pub fn make(path: &Path) -> Result<Self, JournalError> {
         let key = Self::new();
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));

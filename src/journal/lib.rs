@@ -69,7 +69,8 @@ pub const LOCK: &str = ".lock";
 /// record was added in between.
 pub type Stamp = [Option<(SystemTime, u64)>; 2];
 
-/// Returns the stamp of a run folder.
+/// Returns the modification time and the length of the database of a run folder and of its log. They show whether a
+/// record was added since an earlier call. A file that does not exist gives `None`.
 pub fn stamp(folder: &Path) -> Stamp {
     [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
         let metadata = std::fs::metadata(folder.join(name)).ok()?;
@@ -89,7 +90,7 @@ impl Reader {
     /// Opens the journal of a run folder for reading.
     ///
     /// # Errors
-    /// The folder has no journal, or the file is not a journal.
+    /// The folder has no journal; the file is not a journal, or was written by a later version.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         Ok(Self { connection: open::read_only(&folder)?, folder })
@@ -100,7 +101,7 @@ impl Reader {
         &self.folder
     }
 
-    /// Returns the records from number `from` on, in order.
+    /// Returns an iterator over the records, in order, beginning with the record number `from`.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
     }
@@ -118,7 +119,8 @@ impl Reader {
         }
     }
 
-    /// Returns the lowest record number below 1, or `None` if there is none. An unchanged journal has none.
+    /// Returns the lowest record number below 1; `None` if there is none. Such a number shows that the journal was
+    /// changed.
     fn number_before_the_first(&self) -> Result<Option<i64>, JournalError> {
         let least = self.connection.query_row("SELECT min(seq) FROM record WHERE seq < 1", [], |row| row.get(0));
         least.map_err(JournalError::database(&self.folder))

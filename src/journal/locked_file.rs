@@ -14,7 +14,7 @@ const TRIES: usize = 20;
 const BETWEEN_TRIES: Duration = Duration::from_millis(5);
 
 impl LockedFile {
-    /// Locks a file. Retries for a short time if another process holds the lock.
+    /// Locks a file until the value is dropped. If another process holds the lock, tries again for about 0.1 s.
     ///
     /// # Errors
     /// Another process holds the lock, or the file cannot be locked.

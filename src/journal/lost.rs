@@ -21,8 +21,8 @@ const PAGES: std::ops::RangeInclusive<usize> = 512..=65_536;
 /// Maximum number of bytes of the log that are examined.
 const MAX_LOG_BYTES: u64 = 256 << 20;
 
-/// Returns why acknowledged records of an unfinished run could be lost, or `None` if there is no sign of a loss. The
-/// program that wrote these records had seen that they were on the disk. Call this only while no process drives the
+/// Returns the reason why acknowledged records of an unfinished run can be lost; `None` if there is no sign of a loss.
+/// A record is acknowledged if the program had seen that it was on the disk. Call this only while no process drives the
 /// run.
 ///
 /// # Errors
@@ -44,16 +44,16 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }
 
-/// Returns the highest cycle number for which the run folder has files, or 0 if there are none.
+/// Returns the highest number of a cycle for which a run folder has an entry `cycle-N`; 0 if there is none.
 pub fn newest_cycle(folder: &Path) -> u32 {
     let names = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
     let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix("cycle-")?.parse().ok();
     names.filter_map(number).max().unwrap_or(0)
 }
 
-/// Returns a message if changes that were committed and on the disk follow an invalid part of the log: these changes
-/// are lost. Returns `None` if all frames are valid, or if only the end is invalid, as after a power failure: a
-/// transaction is on the disk before the first frame of the next transaction is written.
+/// Returns a message if the write-ahead log has an invalid part with committed changes after it: these changes are
+/// lost. Returns `None` if all frames are valid, or if only the end is invalid, as after a power failure. The end is
+/// harmless because a transaction is on the disk before the first frame of the next transaction is written.
 fn damage(log: &[u8]) -> Option<String> {
     if log.len() <= LOG_HEADER {
         return None;

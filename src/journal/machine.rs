@@ -51,7 +51,8 @@ const PROCESS: &str = ", process ";
 type Opens = fn(&LockFolder, &str) -> Result<LockFile, String>;
 
 impl MachineLock {
-    /// Locks a machine for a run. `address` identifies the machine, and must be the same text in every run.
+    /// Locks a machine for the run in the folder `run`, until the value is dropped. `address` identifies the machine,
+    /// and must be the same text in every run.
     ///
     /// # Errors
     /// Another run has the machine (the error names it), or no folder for locks can be used.
@@ -60,8 +61,9 @@ impl MachineLock {
         Self::acquire_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
-    /// Returns an epoch for the client of these machines: higher than every epoch that a client of this computer used
-    /// for any of them, and not below `clock`, in seconds. Stores it in the files of the machines.
+    /// Returns a new epoch (a number that identifies a session of a client) for `machines`, and stores it in their lock
+    /// files. It is higher than every epoch that a client of this computer used for any of them, and at least `clock`,
+    /// the time in seconds.
     pub fn epoch<'a>(machines: impl IntoIterator<Item = &'a Self> + Clone, clock: u32) -> u32 {
         let last = machines.clone().into_iter().map(|machine| machine.last_epoch).max().unwrap_or(0);
         let epoch = clock.max(last.saturating_add(1));
@@ -69,14 +71,15 @@ impl MachineLock {
         epoch
     }
 
-    /// Returns the path of the control socket next to the lock. There the cell that has this machine can be reached
-    /// even if its run folder is gone.
+    /// Returns the path of the control socket next to the lock file. Through it, the cell that has this machine can be
+    /// reached even if its run folder is gone.
     pub fn control_socket(&self) -> &Path {
         &self.control_socket
     }
 
-    /// Returns the cells of this user that have machines on this computer: the folder of the run, and the path of the
-    /// control socket next to its lock. The list can contain a killed cell, whose socket has no listener.
+    /// Returns the cells of this user that have locked machines on this computer. Each entry is the folder of the run,
+    /// and the path of the control socket next to the lock file. A cell that was killed can still be in the list;
+    /// nobody answers at its socket.
     pub fn control_sockets() -> Vec<(PathBuf, PathBuf)> {
         system::place_of_locks(FOLDER).map_or_else(Vec::new, |place| Self::doors_in(&place.join(FOLDER)))
     }
@@ -95,8 +98,8 @@ impl MachineLock {
         doors.filter_map(|door| Some((run_of(&door)?, door))).collect()
     }
 
-    /// Returns notes about unexpected files found in the place of the lock files. These files are neither followed nor
-    /// trusted.
+    /// Returns notes about unexpected files in the place of the lock files, such as links or files of other users.
+    /// These files are ignored.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -140,8 +143,12 @@ impl MachineLock {
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
-    /// Locks a file and reads the epoch that it stores. Returns the reason in the inner `Err` if something else is in
-    /// its place.
+    /// Opens the lock file `name` in the folder `path` with `open`, locks it, and reads the last epoch from it.
+    /// `address` identifies the machine in messages. The inner `Err` is the reason why something in the place of the
+    /// file cannot be used as a lock.
+    ///
+    /// # Errors
+    /// Another process holds the lock; the file cannot be locked.
     fn lock_file(
         &mut self,
         folder: &LockFolder,
@@ -182,7 +189,8 @@ impl MachineLock {
         Ok(Err("it is removed repeatedly".to_owned()))
     }
 
-    /// Reads the stored epoch. Rejects a value that no client of this computer can have used.
+    /// Reads the last epoch from `kept`, the text of the lock file at `path`. An impossible value is ignored and
+    /// reported in a note.
     fn read_epoch(&mut self, kept: &str, path: &Path) {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
@@ -196,8 +204,8 @@ impl MachineLock {
         self.notes.push(format!("{}: {what}; it was ignored", path.display()));
     }
 
-    /// Writes the holder and the epoch. Ignores write errors: the holder is information for people, the machine itself
-    /// also reports its last epoch, and the lock is valid without them.
+    /// Writes the holder and the epoch into the lock files. Write errors are ignored: the holder is information for
+    /// people, the machine itself also reports its last epoch, and the lock is valid without them.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
         for mut file in &self.holder_files {
@@ -210,7 +218,7 @@ impl MachineLock {
     }
 }
 
-/// Returns another handle of a file, for its lock.
+/// Returns a second handle of an open file, which is then used for its lock. `path` only names the file in messages.
 fn again(file: &File, path: &Path) -> Result<File, JournalError> {
     file.try_clone().map_err(JournalError::file(path, "opening it"))
 }

@@ -44,7 +44,7 @@ CREATE TRIGGER record_follows_the_last BEFORE INSERT ON record
     BEGIN SELECT RAISE(ABORT, 'records follow the last'); END;
 ";
 
-/// Creates the database of a new run.
+/// Creates the database of a new run in its folder.
 pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     let failed = JournalError::database(&path);
@@ -56,13 +56,17 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     Ok(connection)
 }
 
-/// Sets whether the write-ahead log stays when the database is closed (true), or is written into the database (false).
-/// The log of an interrupted run stays, however its program ended.
+/// Sets what happens to the write-ahead log when the database is closed: it stays if `keeps` is true, and is written
+/// into the database and deleted if `keeps` is false. After a crash it stays in both cases.
 pub(super) fn keep_the_log(connection: &Connection, keeps: bool) -> rusqlite::Result<()> {
     connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, keeps).map(drop)
 }
 
-/// Opens the database of a run for writing.
+/// Opens the database of a run for writing, and writes its log into it.
+///
+/// # Errors
+/// The folder has no journal; the file is not a journal, or was written by a later version; a setting cannot be
+/// applied.
 pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     let layout = recognise(folder, &path)?;
@@ -80,17 +84,19 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     Ok(connection)
 }
 
-/// Writes the whole log into the database, and restarts the log. After a failed sync the operating system can drop a
-/// part of the log that is not yet on the disk, and still show it to readers. Records written after that part cannot be
-/// read after a power failure. While another process reads, the log stays as it is.
+/// Writes the whole write-ahead log into the database (checkpoint), so that the log begins anew. Does nothing while
+/// another process reads.
+///
+/// This is needed because, after a failed flush, the operating system can drop a part of the log that is not yet on the
+/// disk, and still show it to readers. Records written after that part cannot be read after a power failure.
 fn checkpoint_log(connection: &Connection) -> rusqlite::Result<()> {
     // RESTART keeps the length of the log file. A missing or empty log of an interrupted run therefore shows that
     // somebody removed it.
     run(connection, "PRAGMA wal_checkpoint(RESTART)")
 }
 
-/// Checks that the schema has the tables of a journal and nothing else. A view in the place of a table can return any
-/// content, without end.
+/// Returns an error if the database has anything but the tables, indices and triggers of a journal. A view in the place
+/// of a table could return any content, without end.
 fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     let failed = JournalError::database(path);
     let mut statement = connection.prepare("SELECT type, name, sql FROM sqlite_schema").map_err(&failed)?;
@@ -110,7 +116,8 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
     if has_table { Ok(()) } else { Err(foreign("it has no table of records")) }
 }
 
-/// Returns the statements of the schema in the form in which the database stores them.
+/// Returns the SQL statements of the schema of a journal, with single blanks between words, for comparison with those
+/// in a database.
 fn statements() -> impl Iterator<Item = String> {
     // The statement of a trigger contains a semicolon, so the schema is not split at semicolons.
     SCHEMA
@@ -123,7 +130,10 @@ fn words(sql: &str) -> String {
     sql.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Opens the database of a run for reading. Works also if the folder is not writable.
+/// Opens the database of a run for reading. The folder need not be writable.
+///
+/// # Errors
+/// The folder has no journal; the file is not a journal, or was written by a later version.
 pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     recognise(folder, &path)?;
@@ -165,7 +175,7 @@ fn is_unopenable(error: &rusqlite::Error) -> bool {
     )
 }
 
-/// Returns the URI that opens a file as immutable.
+/// Returns the SQLite URI that opens the file at `path` as immutable: without locks and without a log.
 fn address(path: &Path) -> String {
     let mut address = "file:".to_owned();
     for byte in path.as_os_str().as_encoded_bytes() {
@@ -177,8 +187,11 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Checks the header of the file before SQLite opens it, and returns the layout version. A process that writes this
-/// journal must not call it: when a process closes a file, it releases all locks that it has on that file.
+/// Checks the header of the database at `path` before SQLite opens it, and returns its layout version. A process that
+/// writes this journal must not call it: when a process closes a file, it releases all locks that it has on that file.
+///
+/// # Errors
+/// The file does not exist; it is not a journal; it was written by a later version.
 fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     if !path.is_file() {
         return Err(JournalError::Absent { path: folder.to_owned() });
@@ -206,7 +219,10 @@ fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     }
 }
 
-/// Applies the settings that the guarantees depend on, and reads each one back.
+/// Applies the database settings on which durability and safety depend, and reads each one back.
+///
+/// # Errors
+/// [`JournalError::Setting`] if the database did not accept a setting.
 fn configure(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     connection.busy_timeout(BUSY_FOR).map_err(JournalError::database(path))?;
     set(connection, path, "journal_mode", "wal")?;
@@ -230,8 +246,8 @@ fn set(connection: &Connection, path: &Path, setting: &'static str, wanted: &'st
     if found == wanted { Ok(()) } else { Err(JournalError::Setting { path: path.to_owned(), setting, wanted, found }) }
 }
 
-/// Runs a statement to its end and ignores its rows. A setting that is stored in the file returns its value first, and
-/// can fail after that.
+/// Runs an SQL statement to its end and ignores its rows. Reading all rows is necessary: a setting that is stored in
+/// the file returns its value first, and can fail after that.
 fn run(connection: &Connection, sql: &str) -> rusqlite::Result<()> {
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;
@@ -247,13 +263,13 @@ fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
     }
 }
 
-/// Syncs the names in a folder to the disk.
+/// Flushes a folder to the disk, so that the names of its files last after a power failure.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), JournalError> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     system::sync_folder(folder).map_err(JournalError::file(folder, "flushing it to the disk"))
 }
 
-/// Returns true if a folder is absent or empty.
+/// Returns true if a folder does not exist or is empty.
 pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     match fs::read_dir(folder) {
         Ok(mut entries) => Ok(entries.next().is_none()),
@@ -262,13 +278,14 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     }
 }
 
-/// Returns true if every user of this computer can read the run folder: a reader can block the writing of its record.
+/// Returns true if every user of this computer can read or enter a run folder. This is a risk, because a reader can
+/// block the writing of the record.
 pub fn is_open_to_all(folder: &Path) -> bool {
     system::is_open_to_all(folder)
 }
 
-/// Returns the free space, in bytes, that the user of this program has on the disk of a folder. For a folder that does
-/// not exist, the nearest existing folder above it is used.
+/// Returns the free space, in bytes, that the user of this program has on the disk of a folder. If the folder does not
+/// exist, its nearest existing parent is used.
 ///
 /// # Errors
 /// The free space cannot be queried.

@@ -52,7 +52,7 @@ impl RecordKind {
         Self::End,
     ];
 
-    /// Returns the word that the database stores.
+    /// Returns the word for this kind in the database, such as `begin`.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Begin => "begin",
@@ -98,7 +98,8 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Returns an entry of the cell itself, with this program as its station.
+    /// Creates an entry of the cell itself, with the actor `cell` and the station `regrind`. `mono_ns` is the time
+    /// since the run began.
     pub fn new(kind: RecordKind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
         let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
         Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
@@ -140,19 +141,22 @@ pub struct Record {
 }
 
 impl Record {
-    /// Returns true if this record was made from an entry. Compares kind, cycle, actor, station, time and payload.
+    /// Returns true if this record was made from `entry`: kind, cycle, actor, station, time and payload are equal.
     pub(super) fn is_of(&self, entry: &Entry) -> bool {
         (self.kind, self.cycle, &self.actor, &self.station) == (entry.kind, entry.cycle, &entry.actor, &entry.station)
             && self.mono_ns == entry.mono_ns.min(i64::MAX as u64)
             && self.payload == canonical_json(&entry.payload)
     }
 
-    /// Returns the content as a JSON value, or null if it is not JSON.
+    /// Returns the payload as a JSON value, or null if it is not valid JSON.
     pub fn value(&self) -> Value {
         serde_json::from_str(&self.payload).unwrap_or(Value::Null)
     }
 
-    /// Inserts the record after the last one. The database rejects a record that does not follow the last one.
+    /// Inserts this record into the database.
+    ///
+    /// # Errors
+    /// The database rejects a record whose number does not follow the last one, or cannot write it.
     pub(super) fn put_into(&self, connection: &Connection) -> rusqlite::Result<()> {
         let sql = format!(
             "INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)"
@@ -177,7 +181,8 @@ impl Record {
         statement.execute(values).map(drop)
     }
 
-    /// Returns the text that is hashed: all fields except the hashes, as JSON with sorted keys.
+    /// Returns the text from which the hash of the record is computed: all fields except the hashes, as JSON with
+    /// sorted keys.
     pub fn text(&self) -> String {
         let mut text = String::with_capacity(self.payload.len() + 256);
         let string = |text: &mut String, key: &str, value: &str| {
@@ -205,18 +210,18 @@ impl Record {
         text
     }
 
-    /// Computes the hash that this record must have.
+    /// Returns the hash that this record should have, computed from its content and `prev_hash`.
     pub(super) fn expected_hash(&self) -> String {
         chain(&self.prev_hash, &self.text())
     }
 
-    /// Returns the column names as a row of CSV (RFC 4180), without the line ending.
+    /// Returns the names of the columns as a row of CSV (RFC 4180), without a line ending.
     pub fn csv_head() -> String {
         COLUMNS.replace(", ", ",")
     }
 
-    /// Returns the record as a row of CSV (RFC 4180), without the line ending. Every field is unchanged. The payload is
-    /// its JSON text. A missing command number is an empty field.
+    /// Returns the record as a row of CSV (RFC 4180), without a line ending. The payload is its JSON text. A missing
+    /// command number is an empty field.
     pub fn csv_row(&self) -> String {
         let id = self.command_id.map_or(String::new(), |id| id.to_string());
         let (seq, mono_ns, cycle) = (self.seq.to_string(), self.mono_ns.to_string(), self.cycle.to_string());
@@ -240,8 +245,8 @@ impl Record {
         fields.map(csv_field).join(",")
     }
 
-    /// Returns the fault of this record as the successor of `records` records, of which the last has the hash `head`;
-    /// `None` if it has no fault.
+    /// Returns the fault of this record, if it should follow `records` records of which the last has the hash `head`: a
+    /// wrong number, or a wrong hash. Returns `None` if it has no fault.
     pub(super) fn successor_flaw(&self, records: u64, head: &str) -> Option<String> {
         let due = records + 1;
         if self.seq != due {
@@ -255,7 +260,8 @@ impl Record {
         }
     }
 
-    /// Returns the record as one line of JSON: the fields of the hashed text, then the hashes.
+    /// Returns the record as one line of JSON without a line ending: the fields of [`Record::text`], then the two
+    /// hashes.
     pub fn json_line(&self) -> String {
         let mut line = self.text();
         line.pop();
@@ -275,7 +281,10 @@ fn csv_field(field: &str) -> Cow<'_, str> {
 pub(super) const COLUMNS: &str =
     "seq, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, hash";
 
-/// Reads a nonnegative integer from a column.
+/// Returns the integer in a column of a row.
+///
+/// # Errors
+/// The value is negative or no integer.
 pub(super) fn whole(row: &Row<'_>, column: usize) -> rusqlite::Result<u64> {
     let number: i64 = row.get(column)?;
     u64::try_from(number).map_err(|_| rusqlite::Error::IntegralValueOutOfRange(column, number))
@@ -325,7 +334,7 @@ impl<'j> Records<'j> {
         Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from.max(1), size: 1, over: false }
     }
 
-    /// Reads the next page. An error ends the iteration, and is returned after the records that were read before it.
+    /// Reads the next page of records. An error ends the iteration, after the records that were read before it.
     fn turn(&mut self) {
         if let Err(error) = self.read() {
             self.page.push_back(Err(error));
@@ -370,7 +379,8 @@ impl Iterator for Records<'_> {
     }
 }
 
-/// Converts to the signed integer of the database. 292 years of nanoseconds fit.
+/// Converts a number to the signed integer of the database; a larger one becomes the largest possible. Its range covers
+/// 292 years in nanoseconds.
 pub(super) fn signed(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }

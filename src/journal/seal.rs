@@ -32,13 +32,15 @@ impl Seal {
     }
 }
 
-/// Returns the message that is signed. It names the run, so that a seal is not valid in another run.
+/// Returns the message that a seal signs: the name of the run, the number of records and the hash `head` of the last
+/// one. The name makes a seal invalid in another run.
 fn message(run: &str, records: u64, head: &str) -> Vec<u8> {
     let text = canonical_json(&json!({ "head": head, "records": records, "run": run }));
     [DOMAIN, &text].concat().into_bytes()
 }
 
-/// Returns true if a key has signed the head of a run.
+/// Returns true if `signature` is the signature of a seal by `key`: for the run named `run`, the number of records and
+/// the hash `head` of the last one.
 pub(super) fn is_signed(key: &PublicKey, run: &str, records: u64, head: &str, signature: &str) -> bool {
     key.has_signed(&message(run, records, head), signature)
 }

@@ -35,12 +35,12 @@ pub struct Anchor {
 }
 
 impl Anchor {
-    /// Returns an anchor without a signature.
+    /// Creates an anchor without a signature. `head` is the hash of the last of `records` records.
     pub fn new(records: u64, head: String) -> Self {
         Self { records, head, run: None, key: None, signature: None }
     }
 
-    /// Returns the anchor with the content of a seal.
+    /// Creates an anchor with the content and the signature of a seal of the run named `run`.
     pub(super) fn sealed(run: &str, seal: &Seal) -> Self {
         Self {
             records: seal.records,
@@ -89,14 +89,15 @@ pub struct Verified {
 }
 
 impl Verified {
-    /// Returns true if the run names a key and has its end record, but the end is not sealed: somebody without the key
-    /// could have written the end. While a process drives the run, the seal can still follow.
+    /// Returns true if the run names a key and has its end record, but no seal follows the end. Somebody without the
+    /// key could then have written the end. While a process drives the run, the seal can still follow.
     pub fn lacks_last_seal(&self) -> bool {
         !self.keys.is_empty() && self.closed && self.signed + 1 != self.records
     }
 }
 
-/// Verifies the journal of a run folder, the recorded files, and the anchor in the folder.
+/// Verifies the journal of a run folder: the hash chain, the signatures, the recorded files, and the anchor in the
+/// folder. Returns a summary of an intact journal.
 ///
 /// # Errors
 /// [`JournalError::Broken`] with the first record that fails; the journal cannot be read.
@@ -104,7 +105,8 @@ pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
     verify_against(folder, &ExternalEvidence::default())
 }
 
-/// Verifies a journal as [`verify`] does, and also against external evidence.
+/// Verifies a journal as [`verify`] does, and also against `against`: an anchor that was kept elsewhere, and trusted
+/// keys.
 ///
 /// # Errors
 /// Those of [`verify`]; [`JournalError::NoAuthor`] if the journal is intact, but not signed with one of the trusted
@@ -124,7 +126,10 @@ pub fn anchor_of(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     read_anchor(folder)
 }
 
-/// Reads the anchor in a run folder, or returns `None` if there is none.
+/// Returns the anchor in a run folder; `None` if there is none.
+///
+/// # Errors
+/// The file cannot be read, or it is not a valid anchor.
 pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     let path = folder.join(ANCHOR);
     match read_few(&path) {
@@ -139,8 +144,10 @@ pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError>
 /// Maximum length of an anchor file, in bytes.
 const MAX_ANCHOR_BYTES: u64 = 4096;
 
-/// Reads at most [`MAX_ANCHOR_BYTES`] bytes of a file. Rejects a path that is not a regular file, which could have no
-/// end.
+/// Returns the first [`MAX_ANCHOR_BYTES`] bytes of a file, or all bytes of a shorter one.
+///
+/// # Errors
+/// A path that is not a regular file, because it could have no end; a file that cannot be read.
 fn read_few(path: &Path) -> io::Result<Vec<u8>> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"));
@@ -222,7 +229,8 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     })
 }
 
-/// Returns true if a process holds the lock of a run folder. The process holds it from the start of the run to its end.
+/// Returns true if a process drives the run in a folder: it holds the lock of the folder from the start of the run to
+/// its end.
 pub fn is_driven(folder: &Path) -> bool {
     let path = folder.join(LOCK);
     if !fs::metadata(&path).is_ok_and(|found| found.is_file()) {
@@ -232,7 +240,8 @@ pub fn is_driven(folder: &Path) -> bool {
     lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
 }
 
-/// Returns the files of a run folder that are in no record, sorted.
+/// Returns the sorted names of the files in a run folder that are not in `recorded`. The journal's own files are
+/// omitted.
 fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>, JournalError> {
     let mut names = Vec::new();
     files_below(folder, "", &mut names)?;
@@ -241,8 +250,8 @@ fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>,
     Ok(names)
 }
 
-/// Collects the files in a run folder, by their paths relative to it. Omits the journal's own files, and everything
-/// that is not a regular file.
+/// Adds to `found` the files in the subfolder `below` of a run folder and in all its subfolders, as paths relative to
+/// the run folder. The journal's own files, and everything that is not a regular file, are omitted.
 fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<(), JournalError> {
     let at = folder.join(below);
     for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "inspecting it"))? {
@@ -257,7 +266,8 @@ fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
-/// Returns true if a file of a run folder is the journal's own, or was left from one by a crash.
+/// Returns true if `name` is one of the journal's own files in a run folder, or a temporary file that a crash left of
+/// one.
 fn is_own(name: &str) -> bool {
     name.starts_with(DATABASE) || [ANCHOR, LOCK, &temporary_name(ANCHOR)].contains(&name)
 }
@@ -359,7 +369,10 @@ impl<'a> VerifierState<'a> {
         Ok(())
     }
 
-    /// Checks the state so far against an anchor with the same number of records.
+    /// Compares an anchor with the records read so far, whose number is that of the anchor.
+    ///
+    /// # Errors
+    /// Another run, another hash of the last record, or a missing or wrong signature.
     fn check_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, self.records, what));
         if anchor.run.as_ref().is_some_and(|run| *run != self.run) {

@@ -82,16 +82,17 @@ impl Tail {
 }
 
 impl Journal {
-    /// Creates the folder of a new run, with its parents, and its journal with the first record.
+    /// Creates the folder of a new run, with its parents, and its journal with the first record, made from `header`.
+    /// Nothing is signed.
     ///
     /// # Errors
-    /// The folder is in use or cannot be written, or the disk is full.
+    /// The folder is not empty or cannot be written, or the disk is full.
     pub fn create(folder: impl AsRef<Path>, header: Header) -> Result<Self, JournalError> {
         Self::create_with(folder, header, None)
     }
 
-    /// Creates a run as [`Journal::create`] does. If there is a key, signs the head with it: now, every
-    /// [`SEALED_EVERY`] records, and at the end.
+    /// Creates a run as [`Journal::create`] does. With a `key`, the journal is signed: now, every [`SEALED_EVERY`]
+    /// records, and at the end.
     ///
     /// # Errors
     /// Those of [`Journal::create`].
@@ -131,17 +132,17 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Opens the journal of a run to continue it, and records the opening. Checks the chain only after the anchor, or
-    /// all of it if there is no anchor; [`super::verify`] always checks all of it.
+    /// Opens the journal of a run to continue it, and records this. Checks the hash chain from the anchor on, or all of
+    /// it if there is no anchor; [`super::verify`] always checks all of it. Nothing is signed from here on.
     ///
     /// # Errors
-    /// The folder has no journal, or the journal belongs to another program, is in use, is closed, or is broken.
+    /// The folder has no journal; the journal is in use, closed, broken, or of another program.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         Self::open_with(folder, None)
     }
 
-    /// Opens a journal as [`Journal::open`] does. If there is a key, signs the head with it from here on. It can be
-    /// another key than the one at the beginning: the reopen record names it.
+    /// Opens a journal as [`Journal::open`] does. With a `key`, the journal is signed from here on. It can be another
+    /// key than that at the beginning: the record of the opening names it.
     ///
     /// # Errors
     /// Those of [`Journal::open`].
@@ -191,8 +192,8 @@ impl Journal {
         &self.part
     }
 
-    /// Checks that the files of the record are at the paths where they are written. A file that was deleted still
-    /// accepts every write, but the written content is lost.
+    /// Checks that the files of the journal are still at the paths where they were opened. A file that was deleted
+    /// still accepts every write, but the written content is lost.
     ///
     /// # Errors
     /// [`JournalError::Gone`] with the path of a file that is missing or was replaced.
@@ -213,12 +214,12 @@ impl Journal {
         Ok(())
     }
 
-    /// Returns the number of the last record.
+    /// Returns the number of the last record; 0 if there is none.
     pub fn last_seq(&self) -> u64 {
         self.tail.seq
     }
 
-    /// Returns the records from number `from` on, in order.
+    /// Returns an iterator over the records, in order, beginning with the record number `from`.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
     }
@@ -240,7 +241,8 @@ impl Journal {
         }
     }
 
-    /// Records a command before it is executed, and returns its command number. Each number is used once.
+    /// Records a command before it is executed, and returns its new command number. Idempotent: after an error the same
+    /// entry can be given again, and gets only one number.
     ///
     /// # Errors
     /// Those of [`Journal::append`]: then the command must not be executed.
@@ -258,8 +260,8 @@ impl Journal {
         Ok(id)
     }
 
-    /// Returns the recorded commands without an outcome, in order. After a crash they must be reconciled before any
-    /// other action.
+    /// Returns the recorded commands that have no recorded outcome, in order. After a crash it must be found out what
+    /// became of each of them, before any other action.
     ///
     /// # Errors
     /// The journal cannot be read.
@@ -267,8 +269,8 @@ impl Journal {
         open_intents(&self.connection, &self.folder)
     }
 
-    /// Writes a file to the disk, then records it. Idempotent: the same content again is no error and adds no second
-    /// record.
+    /// Writes `bytes` to the file `name` in the run folder, and then records the file. `mono_ns` is the time since the
+    /// run began. Idempotent: the same content again is no error and adds no second record.
     ///
     /// # Errors
     /// The name is not a plain relative path, the name is on record with another content, or the disk is full or not
@@ -283,7 +285,8 @@ impl Journal {
         self.register(Artefact { name: name.to_owned(), bytes: bytes.len() as u64, sha256 }, mono_ns, cycle)
     }
 
-    /// Records a file that another part of the program wrote into the run folder, after syncing it to the disk.
+    /// Flushes the file `name`, which another part of the program wrote into the run folder, to the disk, and then
+    /// records it. `mono_ns` is the time since the run began.
     ///
     /// # Errors
     /// Those of [`Journal::store`].
@@ -291,7 +294,8 @@ impl Journal {
         self.adopt_known(Artefact::from_file(&self.folder, name)?, mono_ns, cycle)
     }
 
-    /// Records a file that [`Artefact::from_file`] has already synced to the disk and read.
+    /// Records `found`, a file that [`Artefact::from_file`] has already flushed to the disk and read. `mono_ns` is the
+    /// time since the run began.
     ///
     /// # Errors
     /// Those of [`Journal::store`].
@@ -303,8 +307,8 @@ impl Journal {
         self.register(found, mono_ns, cycle)
     }
 
-    /// Seals the journal if it has a key. Writes the anchor file: the number of records and the hash of the last one,
-    /// with the signature. Returns the anchor, so that a copy can be kept elsewhere.
+    /// Signs the journal if it has a key, and writes the anchor file: the number of records, the hash of the last one,
+    /// and the signature. Returns the anchor, so that a copy can be kept elsewhere.
     ///
     /// # Errors
     /// The disk is full or not writable.
@@ -314,7 +318,8 @@ impl Journal {
         self.write_anchor()
     }
 
-    /// Writes the end record of the run and the anchor. No record can follow, except the seal.
+    /// Writes the end record of the run with the content `ending`, signs it if there is a key, and writes the anchor.
+    /// Returns the anchor. No other record can follow. `mono_ns` is the time since the run began.
     ///
     /// # Errors
     /// Those of [`Journal::append`].
@@ -322,7 +327,8 @@ impl Journal {
         self.end(mono_ns, cycle, ending)
     }
 
-    /// Ends the run as [`Journal::close`] does, for a caller that may need to retry.
+    /// Ends the run as [`Journal::close`] does, but leaves the journal to the caller, who can call it again after an
+    /// error.
     ///
     /// # Errors
     /// Those of [`Journal::append`].
@@ -347,7 +353,7 @@ impl Journal {
         Ok(artefact)
     }
 
-    /// Records the head and its signature, unless nothing was recorded since the last seal.
+    /// Adds a seal (a signature of the last record), unless there is no key or no record since the last seal.
     fn seal(&mut self) -> Result<(), JournalError> {
         let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
         let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
@@ -356,12 +362,13 @@ impl Journal {
         Ok(())
     }
 
-    /// Returns the record number of the newest seal; 0 if this opening of the journal has none.
+    /// Returns the record number of the newest seal since the journal was opened; 0 if there is none.
     fn sealed(&self) -> u64 {
         self.seal.as_ref().map_or(0, |seal| seal.records + 1)
     }
 
-    /// Writes the anchor file from the newest seal, or from the last record if nothing is signed.
+    /// Writes the anchor file and returns the anchor: that of the newest seal, or that of the last record if nothing is
+    /// signed.
     fn write_anchor(&mut self) -> Result<Anchor, JournalError> {
         let anchor = match &self.seal {
             Some(seal) => Anchor::sealed(&self.run, seal),
@@ -374,8 +381,9 @@ impl Journal {
         Ok(anchor)
     }
 
-    /// Seals and anchors the journal if [`SEALED_EVERY`] records were added since the last time. A failure here does
-    /// not affect the record just written: sealing is tried again after the next record, and at the latest at the end.
+    /// Signs the journal and writes the anchor, if [`SEALED_EVERY`] records were added since the last time. A failure
+    /// does not affect the record just written: this is tried again after the next record, and at the latest at the end
+    /// of the run.
     fn seal_when_due(&mut self) {
         if self.tail.closed {
             return;
@@ -439,13 +447,13 @@ impl Journal {
         record
     }
 
-    /// Writes a record. One statement is one transaction: on return it is committed and synced.
+    /// Writes a record to the database. On return it is on the disk, because one statement is one transaction.
     fn write(&self, r: &Record) -> Result<(), JournalError> {
         r.put_into(&self.connection).map_err(JournalError::database(&self.folder))
     }
 
-    /// Reads the end of the chain again after a failed write, because the record may or may not be stored. Returns that
-    /// record if it is stored.
+    /// Reads the last record again if the last write failed, because only the database knows whether it was stored.
+    /// Returns that record if it was stored, otherwise `None`.
     fn reread_tail(&mut self) -> Result<Option<Record>, JournalError> {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;
@@ -457,8 +465,8 @@ impl Journal {
         Ok(stands)
     }
 
-    /// Checks that no record was cut off or changed since the anchor. A journal that fails this check is not continued,
-    /// because its next seal would sign the changed records.
+    /// Checks that no record was cut off or changed since the anchor was written. A journal that fails this check is
+    /// not continued, because its next seal would sign the changed records.
     fn is_whole(&self) -> Result<(), JournalError> {
         let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
         let (mut records, mut head) = (0, Tail::empty().hash);
@@ -495,7 +503,7 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    /// Locks a run that has a journal.
+    /// Locks the run in a folder until the value is dropped.
     ///
     /// # Errors
     /// The folder has no journal, or another process drives the run.
@@ -522,7 +530,11 @@ fn boot_id() -> String {
     format!("{:016x}", rand::random::<u64>())
 }
 
-/// Returns the name of the run, the part and the first command number.
+/// Returns three values of the first record: the name of the run, the serial number of the part, and the first command
+/// number.
+///
+/// # Errors
+/// There is no record, or the first record is not the beginning of a run.
 fn first_of(connection: &Connection, folder: &Path) -> Result<(String, String, u32), JournalError> {
     let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq: 1, what: what.to_owned() };
     let first = Records::new(connection, folder, 0).next().ok_or_else(|| broken("there is no record"))??;
@@ -565,8 +577,8 @@ fn read_tail(connection: &Connection, folder: &Path) -> Result<Tail, JournalErro
     Ok(Tail { last_command_id, closed: ends > 0, ..tail })
 }
 
-/// Returns the intents without an outcome, in order. Reads the records themselves and not the index, because the hash
-/// chain does not protect the index.
+/// Returns the recorded commands that have no recorded outcome, in order. Reads the records themselves and not the
+/// index, because the hash chain does not protect the index.
 pub(super) fn open_intents(connection: &Connection, folder: &Path) -> Result<Vec<Record>, JournalError> {
     let failed = JournalError::database(folder);
     let sql = "SELECT seq, command_id, kind = 'intent' FROM record NOT INDEXED

@@ -44,7 +44,8 @@ pub struct EndedRun {
 }
 
 impl CellStatus {
-    /// Returns the name of the run that is active, does not answer, or whose program is gone.
+    /// Returns the name of the run that the status is about: one that is active, does not answer, or has lost its
+    /// program. Returns `None` if there is no such run.
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.run_status {
             RunStatus::NoRun => None,
@@ -54,7 +55,7 @@ impl CellStatus {
         }
     }
 
-    /// Returns the snapshot of the active run.
+    /// Returns the snapshot of the active run; `None` without an active run.
     pub(crate) fn snapshot(&self) -> Option<&Snapshot> {
         match &self.run_status {
             RunStatus::Active { snapshot, .. } => Some(snapshot),

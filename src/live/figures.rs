@@ -71,7 +71,7 @@ const fn text(name: &'static str, about: &'static str, of: fn(&CellStatus) -> Op
 
 /// All published figures of a cell.
 pub const FIGURES: &[Figure] = &[
-    whole("Status/StateCurrent", "Number of the state by PackML; 4 (Idle) where no run is on", |told| {
+    whole("Status/StateCurrent", "Number of the state in PackML; 4 (Idle) if no run is active", |told| {
         match &told.run_status {
             RunStatus::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
             RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
@@ -121,10 +121,10 @@ pub const FIGURES: &[Figure] = &[
     text("Job/Machine", "Machine that executes a job: cmm or grinder", |told| {
         job(told).map(|job| in_words(job.device.name()))
     }),
-    whole("Job/Done", "Points, or parts of the path, of the job that are done", |told| {
+    whole("Job/Done", "Completed steps of the job: points measured, or parts of the path ground", |told| {
         job(told).map(|job| FigureValue::Whole(job.done))
     }),
-    whole("Job/Total", "Points, or parts of the path, of the whole job", |told| {
+    whole("Job/Total", "All steps of the job: points, or parts of the path", |told| {
         job(told).map(|job| FigureValue::Whole(job.total))
     }),
     number("Job/Progress", "%", "Progress of the job", |told| {

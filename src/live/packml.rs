@@ -7,7 +7,7 @@ pub(crate) const PRODUCTION: u32 = 1;
 /// Mode of a cell with a simulated machine: the first number that PackML leaves to the builder of a machine.
 pub(crate) const SIMULATION: u32 = 16;
 
-/// Returns the number of a state.
+/// Returns the number of a state in PackML (ISA-TR88.00.02).
 pub(crate) fn state_number(state: StateName) -> u32 {
     match state {
         StateName::Stopped => 2,

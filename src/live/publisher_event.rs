@@ -59,7 +59,7 @@ impl EventSender {
     }
 }
 
-/// Returns the beginning of a text from outside as one line, without invisible characters.
+/// Returns a text from outside as one line without invisible characters, cut after a maximum length.
 fn in_a_line(text: &str) -> String {
     let mut line: String = text.chars().take(LONGEST).collect();
     if line.len() < text.len() {

@@ -14,8 +14,8 @@ pub struct PublisherLock {
 }
 
 impl PublisherLock {
-    /// Takes the lock in a folder, which is created if it does not exist. Returns `None` if another program has the
-    /// lock.
+    /// Takes the lock in `folder`, so that no other program publishes the same cell. Creates the folder if it does not
+    /// exist. Returns `None` if another program has the lock.
     ///
     /// # Errors
     /// The folder cannot be created or written.
@@ -46,7 +46,7 @@ impl BdSeqCounter {
         Ok(Self { counter: kept, folder: turn.folder.clone() })
     }
 
-    /// Returns the next number, after it is on disk; 0 follows 255.
+    /// Increments the number of the connection (bdSeq), writes it to the disk, and returns it. After 255 follows 0.
     pub(crate) fn next(&mut self) -> Result<u8, LiveError> {
         let unwritable = unwritable(&self.folder);
         let before = self.counter.get().map_err(&unwritable)?;

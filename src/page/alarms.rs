@@ -16,7 +16,8 @@ pub(crate) struct AlarmTexts<'a> {
     pub(crate) remedy: Vec<&'a str>,
 }
 
-/// Returns the texts of an alarm in a language.
+/// Returns the cause, the consequence and the remedy of an alarm in `language`. The values in the cause stay in the
+/// wording of the cell.
 pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     let Some((head, consequence, remedy)) = translated(alarm.id, language) else {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
@@ -26,9 +27,9 @@ pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     AlarmTexts { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
 }
 
-/// Returns the part of `what`, the cause of an alarm, that follows the general text `head`: a colon and the values of
-/// this alarm, or "." if there are none. The end of the general text is found by its number of colons, because the
-/// general text of an older record can have other words.
+/// Returns the end of `what`, the cause of an alarm: the colon and the values of this alarm after the general text, or
+/// "." if there are no values. The end of the general text is found by the number of colons in `head`, its present
+/// wording, because an older record can have other words.
 fn case<'a>(what: &'a str, head: &str) -> &'a str {
     let colons = head.matches(": ").count();
     what.match_indices(": ").nth(colons).map_or(".", |(at, _)| &what[at..])
@@ -36,7 +37,8 @@ fn case<'a>(what: &'a str, head: &str) -> &'a str {
 
 type Entry = (&'static str, &'static str, &'static [&'static str]);
 
-/// Returns the general cause, the consequence and the remedy; `None` in the language of the catalogue itself.
+/// Returns the general cause, the consequence and the remedy of an alarm in `language`. Returns `None` for English, the
+/// language of the texts in the alarm itself.
 fn translated(id: AlarmId, language: Language) -> Option<Entry> {
     match language {
         Language::En => None,

@@ -42,8 +42,8 @@ impl Line {
     }
 }
 
-/// Returns the chart as SVG; empty if nothing was measured. If `ahead` is true, the chart contains the forecast for the
-/// next cycle.
+/// Returns the chart of PV and RMS over the cycles, as SVG. Returns a sentence instead if nothing was measured. If
+/// `ahead` is true, the chart contains the forecast for the next cycle.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
     let lines = [
         Line::new(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
@@ -101,7 +101,7 @@ fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
     }
 }
 
-/// Returns the text of the chart for a screen reader.
+/// Returns the values of the chart as text, for a screen reader.
 fn words(lines: &[Line], language: Language) -> String {
     let of = |line: &Line| {
         let points =
@@ -120,7 +120,7 @@ struct Scale {
 }
 
 impl Scale {
-    /// Returns the scale on which all lines are visible; `None` if there is nothing to show.
+    /// Returns a scale on which all points, limits and forecasts are visible; `None` if there is no point.
     fn fitting(lines: &[Line]) -> Option<Self> {
         let all = || lines.iter().flat_map(|line| &line.points);
         let first = all().map(|(cycle, ..)| *cycle).min()?;
@@ -145,7 +145,8 @@ impl Scale {
         HEIGHT - BOTTOM - share.clamp(0.0, 1.0) * (HEIGHT - TOP - BOTTOM)
     }
 
-    /// Returns ticks at 1, 2 and 5 of each decade, or only at the decades if the others would be too dense.
+    /// Returns the values, in micrometres, at which the vertical axis has lines: 1, 2 and 5 times each power of ten, or
+    /// only the powers of ten if the range is large.
     fn ticks(&self) -> Vec<f64> {
         let (from, to) = (self.low.log10().floor() as i32, self.high.log10().ceil() as i32);
         let steps: &[f64] = if to - from > 3 { &[1.0] } else { &[1.0, 2.0, 5.0] };

@@ -65,7 +65,7 @@ impl Entrance {
         if self.tls.is_some() { "https" } else { "http" }
     }
 
-    /// Returns true if a request names this page as its host.
+    /// Returns true if `named`, the host of a request with its port, is a name or an address of this page.
     fn is_host(&self, named: &str) -> bool {
         let port = self.address.port();
         let (host, at) = match named.rsplit_once(':') {
@@ -84,7 +84,7 @@ impl Entrance {
         is_here && at == Some(port)
     }
 
-    /// Returns the address with which a browser opens the page.
+    /// Returns the address (URL) with which a browser opens the page, without a key.
     fn base(&self) -> String {
         let name = self.tls.as_ref().and_then(Tls::name);
         let at = name.map_or(self.address.to_string(), |name| format!("{name}:{}", self.address.port()));
@@ -126,12 +126,12 @@ impl Rate {
         self.began.elapsed() > MINUTE
     }
 
-    /// Returns the time since the minute began.
+    /// Returns the time since the current minute of counting began.
     pub(crate) fn age(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// Returns the number of occurrences since the minute began.
+    /// Returns the number of events since the current minute of counting began.
     pub(crate) fn current_count(&self) -> u32 {
         self.count
     }
@@ -171,7 +171,8 @@ impl Guard {
         if self.entrance.users.is_some() { base } else { format!("{base}?key={}", self.key) }
     }
 
-    /// Returns the cookie of this page with that name.
+    /// Returns the value of the cookie `name` that this page set, without the port in its full name; `None` if the
+    /// browser sent none.
     fn cookie<'h>(&self, headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
         let name = self.cookie_name(name);
         let pairs = text(headers, COOKIE)?.split(';').filter_map(|pair| pair.trim().split_once('='));
@@ -182,7 +183,7 @@ impl Guard {
         format!("{name}_{}", self.entrance.address.port())
     }
 
-    /// Sets a cookie for this page only.
+    /// Adds a header that sets the cookie `name` for this page only. An empty `value` deletes the cookie.
     fn set_cookie(&self, headers: &mut HeaderMap, name: &str, value: &str) {
         let secure = if self.entrance.tls.is_some() { "; Secure" } else { "" };
         let ends = if value.is_empty() { "; Max-Age=0" } else { "" };
@@ -192,14 +193,14 @@ impl Guard {
         }
     }
 
-    /// Sets the session cookie of a signed-in user. An empty session deletes it.
+    /// Sets the cookie of the browser session in a response. An empty `session` deletes the cookie.
     pub(crate) fn set_session(&self, response: &mut Response, session: &str) {
         self.set_cookie(response.headers_mut(), SESSION_COOKIE, session);
     }
 
-    /// Returns true if a key is correct, false if it is wrong, and `None` if there were too many wrong keys within a
-    /// minute. A correct key is always accepted: it cannot be found by guessing, and wrong guesses of others must not
-    /// lock out an operator.
+    /// Returns true if `key` is the key of the page and false if it is not. Returns `None` in place of false after more
+    /// than [`WRONG_KEYS`] wrong keys within a minute. A correct key is always accepted: it cannot be found by
+    /// guessing, and wrong guesses of others must not lock out an operator.
     fn is_key(&self, key: &str) -> Option<bool> {
         if same(key, &self.key) {
             return Some(true);
@@ -208,7 +209,10 @@ impl Guard {
         (wrong <= WRONG_KEYS).then_some(false)
     }
 
-    /// Creates the token for the next order of a browser.
+    /// Creates a token with which the browser of `session` can give one order.
+    ///
+    /// # Errors
+    /// The operating system has no random numbers.
     fn give_token(&self, session: &Session) -> io::Result<String> {
         let token = random_word()?;
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
@@ -219,8 +223,8 @@ impl Guard {
         Ok(token)
     }
 
-    /// Returns true if the token was given to this browser, has not expired and was not used. A token is valid once, so
-    /// an order that an attacker recorded and sends again is refused.
+    /// Uses up a token. Returns true if it was given to the browser of `session`, has not expired and was not used
+    /// before. An order that an attacker recorded and sends again is therefore refused.
     fn takes_token(&self, session: &Session, token: &str) -> bool {
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
         let found = tokens
@@ -229,14 +233,15 @@ impl Guard {
         found.and_then(|at| tokens.remove(at)).is_some()
     }
 
-    /// Returns true if the person at a browser still has access.
+    /// Returns true if the browser of `session` still has access: always without a list of users, and otherwise as long
+    /// as the person is signed in with the same name and role.
     pub(crate) fn has_access(&self, session: &Session) -> bool {
         let person = |users| self.signed_in.person(&session.id, users);
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }
 
-    /// Logs a refusal. Returns true if it should also be on record. Within a minute only the first refusals are
-    /// logged one by one; all are counted.
+    /// Counts a refused request, and logs it if it is one of the first [`MAX_LOGGED_REFUSALS`] within a minute. Returns
+    /// true in this case; the caller should then also put it on record. `what` describes the request.
     pub(crate) fn refused(&self, what: &str) -> bool {
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
@@ -245,7 +250,9 @@ impl Guard {
             (refusals.count(), untold)
         };
         if untold > 0 {
-            (self.log)(&format!("{untold} further requests were refused in that minute"));
+            (self.log)(&format!(
+                "{untold} further requests were refused within the minute after the first refusal, and not logged one by one"
+            ));
         }
         if told <= MAX_LOGGED_REFUSALS {
             (self.log)(&format!("refused {what}"));
@@ -255,25 +262,26 @@ impl Guard {
         told <= MAX_LOGGED_REFUSALS
     }
 
-    /// Logs a successful sign-in.
+    /// Logs `what`, the description of a successful sign-in.
     pub(crate) fn log_sign_in(&self, what: &str) {
         (self.log)(what);
     }
 
-    /// Logs a refusal and puts it on record.
+    /// Logs a refused request and puts it on record, unless too many were logged within a minute. `what` describes the
+    /// request.
     pub(crate) fn record_refusal(&self, what: &str) {
         if self.refused(what) {
             self.record(format!("the page refused {what}"));
         }
     }
 
-    /// Puts a message on record.
+    /// Puts the message `what` on record in each run that it concerns.
     pub(crate) fn record(&self, what: String) {
         (self.on_record)(what);
     }
 
-    /// Returns true if a browser has control, or if no browser has it. In the second case, the browser gets control if
-    /// `asks` is true.
+    /// Returns true if the browser of `session` has control of the cell, or if no browser has it. In the second case,
+    /// this browser gets control if `asks` is true.
     pub(crate) fn has_control(&self, session: &Session, asks: bool) -> bool {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         match &*holder {
@@ -286,12 +294,13 @@ impl Guard {
         }
     }
 
-    /// Gives control to a browser.
+    /// Gives control of the cell to the browser of `session`, and takes it from any other browser.
     pub(crate) fn take_control(&self, session: &Session) {
         *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = Some(session.id.clone());
     }
 
-    /// Releases the control of a browser that has signed out. The next browser that asks gets it.
+    /// Releases control of the cell if the browser of `session`, which has signed out, has it. The next browser that
+    /// asks gets it.
     pub(crate) fn leave_control(&self, session: &Session) {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         holder.take_if(|holder| *holder == session.id);
@@ -311,14 +320,15 @@ pub struct Session {
 }
 
 impl Session {
-    /// Returns true if the person at the browser can give the order with that name. A client with the key of the page
-    /// acts for the operating-system user that serves the page, and can give all orders.
+    /// Returns true if the person at the browser can give the order named `order`, such as `hold`. A client with the
+    /// key of the page acts for the operating-system user that serves the page, and can give all orders.
     pub(crate) fn may(&self, order: &str) -> bool {
         self.person.as_ref().is_none_or(|person| person.role.may(order))
     }
 }
 
-/// Refuses a request for another host, and adds the security headers to each response.
+/// Passes on a request that names this page as its host, and refuses any other request. Adds the security headers to
+/// each response.
 pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut hosts = request.headers().get_all(HOST).iter();
     let host = hosts.next().and_then(|host| host.to_str().ok()).unwrap_or_default();
@@ -330,7 +340,11 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
         next.run(request).await
     } else {
         guard.record_refusal(&format!("a request for the host {}", printable(host)));
-        (StatusCode::MISDIRECTED_REQUEST, "this page is served under another name\n").into_response()
+        (
+            StatusCode::MISDIRECTED_REQUEST,
+            "this page has another address; open it with the address that the program printed at its start\n",
+        )
+            .into_response()
     };
     let headers = response.headers_mut();
     let policy = HeaderName::from_static("content-security-policy");
@@ -346,7 +360,8 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     response
 }
 
-/// Lets in a client that has the key or has signed in, and converts a key in the address to a cookie.
+/// Passes on the request of a client that has the key or has signed in. Any other client gets the page that asks for
+/// the key or the sign-in page. A key in the address is replaced by a cookie.
 pub(crate) async fn let_in(
     State(guard): State<Arc<Guard>>,
     Extension(Peer(from, is_known)): Extension<Peer>,
@@ -375,7 +390,7 @@ pub(crate) async fn let_in(
     next.run(request).await
 }
 
-/// Returns the token for the next order of the page.
+/// Answers with a new token for the next order of the browser.
 pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): Extension<Session>) -> Response {
     match guard.give_token(&session) {
         Ok(token) => ([(CACHE_CONTROL, "no-store")], token).into_response(),
@@ -383,7 +398,8 @@ pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): E
     }
 }
 
-/// Returns the reason to refuse a request that changes something; `None` if it comes from this page.
+/// Returns the reason to refuse a request that changes something. Returns `None` if its header `Origin` shows that it
+/// comes from this page.
 pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<String> {
     let origin = text(headers, ORIGIN).unwrap_or_default();
     let host = origin.strip_prefix(guard.entrance.scheme()).and_then(|rest| rest.strip_prefix("://"));
@@ -391,7 +407,8 @@ pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<Strin
         .then(|| format!("an order from the origin {}", printable(origin)))
 }
 
-/// Returns the reason to refuse an order; `None` if it comes from this page and its token is used for the first time.
+/// Returns the reason to refuse an order. Returns `None` if it comes from this page, and if its token is valid and is
+/// used for the first time.
 pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> Option<String> {
     foreign_origin(guard, headers).or_else(|| {
         let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
@@ -400,8 +417,8 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     })
 }
 
-/// Sends the key cookie and the name of a session to a browser. A browser that has a session keeps this session in all
-/// its tabs.
+/// Sends the key cookie and a session cookie to a browser that gave the correct key, and redirects it to the address
+/// without the key. A browser that has a session already keeps it in all its tabs.
 fn welcome(guard: &Guard, request: &Request) -> Response {
     let headers = request.headers();
     let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));
@@ -445,12 +462,14 @@ pub(crate) fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
     headers.get(name)?.to_str().ok()
 }
 
-/// Returns text from an unknown client in a form that is safe for a line of a log.
+/// Returns the first 80 characters of a text from an unknown client, with `?` for all but printable ASCII characters,
+/// so that it is safe in a log.
 pub(crate) fn printable(text: &str) -> String {
     text.chars().take(80).map(|c| if c.is_ascii_graphic() { c } else { '?' }).collect()
 }
 
-/// Compares two secrets, so that the time does not reveal how much of them is equal.
+/// Returns true if two secrets are equal. Compares their hashes, so that the time does not reveal how much of them is
+/// equal.
 fn same(one: &str, other: &str) -> bool {
     Sha256::digest(one) == Sha256::digest(other)
 }

@@ -44,27 +44,29 @@ pub struct GuardedServer {
 }
 
 impl GuardedServer {
-    /// Prepares access to a page. `log` gets the refusals and the sign-ins.
+    /// Prepares access to the page `of`, which belongs to no run. `log` gets a message for each refusal and each
+    /// sign-in.
     ///
     /// # Errors
-    /// Fails if no random numbers are available for the key.
+    /// The operating system has no random numbers for the key.
     pub fn new(entrance: Entrance, of: PageSubject, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
         // The page belongs to no run, so refusals go to the log only.
         Ok(Self { guard: Arc::new(Guard::new(entrance, of, log, Box::new(drop))?) })
     }
 
-    /// Returns the address that opens the page. It contains the key if there are no users.
+    /// Returns the address (URL) that opens the page. It contains the key if there is no list of users.
     pub fn url(&self) -> String {
         self.guard.url()
     }
 
-    /// Serves the routes to authorised clients as long as the future is polled.
+    /// Serves `routes` to authorised clients that connect to `listener`, as long as the returned future is polled.
     pub async fn serve(self, listener: TcpListener, routes: Router) {
         serve(listener, self.guard, routes).await;
     }
 }
 
-/// Serves the routes with the guard in front of them, as long as the future is polled.
+/// Serves `routes` behind the access control of `guard` to clients that connect to `listener`, as long as the returned
+/// future is polled.
 pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Router) {
     let tls = guard.entrance.tls.clone();
     let service = TowerToHyperService::new(guarded(guard, routes));
@@ -122,7 +124,8 @@ impl Connections {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Marks the client of a connection as authorised.
+    /// Moves the connection with this number to the list of authorised clients. If this list is full, its oldest
+    /// connection ends.
     fn know(&self, number: u64) {
         let mut open = self.open();
         if let Some(at) = open.strangers.iter().position(|(of, ..)| *of == number) {
@@ -171,7 +174,7 @@ impl Drop for Place {
     }
 }
 
-/// Answers the requests of one connection.
+/// Serves all HTTP requests on the connection `stream`, until it ends.
 async fn answer(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     peer: Peer,
@@ -186,7 +189,8 @@ async fn answer(
     drop(http.serve_connection(TokioIo::new(stream), service).await);
 }
 
-/// Puts the guard in front of the routes, and adds the routes that are open to everybody.
+/// Returns `routes` behind the access control of `guard`, together with the routes that everybody can use (sign-in and
+/// assets).
 fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
     let own = Router::new()
         .route("/token", get(guard::token))
@@ -202,7 +206,8 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .layer(from_fn(in_time))
 }
 
-/// Ends an order whose answer does not begin before the timeout, for example because its body does not arrive.
+/// Passes on a request. A request that changes something gets the status 408 if its answer does not begin before the
+/// timeout, for example because its body does not arrive.
 async fn in_time(request: Request, next: Next) -> Response {
     // A request that only reads has no body to wait for, and the verification of a large record takes time.
     if request.method().is_safe() {

@@ -30,14 +30,15 @@ impl History {
         Self { runs, read: Mutex::default() }
     }
 
-    /// Returns the folder of a run from its name; `None` if this list has no run with that name.
+    /// Returns the folder of the run with this name; `None` if there is no such run, or if the name could lead out of
+    /// the folder of all runs.
     pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
         let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
         let folder = self.runs.join(id);
         (plain && folder.join("journal.sqlite").is_file()).then_some(folder)
     }
 
-    /// Returns the folders of the active runs. Blocks while it reads the disk.
+    /// Returns the folders of the active runs: a program drives each of them. Blocks while it reads the disk.
     pub(crate) fn live(&self) -> Vec<PathBuf> {
         self.ids().filter_map(|id| self.folder(&id)).filter(|folder| is_live(folder)).collect()
     }
@@ -58,7 +59,8 @@ impl History {
         all
     }
 
-    /// Reads the summary of a run from its record; `None` if the record cannot be read. Blocks while it reads the disk.
+    /// Returns the summary of the run in a folder, from the cache if its record has not changed. Returns `None` if the
+    /// record cannot be read. Blocks while it reads the disk.
     pub(crate) fn summary(&self, folder: &Path) -> Option<Arc<RunSummary>> {
         let stamp = stamp(folder);
         let kept = |read: &HashMap<PathBuf, (Stamp, Arc<RunSummary>)>| {

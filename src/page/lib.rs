@@ -59,11 +59,11 @@ pub struct Page {
 type Shared = Arc<Page>;
 
 impl Page {
-    /// Creates the page for the runs in a folder. `planned` returns the planned points. `log` gets messages that are
-    /// recorded nowhere else.
+    /// Creates the page for the runs in the folder `runs`. `entrance` holds its address and access rules. `planned`
+    /// returns the planned points of a run. `log` gets messages that are recorded nowhere else.
     ///
     /// # Errors
-    /// Fails if no random numbers are available for the key.
+    /// The operating system has no random numbers for the key.
     pub fn new(
         runs: PathBuf,
         entrance: Entrance,
@@ -78,19 +78,19 @@ impl Page {
         Ok(Self { guard, run_watcher: live, history, planned })
     }
 
-    /// Returns the address that opens the page. It contains the key if there are no users.
+    /// Returns the address (URL) that opens the page. It contains the key if there is no list of users.
     pub fn url(&self) -> String {
         self.guard.url()
     }
 
-    /// Serves the page as long as the future is polled.
+    /// Serves the page to clients that connect to `listener`, as long as the returned future is polled.
     pub async fn serve(self, listener: TcpListener) {
         let guard = Arc::clone(&self.guard);
         guarded_server::serve(listener, guard, routes(Arc::new(self))).await;
     }
 }
 
-/// Returns the routes for clients that are let in.
+/// Returns the routes of the page for authorised clients.
 fn routes(page: Shared) -> Router {
     Router::new()
         .route("/", get(view::home))

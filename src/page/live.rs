@@ -26,7 +26,7 @@ pub(crate) struct ObservedRun {
 }
 
 impl ObservedRun {
-    /// Returns true if the run has no end on record and no program that answers. The state of its machines is then
+    /// Returns true if no program answers for the run and its record has no end. The state of its machines is then
     /// unknown.
     pub(crate) fn is_lost(&self) -> bool {
         !self.answers && self.summary.ended.is_none()
@@ -43,7 +43,8 @@ impl RunWatcher {
         Self { history, watched: Mutex::default() }
     }
 
-    /// Returns a receiver of the current status of a run and of its changes.
+    /// Returns a receiver of the current status of the run in `folder` and of its changes. Starts a watcher for this
+    /// run if there is none.
     pub(crate) fn subscribe(self: &RunWatcher, folder: &Path) -> Receiver<ObservedRun> {
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
         watched.retain(|_, seen| seen.receiver_count() > 0);
@@ -57,7 +58,7 @@ impl RunWatcher {
     }
 }
 
-/// Watches a run until no browser shows it.
+/// Sends the status of the run in `folder` to `seen` at each change, until no browser receives it.
 async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<ObservedRun>) {
     let watching = async {
         loop {
@@ -78,7 +79,10 @@ async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Obse
     }
 }
 
-/// Follows the program of a run as long as it answers.
+/// Sends each snapshot from the program of the run to `seen`, until the program ends the connection.
+///
+/// # Errors
+/// The program cannot be reached, or the connection fails.
 async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun>) -> std::io::Result<()> {
     let mut watch = watch(folder).await?;
     let mut read_at = None;
@@ -105,7 +109,8 @@ async fn read(folder: &Path, history: &Arc<History>) -> Arc<RunSummary> {
     spawn_blocking(move || history.summary(&folder)).await.ok().flatten().unwrap_or_default()
 }
 
-/// Returns true if the part was accepted, false if it was not, and `None` if the result is unknown.
+/// Returns true if the part of the run was accepted. Returns false if it was not, or if the run was stopped or aborted.
+/// Returns `None` if the run has no result yet.
 pub(crate) fn verdict(seen: &ObservedRun) -> Option<bool> {
     match seen.summary.result {
         RunResult::Accepted => Some(true),

@@ -30,7 +30,8 @@ struct Answer {
     message: String,
 }
 
-/// Gives an order to a running cell.
+/// Gives the order in `body` to the running cell of the run, and answers with its reply. Refuses an order from another
+/// page, of a person without the right to give it, or of a browser without control if the order needs control.
 pub(crate) async fn order(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -51,7 +52,7 @@ pub(crate) async fn order(
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     if !MAKES_SAFE.contains(&name) && !page.guard.has_control(&session, true) {
-        let message = "another screen has control; take it over first".to_owned();
+        let message = "another screen has control of the cell; take control first".to_owned();
         return (StatusCode::CONFLICT, Json(Answer { accepted: false, message })).into_response();
     }
     if name == "resume"
@@ -65,7 +66,7 @@ pub(crate) async fn order(
 /// Orders that every screen can give, without control.
 const MAKES_SAFE: [&str; 3] = ["hold", "stop", "abort"];
 
-/// Returns the name of an order of the page; `None` for requests that are for programs and the terminal only.
+/// Returns the name of an order that the page can give, such as `hold`; `None` for any other request to a cell.
 fn name_of(request: &Request) -> Option<&'static str> {
     match request {
         Request::Hold { .. } => Some("hold"),
@@ -80,22 +81,24 @@ fn name_of(request: &Request) -> Option<&'static str> {
     }
 }
 
-/// Returns the reason why the person at a browser cannot give an order; `None` if the role of the person allows it.
+/// Returns the reason why the person at a browser cannot give the order named `order`; `None` if the person can give
+/// it.
 fn not_for(session: &Session, order: &str) -> Option<String> {
     let person = session.person.as_ref().filter(|_| !session.may(order))?;
-    Some(format!("the order {order} of {person}: the role of this person cannot give it"))
+    Some(format!("the order {order} of {person}: the role of this person does not allow this order"))
 }
 
-/// Returns the reason to refuse a resume: only a process engineer can clear an active alarm, and the person at the
-/// browser is not a process engineer. Otherwise returns `None`.
+/// Returns the reason to refuse a resume. There is one if an alarm is active that only a process engineer can clear,
+/// and if the person at the browser is not one. Otherwise returns `None`.
 async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
     let theirs = status.alarms.iter().find(|alarm| alarm.clears == Role::ProcessEngineer)?;
-    Some(format!("the order resume of {person}: an engineer clears the alarm \"{}\"", theirs.what))
+    Some(format!("the order resume of {person}: only an engineer can clear the alarm \"{}\"", theirs.what))
 }
 
-/// Gives control to the browser that asks for it.
+/// Gives control of the cell to the browser of this session, if its person can have it and if the change is put on
+/// record.
 pub(crate) async fn take_control(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -125,7 +128,7 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
     }
 }
 
-/// Refuses a request, and answers after the refusal is on record.
+/// Answers with the given status and the reason `what`, after the refusal is on record in the run.
 async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> Response {
     if page.guard.refused(&what) {
         drop(write_down(&page.history, Some(run.to_owned()), format!("the page refused {what}")).await);
@@ -133,8 +136,8 @@ async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> R
     (status, Json(Answer { accepted: false, message: what })).into_response()
 }
 
-/// Puts a message on record in one run, or in every active run. The record is written in its turn. A run that has ended
-/// accepts no remark.
+/// Puts the message `what` on record in the run named `run`, or in every active run if `run` is `None`. The program of
+/// the run writes it. A run that has ended accepts no message.
 pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: String) -> JoinHandle<()> {
     let history = Arc::clone(history);
     spawn_blocking(move || {
@@ -146,7 +149,8 @@ pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: Stri
     })
 }
 
-/// Sends a request to the cell on a blocking thread.
+/// Sends a request to the cell of the run in `folder`, in the name of the person at the browser, and returns the reply.
+/// Does not block the other requests.
 async fn give(folder: PathBuf, request: Request, session: &Session) -> std::io::Result<Reply> {
     let screen = session.id.get(..6).map_or("page".to_owned(), |short| format!("page, screen {short}"));
     let station = if session.from.is_loopback() { screen } else { format!("{screen}, at {}", session.from) };

@@ -47,7 +47,8 @@ pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>)
     .await
 }
 
-/// Returns the path of a file of a cycle that is named in the record.
+/// Returns the path of a file of a cycle. `named` returns its name from the record. Returns `None` if the run, the
+/// cycle or the file is not on record.
 fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option<&String>) -> Option<PathBuf> {
     let folder = page.history.folder(run)?;
     let summary = page.history.summary(&folder)?;
@@ -55,8 +56,8 @@ fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option
     Some(folder.join(named(of)?))
 }
 
-/// Answers with the bytes that `make` returns, or with the status 404 if it returns `None`. `make` runs on a blocking
-/// thread, so that no other request waits.
+/// Answers with the bytes that `make` returns, with the status 404 if it returns no bytes, or 422 for its error. `make`
+/// runs on a blocking thread, so that no other request waits.
 async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatError>> + Send + 'static) -> Response {
     match spawn_blocking(make).await {
         Ok(Some(Ok(Some(bytes)))) => {
@@ -69,7 +70,9 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
     }
 }
 
-/// Returns the bytes of the nodes on their grid; `None` if they do not lie on a grid.
+/// Returns the map as bytes (little-endian): the number of columns and rows, the first position and the spacing along x
+/// and y in millimetres, then all errors and all standard uncertainties in micrometres, NaN where nothing was measured.
+/// Returns `None` if the nodes do not lie on a regular grid, or if the grid is too large.
 fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
     let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
@@ -91,14 +94,16 @@ fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns the index of a position on an axis; `None` if it lies between two grid positions.
+/// Returns the index of the position `value` on an axis that begins at `first` with the spacing `step`; `None` if it
+/// lies between two positions.
 fn place(value: f64, first: f64, step: f64) -> Option<usize> {
     const ROUNDING: f64 = 0.01;
     let steps = (value - first) / step;
     ((steps - steps.round()).abs() < ROUNDING).then_some(steps.round() as usize)
 }
 
-/// Returns the first position along an axis, the spacing and the number of positions; `None` if there is no spacing.
+/// Returns three numbers for the positions along an axis: the first position, the spacing and the number of positions.
+/// Returns `None` if all positions are equal.
 fn axis(mut places: Vec<f64>) -> Option<[f64; 3]> {
     places.sort_by(f64::total_cmp);
     let (first, last) = (*places.first()?, *places.last()?);

@@ -62,8 +62,8 @@ impl Default for SignedIn {
 }
 
 impl SignedIn {
-    /// Returns the person who has signed in with a browser; `None` if nobody has, if the session has expired, or if the
-    /// entry of the person in the list has changed since the sign-in.
+    /// Returns the person who has signed in with the browser `session`. Returns `None` if nobody has, if the session
+    /// has expired, or if the entry of this person in `users` has changed since the sign-in.
     pub(crate) fn person(&self, session: &str, users: &UsersFile) -> Option<Person> {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.retain(|(.., since)| since.elapsed() < SESSION_LIFETIME);
@@ -83,7 +83,8 @@ impl SignedIn {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner).retain(|(id, ..)| id != session);
     }
 
-    /// Counts an attempt under a name from a place. Returns true if the attempt can be checked.
+    /// Counts an attempt to sign in as `name` from the address `from`. Returns false if there were too many attempts
+    /// within a minute; the password is then not checked.
     fn may_try(&self, from: IpAddr, name: &str) -> bool {
         let mut tries = self.tries.lock().unwrap_or_else(PoisonError::into_inner);
         tries.retain(|_, rate| !rate.is_over());
@@ -107,13 +108,13 @@ impl SignedIn {
         tries.entry(this).or_insert_with(Rate::new).count() <= TRIES
     }
 
-    /// Resets the attempts of a user who gave the correct password.
+    /// Deletes the count of attempts as `name` from the address `from`, because the password was correct.
     fn forget_tries(&self, from: IpAddr, name: &str) {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }
 
-    /// Reserves a slot in the queue of password checks, which is released when the value is dropped. Waits until the
-    /// place of the client has a free slot; returns `None` after the timeout.
+    /// Reserves a slot for a password check of a client at `from`. Waits for a free slot, and returns `None` after the
+    /// timeout [`WAITS`]. The slot is released when the returned value is dropped.
     async fn wait_a_while(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let began = Instant::now();
         loop {
@@ -124,7 +125,8 @@ impl SignedIn {
         }
     }
 
-    /// Reserves a slot in the queue at once; `None` if the place of the client uses all its slots.
+    /// Reserves a slot for a password check of a client at `from`, without waiting. Returns `None` if this address or
+    /// network uses all its slots.
     fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let place = place(from);
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -155,8 +157,8 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// Returns the place that an address belongs to: the address itself for IPv4, the /64 network for IPv6, because one
-/// client of an IPv6 network has all its addresses.
+/// Returns the address under which the attempts and connections of a client are counted: the address itself for IPv4,
+/// and its /64 network for IPv6, where one client can use all addresses of a network.
 pub(crate) fn place(from: IpAddr) -> IpAddr {
     match from.to_canonical() {
         IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX))),
@@ -189,7 +191,7 @@ pub(crate) async fn sign_in(
     }
     let (who, name) = (printable(&given.name), given.name.trim().to_lowercase());
     if !guard.signed_in.may_try(from, &name) {
-        let what = format!("one of too many tries to sign in within a minute, as {who}, from {from}");
+        let what = format!("a sign-in as {who} from {from}, after too many attempts within a minute");
         return refuse(StatusCode::TOO_MANY_REQUESTS, what, Text::TooManyTries);
     }
     let waiting = guard.signed_in.wait_a_while(from).await;
@@ -198,7 +200,7 @@ pub(crate) async fn sign_in(
         None => None,
     };
     let Some(turn) = turn else {
-        let what = format!("a try to sign in whose turn did not come in time, as {who}, from {from}");
+        let what = format!("a sign-in as {who} from {from}, which waited too long for the sign-ins of others");
         return refuse(StatusCode::SERVICE_UNAVAILABLE, what, Text::TooManyTries);
     };
     let Some(proven) = prove(&guard, turn, given).await else {
@@ -217,13 +219,14 @@ pub(crate) async fn sign_in(
     response
 }
 
-/// Waits for the turn of a password check; `None` after the timeout.
+/// Waits until no other password check runs, and returns the permit for this one; `None` after the timeout [`WAITS`].
 async fn turn(guard: &Arc<Guard>) -> Option<OwnedSemaphorePermit> {
     let turn = Arc::clone(&guard.signed_in.proving).acquire_owned();
     tokio::time::timeout(WAITS, turn).await.ok()?.ok()
 }
 
-/// Checks a name and a password, while holding the permit `turn`.
+/// Returns the user if the name and the password in `given` are correct, otherwise `None`. Releases the permit `turn`
+/// at its end.
 async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<AuthenticatedUser> {
     let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {

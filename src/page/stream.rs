@@ -51,7 +51,8 @@ pub(crate) async fn events(
 }
 
 impl RunEventStream {
-    /// Waits for the next update for the browser; `None` if there will be no more.
+    /// Waits for a change of the run, at most one second, and returns the next message for the browser. Returns `None`
+    /// if the watcher of the run has ended or the browser has no access any more.
     async fn next(&mut self) -> Option<Event> {
         if !self.is_first {
             if let Ok(Err(_)) = tokio::time::timeout(MAX_SILENCE, self.run.changed()).await {

@@ -19,7 +19,7 @@ pub(crate) enum Language {
 impl Language {
     pub(crate) const ALL: [Self; 3] = [Self::En, Self::De, Self::Zh];
 
-    /// Returns the language tag for HTML and browsers.
+    /// Returns the language tag for HTML and browsers, such as `en`.
     pub(crate) fn tag(self) -> &'static str {
         ["en", "de", "zh"][self as usize]
     }
@@ -29,8 +29,8 @@ impl Language {
         ["English", "Deutsch", "中文"][self as usize]
     }
 
-    /// Returns the first supported language in a list of tags, for example that of `Accept-Language`. The order of the
-    /// list decides; its weights are ignored.
+    /// Returns the first language in `tags`, a list such as that in the header `Accept-Language`, that the page
+    /// supports; `None` if it supports none. The order of the list decides, not its weights.
     pub(crate) fn first_of(tags: &str) -> Option<Self> {
         tags.split(',').find_map(|tag| {
             let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
@@ -51,7 +51,7 @@ macro_rules! texts {
             #[cfg(test)]
             const ALL: &[Self] = &[$(Self::$name),+];
 
-            /// Returns the text in a language.
+            /// Returns this text in `language`.
             pub(crate) fn to(self, language: Language) -> &'static str {
                 match self {
                     $(Self::$name => [$en, $de, $zh][language as usize],)+
@@ -76,7 +76,7 @@ texts! {
     Simulation { "SIMULATION", "SIMULATION", "仿真" }
     NotConnected { "No data since", "Keine Daten seit", "无数据，自" }
     ProgramGone {
-        "The program that ran the cell does not answer. What the machines do is not known: look at them. Then: regrind resume",
+        "The program that ran the cell does not answer. The state of the machines is unknown: look at them. Then run: regrind resume",
         "Das Programm der Zelle antwortet nicht. Was die Maschinen tun, ist nicht bekannt: bitte nachsehen. Dann: regrind resume",
         "单元程序没有应答。机器的状态未知：请到现场查看。然后执行：regrind resume"
     }
@@ -86,7 +86,7 @@ texts! {
         "仿真该单元的程序已结束，其中的机器也随之结束。请开始新的运行。"
     }
     PageGone {
-        "This page has lost its server. What the cell does is not known here: look at it.",
+        "This page has lost the connection to its server. The state of the cell is unknown here: look at the machines.",
         "Diese Seite hat ihren Server verloren. Was die Zelle tut, ist hier nicht bekannt: bitte nachsehen.",
         "页面与服务器断开。此处无法得知单元状态：请到现场查看。"
     }
@@ -166,7 +166,7 @@ texts! {
     FirstThing { "RESUME does this first:", "FORTSETZEN tut zuerst dies:", "“继续”首先执行：" }
     TakeControl { "TAKE CONTROL", "BEDIENUNG ÜBERNEHMEN", "接管操作" }
     ControlElsewhere {
-        "Another screen has control. Hold, end and abort work here all the same.",
+        "Another screen has control. HOLD, END THE RUN and ABORT work here too.",
         "Ein anderer Bildschirm bedient. Halten, Beenden und Abbrechen gehen hier trotzdem.",
         "另一屏幕正在操作。此处仍可保持、结束和中止。"
     }
@@ -203,7 +203,7 @@ texts! {
         "按“继续”，或“结束运行”。"
     }
     SeeStands {
-        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine does not know it, answer below:",
+        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine does not know this state, write below what you saw, and confirm:",
         "Prüfen, ob diese Maschine steht. Dann FORTSETZEN drücken: sie wird nach ihrem Auftrag gefragt; kann sie es nicht sagen, unten angeben:",
         "查看此机器是否静止。然后按“继续”，系统会询问其作业结果；若机器无法应答，请在下方说明："
     }
@@ -274,7 +274,7 @@ texts! {
         "geprüft wird, dass die Schleifmaschine frei ist; dann beginnt die Messung",
         "确认磨床已离开零件；然后开始测量"
     }
-    ComputesAnew { "the cell computes it again; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
+    ComputesAnew { "the cell repeats the computation; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
     // Results of runs.
     Open { "no end on record", "kein Ende im Protokoll", "无结束记录" }
     Live { "on now", "im Gang", "进行中" }
@@ -322,7 +322,7 @@ texts! {
     NotHere { "There is nothing at this address.", "Unter dieser Adresse ist nichts.", "此地址没有内容。" }
 }
 
-/// Returns the text for a state.
+/// Returns the word for a state of the cell.
 pub(crate) fn state(name: StateName) -> Text {
     match name {
         StateName::Idle => Text::Idle,
@@ -343,7 +343,7 @@ pub(crate) fn state(name: StateName) -> Text {
     }
 }
 
-/// Returns the text for a phase.
+/// Returns the words for a phase of a run.
 pub(crate) fn phase(phase: Phase) -> Text {
     match phase {
         Phase::Load => Text::AtLoad,
@@ -356,7 +356,7 @@ pub(crate) fn phase(phase: Phase) -> Text {
     }
 }
 
-/// Returns the text for the result of a run.
+/// Returns the words for the result of a run.
 pub(crate) fn result(result: RunResult) -> Text {
     match result {
         RunResult::Open => Text::Open,
@@ -368,7 +368,7 @@ pub(crate) fn result(result: RunResult) -> Text {
     }
 }
 
-/// Returns the text for a role.
+/// Returns the word for a role of a person.
 pub(crate) fn role(role: PageRole) -> Text {
     match role {
         PageRole::Viewer => Text::Viewer,
@@ -378,7 +378,7 @@ pub(crate) fn role(role: PageRole) -> Text {
     }
 }
 
-/// Returns the next action of a person, and the machine that it concerns.
+/// Returns the sentence for what a person must do next, and the machine that this concerns, if any.
 pub(crate) fn next(next: &NextStep, language: Language) -> (String, Option<Device>) {
     let (text, device) = match next {
         NextStep::Load => (Text::Load, None),
@@ -396,7 +396,8 @@ pub(crate) fn next(next: &NextStep, language: Language) -> (String, Option<Devic
     (text.to(language).to_owned(), device)
 }
 
-/// Returns the first action of a resume if the cell is held in a phase, and the machine that it concerns.
+/// Returns the sentence for what the cell does first after a resume, if it is held in `phase`, and the machine that
+/// this concerns, if any.
 pub(crate) fn on_resume(phase: Phase) -> (Text, Option<Device>) {
     let Some((device, step)) = phase.job() else {
         let text = match phase {

@@ -47,12 +47,12 @@ impl PageRole {
     /// All roles, in ascending order of permissions.
     pub const ALL: [Self; 4] = [Self::Viewer, Self::Quality, Self::Operator, Self::Engineer];
 
-    /// Returns the name of the role in the file and on the command line.
+    /// Returns the word for the role in the file of the users and on the command line.
     pub fn name(self) -> &'static str {
         ["viewer", "quality", "operator", "engineer"][self as usize]
     }
 
-    /// Returns true if this role can give the order with that name.
+    /// Returns true if this role can give the order named `order`, such as `hold`.
     pub(crate) fn may(self, order: &str) -> bool {
         match self {
             Self::Viewer => false,
@@ -106,7 +106,7 @@ pub enum UsersError {
         "the name of a user must have 1 to {LONGEST_NAME} characters, without control characters and without characters that change the direction of the text"
     )]
     Name,
-    #[error("the password has {found} bytes; it needs {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}")]
+    #[error("the password has {found} bytes; choose one of {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} bytes")]
     Password { found: usize },
     #[error("the password cannot be hashed: {0}")]
     Hash(String),
@@ -136,10 +136,10 @@ pub struct Users {
 }
 
 impl Users {
-    /// Reads a list of users.
+    /// Reads a list of users from its file.
     ///
     /// # Errors
-    /// Fails if the file is missing, if others can read it, or if it is not a valid list.
+    /// A file that cannot be read, that other users of the computer can read, or that is not a valid list.
     pub fn read(path: &Path) -> Result<Self, UsersError> {
         let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
         let found = std::fs::metadata(path).map_err(failed)?;
@@ -170,17 +170,17 @@ impl Users {
         Ok(Self { users })
     }
 
-    /// Returns the content of the file for this list.
+    /// Returns the text of the file for this list.
     pub fn to_text(&self) -> String {
         let written = Written { user: self.users.clone() };
         // The list contains only strings, so the conversion to TOML cannot fail.
         format!("{FIRST_LINES}\n{}", toml::to_string(&written).unwrap_or_default())
     }
 
-    /// Adds a person, or changes the password and the role of an existing person.
+    /// Adds a person with a role and a password, or replaces the role and the password of an existing person.
     ///
     /// # Errors
-    /// Fails if the name is not valid, or if the password is too short or too long.
+    /// A name that is not allowed; a password that is too short or too long.
     pub fn add(&mut self, name: &str, role: PageRole, password: &str) -> Result<(), UsersError> {
         let name = named(name)?;
         if !(SHORTEST_PASSWORD..=LONGEST_PASSWORD).contains(&password.len()) {
@@ -194,7 +194,7 @@ impl Users {
         Ok(())
     }
 
-    /// Removes a person from the list. Returns true if the person was on it.
+    /// Removes the person with this name. Returns false if there was no such person.
     pub fn remove(&mut self, name: &str) -> bool {
         let before = self.users.len();
         self.users.retain(|user| user.name != name);
@@ -206,8 +206,8 @@ impl Users {
         self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
     }
 
-    /// Returns the user with this name and password; `None` if there is no such user. Takes some hundredths of a
-    /// second, also for an unknown name, so that the time does not show to an attacker which names exist.
+    /// Returns the user with this name and password; `None` if one of them is wrong. Takes some hundredths of a second
+    /// also for an unknown name, so that an attacker cannot find by the time which names exist.
     fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         let user = self.users.iter().find(|user| user.name == name);
         let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;
@@ -243,16 +243,16 @@ pub struct UsersFile {
 }
 
 impl UsersFile {
-    /// Opens a list.
+    /// Opens the file of a list of users.
     ///
     /// # Errors
-    /// Fails as [`Users::read`] does.
+    /// The same as for [`Users::read`].
     pub fn open(path: &Path) -> Result<Self, UsersError> {
         let read = (changed(path), Users::read(path)?);
         Ok(Self { path: path.to_owned(), read: Mutex::new(read) })
     }
 
-    /// Returns the current list. If the file cannot be read, the list is empty.
+    /// Returns the list of users, read again if its file has changed. The list is empty if the file cannot be read.
     fn now(&self) -> Users {
         let at = changed(&self.path);
         let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
@@ -262,12 +262,13 @@ impl UsersFile {
         read.1.clone()
     }
 
-    /// Returns the user with this name and password. Blocks for some hundredths of a second.
+    /// Returns the user with this name and password; `None` if one of them is wrong. Blocks for some hundredths of a
+    /// second.
     pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         self.now().signs_in(name, password)
     }
 
-    /// Returns true if an entry is still on the list without changes.
+    /// Returns true if the entry of this user (name, role and password) is unchanged in the list.
     pub(crate) fn has(&self, AuthenticatedUser(was): &AuthenticatedUser) -> bool {
         self.now().users.contains(was)
     }

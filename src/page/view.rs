@@ -52,7 +52,8 @@ impl Piece {
     }
 }
 
-/// Returns all pieces of the page of a run.
+/// Returns the HTML of all pieces of the page of a run. `has_control` is true if the page must not offer to take over
+/// control.
 pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) -> [(Piece, String); 8] {
     let ObservedRun { snapshot, summary, .. } = seen;
     let snapshot = snapshot.as_deref();
@@ -71,7 +72,8 @@ pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) 
     .map(|(piece, markup)| (piece, markup.into_string()))
 }
 
-/// Returns the state of a run for the scripts of the page.
+/// Returns the state of a run as JSON for the scripts of the page. `has_control` is true if the browser has control, or
+/// can get it without taking it over.
 pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) -> Value {
     let live = seen.snapshot.as_deref().filter(|_| seen.answers);
     let cycles: Vec<_> = seen
@@ -102,7 +104,8 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
     })
 }
 
-/// Returns the orders that are possible in the present state of the cell and that the person can give.
+/// Returns the names of the orders that the browser can give now. They depend on the state of the cell, the role of the
+/// person, and `has_control`: true if the browser has control, or can get it without taking it over.
 fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
@@ -125,7 +128,7 @@ fn is_over(state: StateName) -> bool {
     matches!(state, StateName::Stopped | StateName::Aborted | StateName::Complete)
 }
 
-/// Returns the state in one word, with a shape and a colour, readable from a distance of two metres.
+/// Returns the HTML of the state in one word, with a shape and a colour, readable from a distance of two metres.
 fn banner(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let mark = |class: &str, shape: &str, word: &str, more: &str| {
@@ -176,7 +179,7 @@ const CROSS: &str = "M4 7 L7 4 L12 9 L17 4 L20 7 L15 12 L20 17 L17 20 L12 15 L7 
 const TRIANGLE: &str = "M12 2 L23 21 H1 Z";
 const UNKNOWN: &str = "M12 2 L22 12 L12 22 L2 12 Z";
 
-/// Returns the colour and the shape of a state.
+/// Returns the CSS class (colour) and the SVG path (shape) for the state of the cell.
 fn state_symbol(live: &Snapshot) -> (&'static str, &'static str) {
     use StateName as S;
     match live.state {
@@ -206,13 +209,13 @@ fn about(seen: &ObservedRun, language: Language) -> Markup {
     }
 }
 
-/// Formats a time of the record to the second.
+/// Returns a time of the record, such as `2026-03-01T12:00:00.5Z`, as `2026-03-01 12:00:00 UTC`.
 fn when(utc: &str) -> String {
     let second: String = utc.chars().take(19).collect();
     if second.is_empty() { second } else { format!("{} UTC", second.replacen('T', " ", 1)) }
 }
 
-/// Returns the next action of a person, with its buttons.
+/// Returns the HTML of what a person must do next, with the buttons for it.
 fn next(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
@@ -242,7 +245,7 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
     }
 }
 
-/// Returns the progress of the current job.
+/// Returns the HTML of the progress of the current job of a machine; empty if there is none.
 fn job(live: &Snapshot, language: Language) -> Markup {
     let Some(JobProgress { device, done, total, left_s }) = live.progress else { return Markup::default() };
     let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
@@ -263,7 +266,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
     }
 }
 
-/// Formats a range of seconds, rounded to a useful precision.
+/// Returns a range of seconds as text in seconds, minutes or hours.
 fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -275,7 +278,8 @@ fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-/// Returns the active alarms. For a run that has ended, or whose program is gone, returns all alarms on record.
+/// Returns the HTML of the active alarms. If the run has ended, or if its program does not answer, returns all alarms
+/// on record.
 fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
@@ -324,7 +328,7 @@ fn standing(alarm: &Alarm, language: Language) -> Markup {
     }
 }
 
-/// Returns a row for each cycle with its judged figures and their limits.
+/// Returns the HTML table of the judged figures: a row for each cycle, and a row with the limits.
 fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let limit = |mm: f64| if mm.is_finite() { format!("{:.2}", 1e3 * mm) } else { "–".to_owned() };
@@ -370,7 +374,7 @@ fn control(is_elsewhere: bool, language: Language) -> Markup {
     }
 }
 
-/// Percent-encodes the name of a run for an address, because a folder can have any name.
+/// Percent-encodes the name of a run for use in a URL, because a folder can have any name.
 fn in_path(run: &str) -> String {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
     run.bytes().map(|byte| if is_plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
@@ -408,7 +412,8 @@ pub(crate) async fn run(
     document(&title, &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// Returns the page of a run: the cell while the run is active, and its result afterwards.
+/// Returns the HTML of the page of the run named `id`: the cell while the run is active, and the result afterwards.
+/// `has_control` is true if the browser has control, or can get it without taking it over.
 fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let made = pieces(seen, has_control || !session.may("control"), language);
@@ -449,7 +454,7 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
     }
 }
 
-/// Returns JSON that cannot end a script element early.
+/// Returns `data` as JSON that is safe within an HTML script element: it contains no `<`.
 fn harmless(data: &Value) -> String {
     data.to_string().replace('<', "\\u003c")
 }
@@ -472,7 +477,7 @@ fn map(language: Language) -> Markup {
     }
 }
 
-/// Returns the texts that the scripts show.
+/// Returns, as JSON, the texts in `language` that the scripts show.
 fn script_texts(language: Language) -> Value {
     let say = |text: Text| text.to(language);
     json!({
@@ -482,7 +487,8 @@ fn script_texts(language: Language) -> Value {
     })
 }
 
-/// Returns the colours of the maps, from low to high, the same as in all pictures: three bytes each in hexadecimal.
+/// Returns the 255 colours of a colour map, from the lowest value to the highest, as hexadecimal digits: three bytes
+/// (red, green, blue) for each.
 fn colours(of: ColourMap) -> String {
     let colour = |k: u32| of.at(f64::from(k) / 254.0);
     (0..255).flat_map(colour).map(|byte| format!("{byte:02x}")).collect()
@@ -586,7 +592,8 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
     }
 }
 
-/// Serves two runs side by side.
+/// Serves the page with two runs side by side. The query of the address names them: `run=A&run=B`. Without two existing
+/// runs, redirects to the list of runs.
 pub(crate) async fn compare(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -631,7 +638,7 @@ pub(crate) async fn compare(
     document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// Serves the report of a run from its folder.
+/// Serves the report of a run: the file in its folder, or else a report computed from its record.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let read = spawn_blocking(move || {
@@ -652,7 +659,7 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     }
 }
 
-/// Returns the page for an address that does not exist.
+/// Returns the page with the status 404, for an address that does not exist.
 pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
@@ -660,7 +667,7 @@ pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
         .into_response()
 }
 
-/// Returns the page for a client without a key.
+/// Returns the page that asks a client without a valid key for the key, with the given status.
 pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
@@ -673,7 +680,7 @@ pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMa
     (status, document("Regrind", &Frame { language, person: None, kind: Kind::Plain(of) }, main)).into_response()
 }
 
-/// Returns the sign-in page, with a message for a user whose sign-in failed.
+/// Returns the sign-in page with the given status. `told` is the message after a sign-in that failed.
 pub(crate) fn sign_in(status: StatusCode, of: PageSubject, headers: &HeaderMap, told: Option<Text>) -> Response {
     let language = language(headers);
     let say = |text: Text| text.to(language);
@@ -733,8 +740,8 @@ impl Kind<'_> {
     }
 }
 
-/// Returns a page of the plant within the common frame. The browser reloads it after `again_s` seconds. `style` is the
-/// address of a style sheet that is used in addition to that of the cell's page.
+/// Returns a page of the plant: `main` within the frame that all pages have. The browser reloads the page every
+/// `again_s` seconds, unless this is `None`. `style` is the address of an additional style sheet.
 pub fn plant_document(title: &str, session: &Session, again_s: Option<u32>, style: &str, main: Markup) -> Response {
     let kind = Kind::Plant { again_s, style };
     document(title, &Frame { language: Language::En, person: session.person.as_ref(), kind }, main)
@@ -803,8 +810,8 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
     ([(CONTENT_TYPE, "text/html; charset=utf-8")], markup.into_string()).into_response()
 }
 
-/// Returns the language that was chosen in this browser, otherwise the first language in the preferences of the
-/// browser.
+/// Returns the language that a person chose in this browser, or else the first supported one in the preferences of the
+/// browser, or else English.
 pub(crate) fn language(headers: &HeaderMap) -> Language {
     let chosen = text(headers, COOKIE).and_then(|cookies| {
         let pair = cookies.split(';').find_map(|pair| pair.trim().strip_prefix("regrind_language="))?;

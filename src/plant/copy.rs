@@ -33,7 +33,8 @@ pub struct PlantRun {
 }
 
 impl PlantRun {
-    /// Finds a run by its name, and by its cell if several cells have a run of that name.
+    /// Finds a run in the plant by its name. `cell` is the name of its cell; it is required only if several cells have
+    /// a run with this name.
     ///
     /// # Errors
     /// There is no such run, or the plant cannot be reached.
@@ -79,7 +80,8 @@ impl PlantRun {
         Err(PlantError::Differs { run: self.name.clone(), what })
     }
 
-    /// Fetches the records and files of the run into a new folder. [`regrind_journal::verify`] then verifies it.
+    /// Fetches the records and files of the run from the plant into a new folder. Verifies nothing:
+    /// [`regrind_journal::verify`] does this.
     ///
     /// # Errors
     /// The folder is in use, the text of a record does not have the form that a journal writes, or the plant cannot be
@@ -104,7 +106,7 @@ impl PlantRun {
         Ok(())
     }
 
-    /// Returns the records of the run, in order.
+    /// Returns the records of the run from the plant, in the order of their numbers. `folder` is named in errors.
     async fn records(&self, link: &DatabaseLink, folder: &Path) -> Result<Vec<Record>, PlantError> {
         const PAGE: i32 = 5000;
         let mut records: Vec<Record> = Vec::new();
@@ -147,16 +149,17 @@ impl PlantRun {
             true => Ok(verified),
             false => {
                 let [has, says] = [verified.records, self.records];
-                let what =
-                    format!("the plant has {has} records and counts {says}, or the last record has another hash");
+                let what = format!(
+                    "the plant sent {has} records and has counted {says} on arrival, or the hash of the last one differs"
+                );
                 Err(PlantError::Differs { run: self.name.clone(), what })
             }
         }
     }
 }
 
-/// Returns the anchor of the newest seal among the records, as `journal.anchor` had it after that seal. Without a seal,
-/// returns an anchor of the last record. `None` if there is no record, or if the seal is invalid.
+/// Returns the state of `journal.anchor` after the newest seal among `records`. If there is no seal, returns an anchor
+/// of the last record. Returns `None` if there is no record, or if the seal is invalid.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
     let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal).map(Record::value) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));

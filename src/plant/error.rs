@@ -51,13 +51,15 @@ pub enum PlantError {
 }
 
 impl PlantError {
-    /// Returns true if the error can pass by itself: the network is down, or the database is starting.
+    /// Returns true if the cause can disappear without a change by a person, so that a retry makes sense: the plant
+    /// cannot be reached.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::Unreachable { .. })
     }
 }
 
-/// Converts an error of the database to a [`PlantError`]; `what` names the request that failed.
+/// Returns a function that converts an error of the database into a [`PlantError`]. `what` names the refused request in
+/// the message.
 pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
     move |error| {
         let Some(said) = error.as_db_error() else {
@@ -74,7 +76,7 @@ pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> P
     }
 }
 
-/// Returns the message of an error of the client, with its causes.
+/// Returns the message of an error of the database client, followed by the messages of its causes.
 pub(crate) fn in_words(error: &tokio_postgres::Error) -> String {
     let mut words = error.to_string();
     let mut behind = std::error::Error::source(error);

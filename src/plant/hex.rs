@@ -1,11 +1,12 @@
 //! Conversion of hashes between bytes (database) and lower-case hexadecimal digits (people and journals).
 
-/// Returns the hexadecimal digits of bytes.
+/// Returns the bytes as lower-case hexadecimal digits.
 pub(crate) fn digits(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Returns the bytes of hexadecimal digits; `None` if the text is not pairs of lower-case digits.
+/// Parses hexadecimal digits into bytes. Returns `None` if the number of digits is odd, or if a character is neither a
+/// digit nor a letter from `a` to `f`. Capital letters are not accepted.
 pub(crate) fn unhex(digits: &str) -> Option<Vec<u8>> {
     let nibble = |digit: u8| match digit {
         b'0'..=b'9' => Some(digit - b'0'),

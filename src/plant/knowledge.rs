@@ -46,8 +46,8 @@ struct Head {
 }
 
 impl Knowledge {
-    /// Asks the plant for the results of other cells for a kind of parts, and for the pairs of results that show how
-    /// similar machines are.
+    /// Queries the plant for what other cells have learned about parts of this `kind`. Also queries the pairs of
+    /// results that show how similar machines are. `simulation` selects results of simulated cells.
     ///
     /// # Errors
     /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: it
@@ -78,7 +78,8 @@ impl Knowledge {
         Ok(knowledge)
     }
 
-    /// Verifies the delivered results, and returns the valid ones. Reports the invalid ones to the plant.
+    /// Verifies the content of the results in `rows`, and returns the valid ones. Reports the others to the plant, and
+    /// adds them to `left_alone`.
     async fn verify_results(
         &mut self,
         link: &DatabaseLink,
@@ -103,8 +104,9 @@ impl Knowledge {
     }
 }
 
-/// Reads a result from a row, and checks that its content has the hash in the row. Returns the reason if the result
-/// cannot be used.
+/// Reads a result of another cell from a row of the database or from the folder of large files. Checks that its content
+/// has the recorded hash. Returns the reason if the result cannot be used. `simulation` is true if the own run is
+/// simulated.
 fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<DeliveredResult, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
@@ -125,7 +127,7 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
     Ok(DeliveredResult { kind, is_own, from, learned })
 }
 
-/// Reads a file of at most [`MAX_BYTES`] bytes; returns an error for a longer one.
+/// Reads a file. Returns an error if it is longer than [`MAX_BYTES`].
 fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     fs::File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut content)?;
@@ -135,9 +137,9 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Registers in the plant the learned result of a finished run of this cell, after all files of the run have arrived
-/// there. Returns the reason if the plant refuses the result; `None` if it is registered, or if there is no usable
-/// result.
+/// Registers in the plant what a finished run of this cell has learned, so that other cells can use it. All files of
+/// the run, whose id in the plant is `id`, must have arrived there. Returns the reason if the plant refuses the result.
+/// Returns `None` if the result is registered, or if the run has no usable one.
 pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";

@@ -93,8 +93,8 @@ impl DatabaseLink {
     }
 }
 
-/// Converts an error of signing in: a refused login is reported as such; every other error means that the database
-/// cannot be reached.
+/// Converts an error of the login to the database. A refused login and a missing database are reported as refused;
+/// every other error as an unreachable database. `place` is the address of the database.
 fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
     match error.as_db_error() {
         // Classes 28 (invalid authorisation), 3D and 42 (no such database or role).

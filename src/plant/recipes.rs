@@ -42,8 +42,9 @@ pub struct Approval {
 }
 
 impl PlantRecipe {
-    /// Returns the hash that identifies the recipe and that people sign, in hexadecimal digits. It is the SHA-256 of a
-    /// first line with the format, then name, version, hash of the text, and a line for each file.
+    /// Returns the SHA-256, in hexadecimal digits, that identifies the recipe and that people sign. It is the hash of
+    /// these lines: the format, the name, the version, the hash of the recipe's text, and the hash and name of each
+    /// file.
     pub fn sha256(&self) -> String {
         let mut lines =
             format!("regrind recipe 1\n{}\n{}\n{}\n", self.name, self.version, sha256_hex(self.text.as_bytes()));
@@ -74,7 +75,8 @@ impl PlantRecipe {
         Ok(digits(row.get(0)))
     }
 
-    /// Finds a version of a recipe, or the newest version that is not withdrawn. For planners and readers.
+    /// Finds the given version of a recipe. Without `version`, finds the newest one that is not withdrawn. The database
+    /// role must be that of a planner or a reader.
     ///
     /// # Errors
     /// There is no such recipe, or the plant cannot be reached.
@@ -121,8 +123,9 @@ impl PlantRecipe {
         }
     }
 
-    /// Pulls the recipe with a hash to a cell, and verifies it: the recipe must have this hash, and at least two people
-    /// with different keys must have signed it who are in the plant file of the cell. Returns their names.
+    /// Fetches the recipe with the hash `sha256` from the plant and verifies it. It must have this hash. At least two
+    /// people with different keys must have signed it, and both must be in `approvers`, the list in the plant file of
+    /// the cell. Returns the recipe and the names of these people.
     ///
     /// # Errors
     /// The recipe does not match its hash, too few people have signed it, or it was withdrawn; the plant receives a
@@ -164,13 +167,13 @@ impl PlantRecipe {
     }
 }
 
-/// Returns the text that a person signs.
+/// Returns the text that `person` signs to approve the recipe with the hash `sha256`.
 fn words(sha256: &str, person: &str) -> String {
     format!("regrind recipe approval 1\n{sha256}\n{person}\n")
 }
 
-/// Verifies a recipe received from the plant. Returns the recipe and the names of the approvers who signed it;
-/// otherwise the fault as a text.
+/// Verifies a recipe from the plant: its hash must be `sha256`, and enough `approvers` must have signed it in
+/// `approvals`. Returns the recipe and the names of those who signed, or the fault as a text.
 fn proven(
     recipe: PlantRecipe,
     sha256: &str,

@@ -72,7 +72,7 @@ impl Replicator {
         Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), reported: HashSet::new() }
     }
 
-    /// Returns the runs that differ from the plant's copy, with the reason.
+    /// Returns the runs that are no longer replicated because they differ from the plant's copy, each with the reason.
     pub fn skipped(&self) -> impl Iterator<Item = (&str, &str)> {
         self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
     }
@@ -100,7 +100,8 @@ impl Replicator {
         Ok(shipped)
     }
 
-    /// Returns the runs that can have new content.
+    /// Returns the runs whose files have changed since they were last replicated completely, the newest change first.
+    /// Each has the modification times of its files.
     fn unsettled(&self) -> Vec<(String, Stamp)> {
         let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
         let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
@@ -114,7 +115,8 @@ impl Replicator {
         open
     }
 
-    /// Replicates one run; returns true if the plant then has all of it.
+    /// Sends the new records and files of the run `name` to the plant, and counts them in `shipped`. Returns true if
+    /// the plant then has the complete run.
     async fn replicate_run(
         &mut self,
         link: &DatabaseLink,
@@ -148,7 +150,8 @@ impl Replicator {
         Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
     }
 
-    /// Registers in the plant what a finished run has learned.
+    /// Registers in the plant what a finished run has learned. If the plant refuses it, adds the reason to `shipped`,
+    /// once per run.
     async fn teach(
         &mut self,
         link: &DatabaseLink,
@@ -165,8 +168,9 @@ impl Replicator {
         Ok(())
     }
 
-    /// Sends the contents of the recorded files that the plant does not have. Returns how many were sent and how many
-    /// could not be sent.
+    /// Sends the contents of recorded files that the plant does not have. `id` is the id of the run in the plant.
+    /// Returns two numbers of files: those sent, and those that cannot be sent. The latter are reported to the plant
+    /// and added to `shipped`.
     async fn give_files(
         &mut self,
         link: &DatabaseLink,
@@ -194,7 +198,8 @@ impl Replicator {
         Ok(files)
     }
 
-    /// Sends the content of one file; returns the reason if it cannot be sent.
+    /// Sends the content of the file at `path`. Returns the reason if it cannot be sent: it cannot be read, or it does
+    /// not have the recorded length `bytes` and hash `sha256`.
     async fn give_file(
         &self,
         link: &DatabaseLink,
@@ -254,7 +259,8 @@ async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, Plan
     Ok(PlantRunState { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
-/// Compares a journal with the plant's copy, and reports a difference to the plant.
+/// Checks that the journal of a run contains the records that the plant has (`there`). If it does not, reports this to
+/// the plant and returns an error.
 async fn compare_with_plant(
     link: &DatabaseLink,
     folder: &Path,
@@ -278,7 +284,8 @@ async fn compare_with_plant(
     }
 }
 
-/// Reads the next batch of records.
+/// Reads the records after number `records` from the journal of a run, up to the maximum number or size for one
+/// request.
 fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     let mut batch = Vec::new();
     let mut bytes = 0;
@@ -294,8 +301,8 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     Ok(batch)
 }
 
-/// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
-/// the state.
+/// Sends `batch` to the plant, and returns how many records the plant has then, and the hash of the last one. If the
+/// answer is lost, the next round queries this state.
 async fn send_records(
     link: &DatabaseLink,
     run: &str,
@@ -314,7 +321,8 @@ async fn send_records(
     }
 }
 
-/// Returns true if the run with this last record has its end on record.
+/// Returns true if the journal of a run contains the record of its end. `last` is its last record: the end itself, or
+/// the seal after it.
 fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
     if last.kind == RecordKind::End {
         return Ok(true);
@@ -359,7 +367,7 @@ pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
     }))
 }
 
-/// Returns the radius of the probe from the recipe of the run.
+/// Returns the radius of the probe in mm from the recipe of a run; `None` if it cannot be read.
 fn probe_of(folder: &Path) -> Option<f64> {
     let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
     recipe.get("measure")?.get("probe_radius_mm")?.as_float()

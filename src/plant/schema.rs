@@ -21,8 +21,8 @@ const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", 
 /// Key of the advisory lock that stops two programs from changing the layout at once.
 const LOCK: i64 = 0x5267_7264_506c_616e;
 
-/// Migrates the layout of a database to the version of this program, as its owner. Returns the version before and the
-/// version after.
+/// Updates the tables and functions of a database to the version of this program. Must be called as the owner of the
+/// database. Returns the version before and the version after.
 ///
 /// # Errors
 /// The database role has no right to change the layout, a later version of Regrind made the layout, or a person changed
@@ -62,7 +62,7 @@ pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
     Ok([before, known()])
 }
 
-/// Checks that the layout of a database is the one this program knows.
+/// Checks that the layout of a database (its tables and functions) is the one that this program uses.
 ///
 /// # Errors
 /// The layout is older, later or different.
@@ -88,7 +88,11 @@ fn known() -> i32 {
     MIGRATIONS.last().map_or(0, |(version, _)| *version)
 }
 
-/// Returns the newest applied version, if every applied migration is one of this program's.
+/// Compares the migrations that a database has `applied`, as versions with hashes, with those of this program. Returns
+/// the newest applied version, or 0 if there is none.
+///
+/// # Errors
+/// The database has a migration that this program does not have, or one with another text.
 fn compare_migrations(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
@@ -124,8 +128,8 @@ impl PlantRole {
     }
 }
 
-/// Registers a cell with its role and the keys that may sign its records. A cell that is registered already gets the
-/// new password and the additional keys.
+/// Registers the cell `name` in the plant: creates its database role with a password, and stores the public keys that
+/// may sign its records. For a registered cell, sets the new password and adds the keys.
 ///
 /// # Errors
 /// The database role has no right to create roles, or another cell has a role of this name.

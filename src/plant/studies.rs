@@ -96,8 +96,8 @@ impl LeasedRun {
         }))
     }
 
-    /// Stores the result, or the reason why there is none. Returns whether the plant accepted it: after the lease has
-    /// ended, another worker can have the job.
+    /// Stores the result of this job in the plant, or the reason why there is none. Returns false if the plant does not
+    /// accept it, because the lease has ended and another worker may have the job.
     ///
     /// # Errors
     /// The plant cannot be reached.

@@ -131,7 +131,8 @@ impl StartedPart {
     }
 }
 
-/// Runs a query for a step of a part. The database answers with the reason if it refuses.
+/// Runs a query of the database that changes the state of the part `work`. If the answer contains a reason, the
+/// database has refused, and this reason is returned as an error.
 async fn answered(
     link: &DatabaseLink,
     work: i64,

@@ -21,8 +21,8 @@ use crate::surface::{DefinedSurface, SurfaceDefinition};
 /// Maximum number of points: more than any part is measured with.
 const MAX_POINTS: f64 = 1e6;
 
-/// Checks a recipe as written. Errors are reported to `document`. Returns the values that several keys define together,
-/// or `None` for those that are invalid.
+/// Checks the values of a recipe. Reports each error to `document`. Returns the source of the nominal surface and the
+/// measuring pattern, which several keys define together; `None` for each that is invalid.
 pub(super) fn check(
     written: &RecipeFile,
     path: &Path,
@@ -42,7 +42,7 @@ pub(super) fn check(
     (nominal, pattern(&written.measure, folder, document))
 }
 
-/// Joins a path of a recipe to the recipe's folder. An absolute path stays unchanged.
+/// Returns a path of a recipe relative to `folder`, the folder of the recipe. An absolute path stays unchanged.
 fn resolve_path(folder: &Path, path: &str) -> PathBuf {
     folder.join(path)
 }
@@ -70,7 +70,7 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             document.report(
                 &key,
                 "is given together with `nominal.file`",
-                "the nominal surface has one source",
+                "the nominal surface is either a file or a formula",
                 from_formula,
             );
         }
@@ -102,7 +102,8 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
     None
 }
 
-/// Parses the tables of a formula as a surface definition, which has its own checks.
+/// Parses the tables `[nominal.surface]`, `[nominal.aperture]` and `[nominal.sampling]` as the definition of a surface
+/// by a formula. Returns `None` if a table is missing or invalid; this is then reported to `document`.
 fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSource> {
     let tables = [("surface", &written.surface), ("aperture", &written.aperture), ("sampling", &written.sampling)];
     let missing = tables[..2].iter().filter(|(_, table)| table.is_none());
@@ -136,7 +137,8 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
     None
 }
 
-/// Removes the key at the beginning of a sentence, so that the sentence can follow the full key.
+/// Removes the key from the beginning of a sentence such as "`key` must be positive", so that the sentence can follow
+/// the complete key. If it begins otherwise, puts "is refused: " in front.
 fn without_key(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),
@@ -347,7 +349,7 @@ fn compensation(written: &Compensation, document: &mut Document) {
         document.report(
             "compensation.cutoff_mm",
             format!("is {cutoff} mm, less than two spacings of the map, {least} mm"),
-            "a wavelength requires at least two nodes",
+            "the cut-off wavelength must be at least two spacings of the map",
             "raise it, or lower `compensation.spacing_mm`",
         );
     }
@@ -361,7 +363,7 @@ fn compensation(written: &Compensation, document: &mut Document) {
     }
 }
 
-/// Checks the keys that an estimate of machine parameters requires.
+/// Checks the values that the estimation of machine parameters requires, if the recipe compensates parameters.
 fn parameters(written: &RecipeFile, document: &mut Document) {
     const KEY: &str = "compensation.parameters";
     let Some(parameters) = written.compensation.parameters else { return };
@@ -477,7 +479,7 @@ fn grinding(written: &Grinding, document: &mut Document) {
     }
 }
 
-/// Checks that the values in different tables of the recipe agree.
+/// Checks values that depend on a value in another table of the recipe.
 fn check_tables(written: &RecipeFile, document: &mut Document) {
     if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
         && most < rms
@@ -510,7 +512,8 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
     }
 }
 
-/// Checks lengths against the size and the curvature of the part, if a formula or an outline defines them.
+/// Checks lengths in the recipe against the size and the curvature of the part, if the recipe defines the part by an
+/// outline or a formula.
 fn check_against_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
     let (surface, aperture) = match nominal {
         Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
@@ -566,7 +569,7 @@ fn check_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) {
     let points = (left_mm[0] / spacing_mm + 1.0) * (left_mm[1] / spacing_mm + 1.0);
     let found = format!("is {spacing_mm} mm on {:.4} x {:.4} mm", left_mm[0], left_mm[1]);
     if points > MAX_POINTS {
-        let allowed = format!("that makes {points:.1e} points; at most {MAX_POINTS:.0e} are allowed");
+        let allowed = format!("this gives {points:.1e} points, limit {MAX_POINTS:.0e}");
         document.report("measure.spacing_mm", found, &allowed, "choose a coarser spacing");
     } else if spacing_mm > left_mm[0].min(left_mm[1]) {
         let allowed = "it must be at most the smaller side";
@@ -579,13 +582,14 @@ fn check_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
         document.report(
             "compensation.cutoff_mm",
             format!("is {cutoff_mm} mm, with measured points {apart_mm:.4} mm apart"),
-            &format!("a wavelength requires two points: it must be at least {:.4} mm", 2.0 * apart_mm),
+            &format!("the cut-off wavelength must be at least two point spacings, {:.4} mm", 2.0 * apart_mm),
             "raise it, or measure more points",
         );
     }
 }
 
-/// Checks the wheel and the probe against the smallest concave radius of the surface on their side.
+/// Checks that the wheel and the ball of the probe fit into the concave regions of the surface, on the side where they
+/// touch it.
 fn check_against_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
     let hollows = curvature::min_concave_radii_mm(surface);
     let (radius_mm, place) = match written.measure.side {

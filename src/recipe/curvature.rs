@@ -5,8 +5,8 @@ use crate::surface::DefinedSurface;
 /// Number of evaluated positions along each axis of the aperture's box.
 const POSITIONS_PER_AXIS: usize = 61;
 
-/// Returns the smallest concave radius towards +z and towards -z, in mm, and its position. The radius is infinite if
-/// there is no concave region.
+/// Returns the smallest concave radius in mm, and its position (x, y), for each of two views: of the side towards +z,
+/// and of the side towards -z. The radius is infinite if this side has no concave region.
 ///
 /// Curvature is computed from finite differences of the exact gradient on a grid. It is accurate to a few percent,
 /// which is enough to check a recipe. The registration checks the offset surface itself.

@@ -140,7 +140,8 @@ impl Recipe {
         Self::parse(path, &text)
     }
 
-    /// Returns the paths of the files that the recipe refers to: of the nominal surface and of the measuring pattern.
+    /// Returns the paths of the files that the recipe names: the nominal surface and the measuring pattern, if they are
+    /// files.
     pub fn files(&self) -> Vec<&Path> {
         let nominal = match &self.nominal {
             NominalSource::File { path, .. } => Some(path.as_path()),
@@ -188,7 +189,8 @@ impl Recipe {
         })
     }
 
-    /// Returns a problem that another module found with the value of a key, with the position of the key in the text.
+    /// Returns a problem with the value of `key` that another module has found, with the position of the key in the
+    /// file. `found` describes the value, `allowed` the permitted values, and `remedy` what to do.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
@@ -198,7 +200,8 @@ impl Recipe {
         &self.notes
     }
 
-    /// Returns the options of a registration, given the pose of the part in the cell's fixture.
+    /// Returns the options of a registration. `fixture_cmm_from_model` is the pose of the part in the fixture of the
+    /// cell; it is the start if the recipe demands this.
     pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::RegistrationOptions {
         let settings = &self.registration;
         registration::RegistrationOptions {
@@ -216,8 +219,9 @@ impl Recipe {
         }
     }
 
-    /// Returns the probability with which a figure must be within its limit. If the recipe does not set it, this is the
-    /// default (0.975), or 1 - `accepted_risk` in mode adaptive if that is more.
+    /// Returns the minimum probability that a figure is within its limit, for a part to be accepted. It is
+    /// `acceptance.probability`, or by default 0.975. In mode adaptive, the default is 1 - `accepted_risk` if that is
+    /// higher.
     pub fn required_probability(&self) -> f64 {
         let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == SelectionMode::Adaptive);
         let usual = risk

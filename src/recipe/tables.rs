@@ -361,7 +361,8 @@ pub struct ParameterTolerances {
 }
 
 impl ParameterTolerances {
-    /// Returns the tolerances in millimetres and radians, in the order of [`crate::compensation::ParameterKind::ALL`].
+    /// Returns the tolerances of the machine parameters in mm and rad, in the order of
+    /// [`crate::compensation::ParameterKind::ALL`]. `None` for a parameter that is not compensated.
     pub fn tolerances(&self) -> [Option<f64>; crate::compensation::ParameterKind::COUNT] {
         let [radius, x, y, z] =
             [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Micrometres::mm));
@@ -502,7 +503,8 @@ pub enum WheelDimensions {
 }
 
 impl WheelDimensions {
-    /// Returns the wheel radius that the grinder uses.
+    /// Returns the radius of the wheel in mm: for a torus up to the outermost point of the rim, for a cup up to the
+    /// middle of its face.
     pub fn radius_mm(&self) -> f64 {
         match *self {
             Self::Sphere { radius_mm } | Self::Torus { radius_mm, .. } | Self::Cup { radius_mm, .. } => radius_mm,
@@ -510,7 +512,7 @@ impl WheelDimensions {
     }
 }
 
-/// Default of a required number.
+/// Default of a required number: NaN, which the check of the recipe reports as missing.
 fn missing() -> f64 {
     f64::NAN
 }

@@ -28,7 +28,8 @@ pub(super) struct Tick {
 }
 
 impl Ruler {
-    /// Maps a range of coordinates to a range of pixels. On a logarithmic axis the coordinates must be above 0.
+    /// Creates the mapping from coordinates to pixels: `range` (first and last coordinate) is mapped to `pixels` (first
+    /// and last pixel). On a logarithmic axis the coordinates must be above 0.
     pub(super) fn new(scale: Scale, range: [f64; 2], pixels: [f64; 2]) -> Self {
         let range = match scale {
             Scale::Linear => range,
@@ -37,7 +38,8 @@ impl Ruler {
         Self { scale, range, pixels }
     }
 
-    /// Widens the range so that it begins and ends at a tick. `most` is that of [`Self::ticks`].
+    /// Returns the same mapping with a range that is widened to begin and end at a tick. `most` is the intended maximum
+    /// number of ticks.
     pub(super) fn rounded(self, most: usize) -> Self {
         let [low, high] = self.range;
         let step = match self.scale {
@@ -51,14 +53,14 @@ impl Ruler {
         Self { range, ..self }
     }
 
-    /// Returns the pixel of a coordinate.
+    /// Returns the position of a coordinate, in pixels.
     pub(super) fn pixel(&self, value: f64) -> f64 {
         let value = if self.scale == Scale::Log { value.log10() } else { value };
         let t = (value - self.range[0]) / (self.range[1] - self.range[0]);
         self.pixels[0] + t * (self.pixels[1] - self.pixels[0])
     }
 
-    /// Returns the ticks, at round numbers; their number is about `most` or less.
+    /// Returns ticks at round numbers within the range. `most` is the maximum number of steps between them.
     pub(super) fn ticks(&self, most: usize) -> Vec<Tick> {
         let [low, high] = self.range;
         match self.scale {
@@ -97,7 +99,8 @@ fn round_numbers(low: f64, high: f64, step: f64) -> impl Iterator<Item = f64> {
     (first..=last).map(move |k| k as f64 * step)
 }
 
-/// Formats a multiple of `step` with as many decimals as the step has.
+/// Formats `value`, a multiple of the tick distance `step`, with as many decimals as `step` needs. Very small and very
+/// large steps get an exponent.
 fn label(value: f64, step: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -109,7 +112,7 @@ fn label(value: f64, step: f64) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 
-/// Formats a number with three significant digits, without an exponent.
+/// Formats a number with three significant digits. A magnitude below 1e-4, or of 1e6 and more, gets an exponent.
 pub(super) fn three_digits(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -122,7 +125,7 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 
-/// Formats a count with a comma between thousands.
+/// Formats a count with a comma as the thousands separator, such as 1,234,567.
 pub(super) fn grouped(count: usize) -> String {
     let digits = count.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);

@@ -24,10 +24,8 @@ const SEQUENTIAL: [u32; 9] =
     [0x44_0154, 0x47_2d7b, 0x3b_528b, 0x2c_728e, 0x21_918c, 0x28_ae80, 0x5e_c962, 0xad_dc30, 0xfd_e725];
 
 impl ColourMap {
-    /// Returns the colour at a share of the range, from 0 to 1. Outside that range it returns the colour of the nearer
-    /// end.
-    ///
-    /// Shape: red, green and blue of sRGB.
+    /// Returns the colour (red, green and blue of sRGB) at a position in the colour map. `share` is 0 at the lower end
+    /// and 1 at the upper end; a value outside this range gives the colour of the nearer end.
     pub fn at(self, share: f64) -> [u8; 3] {
         let anchors = self.anchors();
         let place = share.clamp(0.0, 1.0) * (anchors.len() - 1) as f64;
@@ -37,7 +35,8 @@ impl ColourMap {
         std::array::from_fn(|k| (f64::from(low[k]) * (1.0 - t) + f64::from(high[k]) * t).round() as u8)
     }
 
-    /// Returns the anchor colours, at equal distances. The map is linear between them.
+    /// Returns the colours (0xRRGGBB) between which the map is interpolated linearly. They are equally spaced from the
+    /// lower end to the upper.
     pub(super) fn anchors(self) -> &'static [u32] {
         match self {
             Self::Diverging => &DIVERGING,
@@ -45,7 +44,8 @@ impl ColourMap {
         }
     }
 
-    /// Returns a name that depends only on the colours, so that figures in one document can share it.
+    /// Returns the identifier of the colour gradient in an SVG. Figures in one document that use the same colours share
+    /// it.
     pub(super) fn id(self) -> &'static str {
         match self {
             Self::Diverging => "regrind-diverging",
@@ -74,8 +74,8 @@ const STEP: f64 = 0.4;
 const BEYOND: f64 = 1.25;
 
 impl Tones {
-    /// Returns tones that are symmetric about zero, for values up to a limit. The limit is increased if the tolerance
-    /// band would otherwise fill the colour bar.
+    /// Returns a diverging colour scale from `-limit` to `limit`. `tolerance` is half the width of the band of values
+    /// that get only a tint. If `limit` is less than 1.25 times the tolerance, it is raised to this value.
     pub(super) fn symmetric(limit: f64, tolerance: Option<f64>) -> Self {
         let limit = limit.max(tolerance.map_or(0.0, |t| BEYOND * t));
         // If all values are zero, they have no range of their own.
@@ -83,7 +83,7 @@ impl Tones {
         Self { colours: ColourMap::Diverging, range: [-limit, limit], tolerance }
     }
 
-    /// Returns the colour of a value.
+    /// Returns the colour (red, green, blue) of a value. Values beyond the range get the colour of the nearer end.
     pub(super) fn at(&self, value: f64) -> [u8; 3] {
         let [low, high] = self.range;
         let Some(band) = self.tolerance else { return self.colours.at((value - low) / (high - low)) };
@@ -96,8 +96,8 @@ impl Tones {
         self.colours.at(0.5 + 0.5 * arm.copysign(value))
     }
 
-    /// Returns positions along the bar, from 0 at the bottom to 1 at the top, with their colours. Colours are linear
-    /// between two neighbours.
+    /// Returns the gradient of the colour bar: pairs of a position, from 0 at the bottom to 1 at the top, and the
+    /// colour there. Between two positions the colour changes linearly.
     pub(super) fn stops(&self) -> Vec<(f64, [u8; 3])> {
         let [low, high] = self.range;
         let place = |value: f64| (value - low) / (high - low);
@@ -113,7 +113,8 @@ impl Tones {
         values.map(|value| (place(value).clamp(0.0, 1.0), self.at(value))).collect()
     }
 
-    /// Returns a name that depends only on the colours, so that figures in one document can share it.
+    /// Returns the identifier of the colour gradient in an SVG. Figures in one document that use the same colours share
+    /// it.
     pub(super) fn id(&self) -> String {
         match self.tolerance {
             Some(band) => format!("{}-{:.0}", self.colours.id(), 1e4 * band / self.range[1]),

@@ -7,7 +7,8 @@ use super::plot::{Axis, Plot, Series};
 use super::run_history::RunHistory;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 
-/// Returns the plot of PV and RMS of each measured cycle, with their limits; `None` if fewer than two were measured.
+/// Returns an SVG plot of PV and RMS of each measured cycle, with their limits. Returns `None` if the record contains
+/// no tolerance, if fewer than two cycles were measured, or if a figure is 0: the axis is logarithmic.
 pub(super) fn convergence(story: &RunHistory) -> Option<String> {
     let tolerance = story.tolerance()?;
     let measured = story.cycles.iter().filter_map(|(cycle, of)| {
@@ -38,8 +39,8 @@ const BARS: usize = 41;
 const CORNER: [f64; 2] = [70.0, 58.0];
 const SIZE: [f64; 2] = [460.0, 180.0];
 
-/// Returns the histogram of the errors at the nodes of a map, in the colours of the map, from minus to plus the largest
-/// magnitude.
+/// Returns the histogram, as SVG, of the errors at the nodes of a map. `samples_um` holds x, y and the error of each
+/// node. The axis extends from minus to plus the largest magnitude, and the bars have the colours of the map.
 pub(super) fn histogram(title: &str, samples_um: &[[f64; 3]]) -> Result<String, ReportError> {
     let largest = samples_um.iter().fold(0.0_f64, |largest, [.., error]| largest.max(error.abs()));
     let limit = if largest > 0.0 { largest } else { 1.0 };

@@ -46,8 +46,9 @@ pub struct DfqPart {
     pub limits_mm: [Option<f64>; 2],
 }
 
-/// Returns the file of several parts of one kind: PV and RMS, one value for each part, in the given order. A limit is
-/// written only if it is the same for all parts.
+/// Returns the Q-DAS ASCII file (DFQ) of several parts with the same name: PV and RMS, one value for each part, in the
+/// given order. `name` is the name of the part, `remark` a remark about the file. A limit is written only if it is the
+/// same for all parts.
 pub fn dfq_of_parts(name: &str, remark: &str, parts: &[DfqPart]) -> String {
     let mut file = Fields::default();
     file.field("K0100", "2");
@@ -137,12 +138,12 @@ fn values(file: &mut Fields, results: &Results, of: &Measured) {
     }
 }
 
-/// Formats a length as a decimal to a picometre, as in QIF.
+/// Formats a length in millimetres with nine decimals (a picometre), without an exponent.
 fn mm(value: f64) -> String {
     format!("{value:.9}")
 }
 
-/// Converts `2026-07-04T12:00:00Z` to `04.07.2026/12:00:00`.
+/// Converts a time such as `2026-07-04T12:00:00Z` into the format of Q-DAS, such as `04.07.2026/12:00:00`.
 fn when(utc: &str) -> String {
     let (date, time) = utc.split_once('T').unwrap_or((utc, ""));
     let mut date: Vec<&str> = date.split('-').collect();
@@ -158,13 +159,13 @@ struct Fields {
 }
 
 impl Fields {
-    /// Returns the text, with the UTF-8 byte order mark if it is not pure ASCII.
+    /// Returns the complete text of the file. If it is not pure ASCII, it begins with the UTF-8 byte order mark.
     fn whole(self) -> String {
         if self.text.is_ascii() { self.text } else { format!("\u{feff}{}", self.text) }
     }
 
-    /// Writes a field; a field without a value is not written. Characters that would end the line or split the value
-    /// become spaces. Micrometres become um and ± becomes +-, for readers that support ASCII only.
+    /// Appends a line with the K-field `key` and its value, unless the value is empty. Control characters and ¤, which
+    /// separate values, become spaces. µ becomes u and ± becomes +-, for readers that support ASCII only.
     fn field(&mut self, key: &str, value: &str) {
         let value = value
             .replace(|c: char| c.is_control() || c == '\u{a4}', " ")

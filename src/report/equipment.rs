@@ -12,7 +12,8 @@ use super::run_history::RunHistory;
 use regrind_cell::Device;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns the HTML table of the machines, the wheel and the probe. A value that is not on record is shown as missing.
+/// Returns the HTML table of the machines, the wheel and the probe of a run. `registration` is the content of the last
+/// `registration.json`. A value that is not on record is shown as "not reported".
 pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> String {
     let not_told = || "not reported".to_owned();
     let machine = |device: Device| {
@@ -38,14 +39,19 @@ pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> Str
     format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
 }
 
-/// Reads the model file of the measurement with the last registration; `None` if there is no such file.
+/// Reads `model.json` of the last cycle that was registered. `folder` is the run folder. Returns `None` if the file
+/// does not exist or cannot be read.
 pub(super) fn last_model(story: &RunHistory, folder: &Path) -> Option<Value> {
     let registration = story.cycles.values().rev().find_map(|of| of.registration.as_ref())?;
     let bytes = fs::read(folder.join(registration).with_file_name("model.json")).ok()?;
     serde_json::from_slice(&bytes).ok()
 }
 
-/// Reads the last registration and its cycle; `None` if no measurement was registered.
+/// Reads `registration.json` of the last cycle that was registered, and returns it with the number of the cycle.
+/// `folder` is the run folder. Returns `Ok(None)` if no measurement was registered.
+///
+/// # Errors
+/// Fails if the file cannot be read or is not JSON.
 pub(super) fn last_registration(story: &RunHistory, folder: &Path) -> Result<Option<(u32, Value)>, ReportError> {
     let last = story.cycles.iter().rev().find_map(|(cycle, of)| Some((*cycle, of.registration.as_ref()?)));
     let Some((cycle, name)) = last else { return Ok(None) };
@@ -56,8 +62,8 @@ pub(super) fn last_registration(story: &RunHistory, folder: &Path) -> Result<Opt
     Ok(Some((cycle, found)))
 }
 
-/// Returns the HTML table of the registration of a cycle, with the uncertainty of the pose and the uncertainty budget.
-/// `found` is the content of `registration.json`, `model` that of `model.json`.
+/// Returns the HTML table of the registration of a cycle, with the uncertainty of the pose, and the table of the
+/// uncertainty budget. `found` is the content of `registration.json`, `model` that of `model.json`.
 pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
     let number = |key: &str| found[key].as_f64();
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
@@ -65,9 +71,9 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     // A locked direction has no uncertainty in one file, and 0 in the other.
     let place = |stated: &Value| {
         let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > 0.0);
-        let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("held".to_owned(), um)).join(", ");
+        let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("locked".to_owned(), um)).join(", ");
         let turn = ["rx_rad", "ry_rad", "rz_rad"]
-            .map(|key| sigma(key).map_or("held".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
+            .map(|key| sigma(key).map_or("locked".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
         format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))
     };
     let frame = model.map_or("not on record".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
@@ -104,8 +110,8 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     html + "</table>\n" + &model.map_or(String::new(), budget)
 }
 
-/// Returns the HTML table of the uncertainty budget of the figures, a row for each source; empty if `model.json`
-/// contains none.
+/// Returns the HTML table of the uncertainty budget of RMS and PV 99.8 %, with a row for each source of uncertainty.
+/// Returns an empty text if `model`, the content of `model.json`, contains no budget.
 fn budget(model: &Value) -> String {
     let Some(shares) = model["budget"].as_array().filter(|shares| !shares.is_empty()) else { return String::new() };
     let um = |share: &Value, key: &str| match (share["is_stated"] == true, share[key].as_f64()) {
@@ -132,7 +138,8 @@ fn budget(model: &Value) -> String {
     )
 }
 
-/// Returns a source of uncertainty in words, from its name in `model.json`.
+/// Returns the description, for people, of a source of uncertainty. `name` is the name of the source in `model.json`;
+/// an unknown name is returned unchanged.
 fn source_words(name: &str) -> &str {
     match name {
         "scatter" => "noise of the probe",
@@ -148,7 +155,7 @@ fn source_words(name: &str) -> &str {
     }
 }
 
-/// Returns the table in which the responsible people sign.
+/// Returns the HTML table with empty fields in which the responsible people sign.
 pub(super) fn signatures() -> String {
     let row = |role: &str| format!("<tr><th>{role}</th><td></td><td></td><td></td></tr>\n");
     let rows: String = ["Recipe approved by", "Made by", "Checked by", "Released by"].map(row).concat();

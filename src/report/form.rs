@@ -12,8 +12,11 @@ use super::axis::three_digits;
 use super::run_history::RunHistory;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns the HTML section about the form: a row for each figure, a column for each cycle with figures, and notes on
-/// each figure.
+/// Returns the HTML section about the form of the surface: a row for each figure, a column for each cycle with figures.
+/// `folder` is the run folder. Returns an empty text if no cycle has figures.
+///
+/// # Errors
+/// Fails if a file of figures cannot be read.
 pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
     for (number, cycle) in &story.cycles {
@@ -25,7 +28,10 @@ pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportEr
     Ok(html + &notations(&cycles))
 }
 
-/// Reads the figures of a cycle.
+/// Reads a file `figures.json`, which holds the figures of a cycle.
+///
+/// # Errors
+/// Fails if the file cannot be read or is not JSON.
 pub(super) fn read_figures(path: &Path) -> Result<Value, ReportError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let bytes = fs::read(path).map_err(unreadable)?;
@@ -44,7 +50,9 @@ fn heads(cycles: &[(u32, Value)]) -> String {
     cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect()
 }
 
-/// Returns the figures that the model estimates, with their intervals; empty for files of earlier versions.
+/// Returns the HTML table of the figures of the form that the model estimates, with their credible intervals. `cycles`
+/// holds the number and the figures of each cycle, `last` the figures of the last cycle. Returns an empty text for
+/// files of earlier versions, which do not contain these figures.
 fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
     let list = listed(last, "form");
     if list.is_empty() {
@@ -77,17 +85,19 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
     )
 }
 
-/// Returns the median and the low and high ends of the interval as text.
+/// Returns three texts from a row of `figures.json`: the median of a figure, and the lower and upper end of its
+/// credible interval. Returns `None` if one of the three is missing.
 fn interval(row: &Value) -> Option<[String; 3]> {
     let number = |key: &str| row[key].as_f64().map(three_digits);
     Some([number("median")?, number("low")?, number("high")?])
 }
 
-/// Returns the figures of the points and of the map.
+/// Returns the HTML table of the figures that were computed directly from the measured points and from the map.
+/// `cycles` holds the number and the figures of each cycle, `last` the figures of the last cycle.
 fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
     let mut html = format!(
-        "{title}<table id=\"form\">\n<tr><th>figure</th>{}<th>unit</th><th>what it is</th><th>removed</th><th>waves left out</th></tr>\n",
+        "{title}<table id=\"form\">\n<tr><th>figure</th>{}<th>unit</th><th>what it is</th><th>removed</th><th>wavelengths left out</th></tr>\n",
         heads(cycles)
     );
     for row in listed(last, "figures") {
@@ -110,7 +120,8 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     html + "</table>\n"
 }
 
-/// Returns the indications of ISO 10110-5 that the form meets.
+/// Returns an HTML list with the tolerance indication by ISO 10110-5 that the form of the part meets in each cycle.
+/// `cycles` holds the number and the figures of each cycle.
 fn notations(cycles: &[(u32, Value)]) -> String {
     let mut html = "<p>The descriptions of the figures are those of the last cycle. All figures are along the outward normal, positive where material is proud; \
                     they are figures of the surface, not of a wavefront. Indication of ISO 10110-5, in nanometres, that the form meets in each value with \

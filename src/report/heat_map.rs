@@ -38,12 +38,12 @@ pub struct HeatMap {
 }
 
 impl HeatMap {
-    /// Draws samples of any quantity.
+    /// Creates a heat map of samples of any quantity. The quantity is named `quantity` and given in `unit`.
     ///
     /// Shapes: two or more samples (x, y, value) in any order. Units: x and y in millimetres, the value in `unit`.
     ///
     /// # Errors
-    /// Fails if there are too few samples, if a sample is not finite, or if all samples are at one place.
+    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples are at one place.
     pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         let raster = Raster::new(title, samples)?;
         let [low, high] = range(samples.iter().map(|s| s[2]));
@@ -65,8 +65,7 @@ impl HeatMap {
         Ok(map.with_colours(ColourMap::Diverging))
     }
 
-    /// Draws lengths given in millimetres. The map is in micrometres, or in nanometres if the peak to valley is below
-    /// 0.1 µm.
+    /// Creates a heat map of lengths. The map shows micrometres, or nanometres if the peak to valley is below 0.1 µm.
     ///
     /// Shapes: two or more samples (x, y, length) in any order. Units: millimetres.
     ///
@@ -79,9 +78,10 @@ impl HeatMap {
         Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
     }
 
-    /// Draws the deviations of a registration at their contact points. Points that the fit did not use are left out.
+    /// Creates a heat map of the deviations of a registration, at their contact points. Only the points that the
+    /// registration used are shown, without outliers. Red is above the nominal surface, blue is below it.
     ///
-    /// Frame: model. Red is above the nominal surface, blue is below it.
+    /// Frame: model.
     ///
     /// # Errors
     /// Fails as [`HeatMap::new`] does.
@@ -91,7 +91,8 @@ impl HeatMap {
         Self::of_lengths(title, "deviation", &samples)
     }
 
-    /// Sets the colours and the range that belongs to them: symmetric about zero, or from the minimum to the maximum.
+    /// Sets the colour map and its range: symmetric about zero for [`ColourMap::Diverging`], from the minimum to the
+    /// maximum for [`ColourMap::Sequential`]. Removes a tolerance that was set before.
     pub fn with_colours(self, colours: ColourMap) -> Self {
         let [low, high] = range(self.raster.values.iter().copied());
         let range = match colours {
@@ -103,10 +104,10 @@ impl HeatMap {
         Self { tones: Tones { colours, range, tolerance: None }, ..self }
     }
 
-    /// Draws values within plus and minus a tolerance with only a tint, and marks the band on the colour bar. The
-    /// colour bar is made longer if it would end within the band.
+    /// Sets a tolerance: values from `-tolerance` to `tolerance` get only a tint, and the colour bar marks this band.
+    /// The colour bar is extended if it would end within the band.
     ///
-    /// Units: millimetres for a map of lengths, those of the map for any other.
+    /// Units: millimetres for a map of lengths, otherwise the unit of the map.
     ///
     /// # Errors
     /// Fails if the tolerance is not a finite number above 0.
@@ -119,10 +120,10 @@ impl HeatMap {
         Ok(Self { tones, ..self })
     }
 
-    /// Sets the range of the colours from minus to plus a limit, so that maps with the same limit can be compared.
-    /// Values beyond the limit get the colour of the end.
+    /// Sets the range of the colours from `-limit` to `limit`, so that maps with the same limit can be compared. Values
+    /// beyond the limit get the colour of the nearer end. Removes a tolerance that was set before.
     ///
-    /// Units: those of the map.
+    /// Units: the unit of the map.
     ///
     /// # Errors
     /// Fails if the limit is negative or not finite.
@@ -133,23 +134,23 @@ impl HeatMap {
         Ok(Self { tones: Tones::symmetric(limit, None), ..self })
     }
 
-    /// Adds further lines below the title.
+    /// Sets the lines of text below the title.
     pub fn with_lines(self, lines: Vec<String>) -> Self {
         Self { lines, ..self }
     }
 
-    /// Declares that the samples are the nodes of a map. The last line then says that PV and RMS are those of the map
-    /// and not of measured points.
+    /// Marks the samples as nodes of a map. The summary below the title then says that PV and RMS are those of the map,
+    /// not those of measured points.
     pub fn of_nodes(self) -> Self {
         Self { figures_of: [" of the map", "nodes"], ..self }
     }
 
-    /// Sets the maximum size of the map in pixels of the page, along x and along y.
+    /// Sets the maximum width and height of the map within the figure, in pixels of the SVG.
     pub fn with_max_size(self, largest: [f64; 2]) -> Self {
         Self { max_size: largest, ..self }
     }
 
-    /// Clears all pixels outside an aperture, even where a gap between samples would be filled.
+    /// Makes the pixels outside `aperture` transparent, also those that were filled between samples.
     ///
     /// Units: millimetres. Frame: that of the samples.
     pub fn within(mut self, aperture: &Aperture) -> Self {
@@ -164,12 +165,12 @@ impl HeatMap {
         self
     }
 
-    /// Returns the value at the upper end of the colour bar, in the unit of the map.
+    /// Returns the upper end of the range of the colours, in the unit of the map.
     pub fn limit(&self) -> f64 {
         self.tones.range[1]
     }
 
-    /// Returns the maximum sample minus the minimum sample, in the unit of the map.
+    /// Returns the peak to valley: the largest sample minus the smallest, in the unit of the map.
     pub fn pv(&self) -> f64 {
         self.pv
     }
@@ -179,11 +180,11 @@ impl HeatMap {
         self.rms
     }
 
-    /// Returns only the pixels, as a PNG of 255 colours: one pixel for each bin, y upwards, transparent where nothing
-    /// was measured.
+    /// Returns the map alone, without axes and text, as a PNG of 255 colours. A pixel of the PNG is a cell of the grid
+    /// into which the samples were collected. y is upwards; places without samples are transparent.
     ///
     /// # Errors
-    /// Fails if the encoder fails.
+    /// Fails if the pixels cannot be encoded.
     pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
         let mut palette = vec![0; 3];
         let [low, high] = self.tones.range;
@@ -208,7 +209,8 @@ impl HeatMap {
         encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })
     }
 
-    /// Returns the index of a value in the palette; 0 is transparent.
+    /// Returns the index of the colour of `value` in the palette of the PNG: 1 to 255 from the lower to the upper end
+    /// of the range, or 0 (transparent) for NaN.
     fn level(&self, value: f64) -> u8 {
         if value.is_nan() {
             return 0;
@@ -218,10 +220,11 @@ impl HeatMap {
         1 + (share.clamp(0.0, 1.0) * f64::from(LEVELS - 1)).round() as u8
     }
 
-    /// Returns the figure: the pixels within axes in millimetres, a colour bar, and a line with PV and RMS.
+    /// Returns the complete figure as SVG: the map within axes in millimetres, a colour bar, the title, and lines of
+    /// text with PV and RMS.
     ///
     /// # Errors
-    /// Fails if the encoder fails.
+    /// Fails if the pixels cannot be encoded.
     pub fn to_svg(&self) -> Result<String, ReportError> {
         let lines = self.lines_within(self.size()[0] + BESIDE);
         let frame = self.frame(lines.len());
@@ -240,7 +243,8 @@ impl HeatMap {
         Ok(svg.finish())
     }
 
-    /// Returns the lines below the title, with the summary last. Lines that are too long for the picture are broken.
+    /// Returns the lines of text below the title, the summary last. A line that is wider than `width` pixels is broken
+    /// into several lines.
     fn lines_within(&self, width: f64) -> Vec<String> {
         let summary = self.summary();
         self.lines.iter().chain([&summary]).flat_map(|line| broken(line, (width / LETTER) as usize)).collect()
@@ -251,7 +255,7 @@ impl HeatMap {
         [columns as f64 * spacing_mm[0], rows as f64 * spacing_mm[1]]
     }
 
-    /// Returns the size of the map in pixels of the page.
+    /// Returns width and height of the map within the figure, in pixels of the SVG.
     fn size(&self) -> [f64; 2] {
         let extent_mm = self.extent_mm();
         let scale = (self.max_size[0] / extent_mm[0]).min(self.max_size[1] / extent_mm[1]);
@@ -305,21 +309,21 @@ impl HeatMap {
         }
     }
 
-    /// Returns the share of the pixels whose values lie within a band about zero.
+    /// Returns the share (0 to 1) of the pixels with a value from `-band` to `band`, among all pixels with a value.
     fn share_within(&self, band: f64) -> f64 {
         let known = || self.raster.values.iter().filter(|v| !v.is_nan());
         known().filter(|v| v.abs() <= band).count() as f64 / known().count().max(1) as f64
     }
 
-    /// Saves the figure.
+    /// Saves the complete figure ([`Self::to_svg`]).
     ///
     /// # Errors
-    /// Fails if the figure cannot be encoded or if the file cannot be written.
+    /// Fails if the pixels cannot be encoded or if the file cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Saves only the pixels, as PNG.
+    /// Saves the map alone, without axes and text ([`Self::to_png`]).
     ///
     /// # Errors
     /// Fails if the pixels cannot be encoded or if the file cannot be written.
@@ -327,10 +331,11 @@ impl HeatMap {
         Ok(write_atomic(path, &self.to_png()?)?)
     }
 
-    /// Saves the pixels below the word SIMULATION, enlarged if there are too few pixels for the word.
+    /// Saves the map alone, as PNG, with the word SIMULATION in a band above it. A map with too few pixels for the word
+    /// is enlarged.
     ///
     /// # Errors
-    /// Fails if the encoder fails, or if the file cannot be written.
+    /// Fails if the pixels cannot be encoded or if the file cannot be written.
     pub fn save_simulated_png(&self, path: &Path) -> Result<(), ReportError> {
         let columns = self.raster.grid.columns;
         let tone = |value: &f64| {
@@ -371,7 +376,8 @@ const LINE: f64 = 18.0;
 /// Average width of a letter in those lines. It is also sufficient if a wider typeface replaces the intended one.
 const LETTER: f64 = 6.8;
 
-/// Breaks a line into lines of at most `most` letters: after a comma if there is one, otherwise after a word.
+/// Breaks a line into lines of at most `most` characters: after the last comma that fits, otherwise after the last word
+/// that fits. A word that is longer than `most` stays in one line with the rest.
 fn broken(line: &str, most: usize) -> Vec<String> {
     let (mut lines, mut rest) = (Vec::new(), line);
     while let Some((end, _)) = rest.char_indices().nth(most) {

@@ -104,7 +104,8 @@ pub fn save_text(path: &Path, text: &str) -> Result<(), ReportError> {
     Ok(write_atomic(path, text.as_bytes())?)
 }
 
-/// Returns the minimum and the maximum of the values, ignoring NaN.
+/// Returns the minimum and the maximum of the values, ignoring NaN. Without values, returns infinity and minus
+/// infinity.
 fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
     values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }

@@ -33,7 +33,12 @@ impl CycleMap {
         low.abs().max(high.abs())
     }
 
-    /// Returns the figure with colours from minus to plus `limit_um`, or a sentence that says why it cannot be drawn.
+    /// Returns the HTML figure of the map, with colours from `-limit_um` to `limit_um`. `largest` is the maximum width
+    /// and height of the map in pixels, `caption` the text below it. If the map cannot be drawn, the figure contains
+    /// the reason instead.
+    ///
+    /// # Errors
+    /// Fails if a file cannot be read or written.
     fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
         let width = largest[0] + BESIDE;
         let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
@@ -48,12 +53,13 @@ impl CycleMap {
     }
 }
 
-/// Prepares an SVG figure for a page: removes the XML namespace, which is not needed within HTML.
+/// Removes the XML namespace from an SVG, because an SVG within an HTML page does not need it.
 pub(super) fn within_html(svg: &str) -> String {
     svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
 }
 
-/// Shortens a text that would be wider than `width`, if each letter has the width `letter`, both in pixels.
+/// Cuts a text that is wider than `width`, and ends it with "…". `letter` is the average width of a letter; both are in
+/// pixels.
 fn shortened(text: &str, width: f64, letter: f64) -> String {
     let most = (width / letter) as usize;
     if text.chars().count() <= most {
@@ -62,7 +68,11 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
     text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
 }
 
-/// Returns the HTML section with the maps that are on record; empty if there are none.
+/// Returns the HTML section with the error maps of the first and the last cycle and the histogram of the last. `folder`
+/// is the run folder, `begin` the content of the first record. Returns an empty text if no map is on record.
+///
+/// # Errors
+/// Fails if an error map cannot be read.
 pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };

@@ -46,10 +46,10 @@ const CORNER: [f64; 2] = [70.0, 44.0];
 const SIZE: [f64; 2] = [520.0, 340.0];
 
 impl Plot {
-    /// Returns the figure as SVG.
+    /// Returns the plot as SVG.
     ///
     /// # Errors
-    /// Fails if there are no points, if a point is not finite, or if a point is not above 0 on a logarithmic axis.
+    /// Fails if there are no points, if a number is not finite, or if a number on a logarithmic axis is not above 0.
     pub fn to_svg(&self) -> Result<String, ReportError> {
         let [x, y] = [self.ruler(0)?, self.ruler(1)?];
         let longest = self.series.iter().map(|s| s.name.chars().count()).max().unwrap_or(0);
@@ -75,7 +75,7 @@ impl Plot {
         Ok(svg.finish())
     }
 
-    /// Saves the figure as SVG.
+    /// Saves the plot as SVG.
     ///
     /// # Errors
     /// Fails as [`Plot::to_svg`] does, or if the file cannot be written.
@@ -83,7 +83,8 @@ impl Plot {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Returns the maximum number of ticks of the x axis. Counts get no ticks at fractions.
+    /// Returns the maximum number of ticks of the x axis: at most 10. If all x are whole numbers, there are no more
+    /// ticks than whole numbers in the range.
     fn max_x_ticks(&self) -> usize {
         const MAX: usize = 10;
         let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
@@ -91,7 +92,11 @@ impl Plot {
         if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MAX) } else { MAX }
     }
 
-    /// Checks one coordinate of all points and maps their range to the pixels of the page.
+    /// Returns the mapping from coordinates to pixels for one axis: x for `k` = 0, y for `k` = 1. Its range covers all
+    /// points.
+    ///
+    /// # Errors
+    /// Fails if there are no points, if a number is not finite, or if a number on a logarithmic axis is not above 0.
     fn ruler(&self, k: usize) -> Result<Ruler, ReportError> {
         let (axis, what) = if k == 0 { (&self.x, "x") } else { (&self.y, "y") };
         let [mut low, mut high] = [f64::INFINITY, f64::NEG_INFINITY];
@@ -115,7 +120,8 @@ impl Plot {
     }
 }
 
-/// Draws a line with a marker at each point. Colours, markers and dashes differ from line to line.
+/// Draws a line through `pixels`, with a marker at each point. `k` is the index of the series; it selects colour,
+/// marker and dashes.
 fn draw(svg: &mut Svg, k: usize, pixels: &[[f64; 2]]) {
     let colour = COLOURS[k % COLOURS.len()];
     let dashes = if k < COLOURS.len() { "none" } else { "6 3" };

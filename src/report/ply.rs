@@ -6,14 +6,17 @@ use super::ReportError;
 use super::colour::Tones;
 use regrind_formats::write_atomic;
 
-/// Returns points, and optional triangles between them, as binary PLY with a colour and the deviation at each point.
+/// Returns points, and optional triangles between them, as a binary PLY file with the colour and the deviation of each
+/// point.
 ///
-/// Shapes: a row (x, y, z, deviation) for each point; corners of triangles as indices of rows from 0. Units:
-/// millimetres; the property `scalar_deviation_um` is in micrometres. Colours: those of the heat maps, symmetric about
-/// zero. Values within the tolerance get only a tint. A `comment` is written for each remark.
+/// Shapes: a row (x, y, z, deviation) for each point; a triangle has three indices of rows, counted from 0. Units:
+/// millimetres; the property `scalar_deviation_um` is in micrometres. Colours: those of [`HeatMap`](crate::HeatMap),
+/// symmetric about zero. Values from `-tolerance_mm` to `tolerance_mm` get only a tint. `title` and each of the
+/// `remarks` become a comment in the file.
 ///
 /// # Errors
-/// Fails if there is no point, if a number is not finite, or if a corner refers to no point.
+/// Fails if there is no point, if a number is not finite, if the tolerance is not above 0, or if a triangle refers to a
+/// point that does not exist.
 pub fn coloured_ply(
     title: &str,
     rows_mm: &[[f64; 4]],

@@ -127,7 +127,8 @@ fn attributes(xml: &mut Xml, list: &[(&str, &str)]) {
     });
 }
 
-/// Writes the definition, nominal and item of each figure, with the numbers `FIRST_FIGURE + 3 k` and the two after it.
+/// Writes the definition, the nominal and the item of each figure. Their identifiers are `FIRST_FIGURE + 3 k`, and the
+/// two numbers after it, for the figure with the index k.
 fn characteristics(xml: &mut Xml, results: &Results) {
     let kinds: Vec<_> = (FIRST_FIGURE..).step_by(3).zip(results.kinds()).collect();
     let n = kinds.len().to_string();
@@ -258,12 +259,13 @@ fn inspection_status(of: &Measured) -> &'static str {
     }
 }
 
-/// Formats a length as a decimal to a picometre, because decimals in XML have no exponent.
+/// Formats a length in millimetres with nine decimals (a picometre). An `xs:decimal` must not have an exponent.
 fn mm(value: f64) -> String {
     format!("{value:.9}")
 }
 
-/// Returns the identity (UUID, version 8) of a document or of a part of it. It is derived from the hash of the record.
+/// Returns a UUID (version 8) that is derived from `head`, the hash of the last record. `number` distinguishes the
+/// document (0) from its parts (from 1), so that the same record always gives the same identifiers.
 fn identity(head: &str, number: u32) -> String {
     let hex: String = head.chars().filter(char::is_ascii_hexdigit).take(24).collect();
     let hex = format!("{hex:0<24}{number:08x}");

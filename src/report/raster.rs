@@ -25,11 +25,14 @@ const LINES_REACH: usize = 8;
 const MIN_WEIGHT: f64 = 1e-3;
 
 impl Raster {
-    /// Distributes each sample (x, y, value) among the four pixels around it and computes the weighted mean of each
-    /// pixel.
+    /// Collects samples (x, y, value) into pixels. Each sample is shared between the four pixels around it, and a pixel
+    /// gets the weighted mean of its samples. `title` names the figure in errors.
     ///
-    /// The width of a pixel is approximately the distance between samples. Gaps within the cloud are filled from their
-    /// neighbours.
+    /// The width of a pixel is about the distance between samples. Small gaps within the cloud of samples are filled
+    /// from their neighbours.
+    ///
+    /// # Errors
+    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples are at one place.
     pub(super) fn new(title: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         check(title, samples)?;
         let (low, size) = extent(samples);
@@ -66,7 +69,8 @@ impl Raster {
         sums.into_iter().map(|[sum, total]| if total >= MIN_WEIGHT { sum / total } else { f64::NAN }).collect()
     }
 
-    /// Fills gaps narrower than the reach with the mean of the neighbours, from the sides inwards.
+    /// Fills gaps that are narrower than twice the reach, from their sides inwards, with the mean of neighbouring
+    /// pixels. The reach is [`REACH`], or [`LINES_REACH`] if the samples are scan lines.
     fn fill(&mut self) {
         let known: Vec<bool> = self.values.iter().map(|v| !v.is_nan()).collect();
         let count = |mask: &[bool]| mask.iter().filter(|&&m| m).count();
@@ -101,7 +105,8 @@ impl Raster {
         sum / total
     }
 
-    /// Returns the morphological closing of a mask by a square: the mask is dilated by `reach`, then eroded by `reach`.
+    /// Returns the morphological closing of `mask` by a square: the true area is dilated by `reach` pixels, then eroded
+    /// by `reach` pixels. This fills gaps of up to twice this width.
     fn closed(&self, mask: &[bool], reach: usize) -> Vec<bool> {
         let (columns, rows) = (self.grid.columns + 2 * reach, self.grid.rows + 2 * reach);
         let mut wide = vec![false; columns * rows];
@@ -116,7 +121,8 @@ impl Raster {
     }
 }
 
-/// Sets each pixel to `value` if any pixel within `reach`, along columns and then along rows, has that value.
+/// Dilates the pixels of `mask` that have this `value`: returns a mask in which each pixel has the value if a pixel at
+/// most `reach` columns and `reach` rows away has it.
 fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool) -> Vec<bool> {
     let mut along = vec![!value; mask.len()];
     let mut out = vec![!value; mask.len()];
@@ -133,13 +139,14 @@ fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool)
     out
 }
 
-/// Returns the spacing s of a square grid of n points over a rectangle of w by h: (n - 1) s^2 = (w + h) s + w h.
+/// Returns the spacing of a square grid of `points` nodes over a rectangle of `width` by `height`. With n points and
+/// the size w by h, the spacing s solves (n - 1) s^2 = (w + h) s + w h.
 fn spacing([width, height]: [f64; 2], points: usize) -> f64 {
     let (sum, n) = (width + height, (points - 1) as f64);
     (sum + (sum * sum + 4.0 * n * width * height).sqrt()) / (2.0 * n)
 }
 
-/// Returns the minimum x and y, and the extent in x and y.
+/// Returns the minimum `[x, y]` of the samples, and their extent along x and along y.
 fn extent(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
     let [[x0, x1], [y0, y1]] = [0, 1].map(|k| range(samples.iter().map(|s| s[k])));
     ([x0, y0], [x1 - x0, y1 - y0])

@@ -46,7 +46,8 @@ pub(super) enum RecordContent {
 }
 
 impl RecordContent {
-    /// Reads the content of a record.
+    /// Interprets a record of the journal. Returns [`Self::Unknown`] if this version of the program cannot read the
+    /// content.
     pub(super) fn from_record(record: &Record) -> Self {
         let value = record.value();
         let told = match record.kind {

@@ -26,8 +26,8 @@ pub enum ResultsFormat {
     Dfq,
 }
 
-/// Verifies the record of a run, writes its results and returns the path of the file: `path`, or the default name in
-/// the run folder.
+/// Verifies the record in the run folder `folder`, writes the results of the run in `format`, and returns the path of
+/// the written file. With `path` = `None` the file is `results.qif` or `results.dfq` in the run folder.
 ///
 /// # Errors
 /// Fails if the record is missing, does not pass verification or contains no measurement, or if the file cannot be
@@ -42,10 +42,12 @@ pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Pat
     Ok(path)
 }
 
-/// Returns the results of a run from its record. The same record gives the same bytes.
+/// Verifies the record in the run folder `folder` and returns the results of the run as text in `format`. The same
+/// record always gives the same bytes.
 ///
 /// # Errors
-/// Fails if the record does not pass verification, or if nothing was measured.
+/// Fails if the record is missing or does not pass verification, if a file of figures cannot be read, or if nothing was
+/// measured.
 pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
     let results = Results::from_history(&story, verified.head.to_string()).with_areas(&story, folder)?;
@@ -157,15 +159,18 @@ impl Results {
         }
     }
 
-    /// Returns the kinds of the figures of the measurement that has the most figures, in their order. Kinds that some
-    /// measurements lack come last.
+    /// Returns name, meaning and limit of each figure that the file of results contains. They are those of the
+    /// measurement with the most figures, in its order.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
         let most = self.measured.iter().max_by_key(|of| of.figures.len());
         most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
     }
 
     /// Adds the figures of ISO 10110-5 to the last measurement of each cycle. They are read from `figures.json` of the
-    /// cycle.
+    /// cycle in the run folder `folder`.
+    ///
+    /// # Errors
+    /// Fails if a file of figures cannot be read.
     fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
@@ -205,7 +210,8 @@ impl Measured {
 fn decision_rule(tolerance: &Tolerance) -> String {
     if tolerance.with_uncertainty {
         format!(
-            "ISO 14253-1, JCGM 106: within where the figure does not exceed the limit with a probability of {:.1} %",
+            "ISO 14253-1, JCGM 106: a figure is within its limit if it does not exceed the limit with a \
+             probability of at least {:.1} %",
             1e2 * tolerance.probability
         )
     } else {
@@ -213,7 +219,11 @@ fn decision_rule(tolerance: &Tolerance) -> String {
     }
 }
 
-/// Returns the judged figures, then the peak to valley of all points if another figure is judged.
+/// Returns the figures of a measurement for the file of results: first the figures that the tolerance selects, with
+/// their limits. If these do not include the peak to valley of all measured points, it follows for information.
+///
+/// `judged` is true if the measurement was judged; otherwise the status of each figure is [`LimitStatus::NotJudged`].
+/// Without a tolerance, returns PV and RMS of the points without limits.
 fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
     let compared = tolerance.map(|tolerance| tolerance.compare(figures));
     // The form is judged. The figure of the points, which contains the noise of the probe, is added for information.
@@ -296,8 +306,8 @@ const AREAS: [(&str, &str, &str); 6] = [
     ),
 ];
 
-/// Returns the figures of ISO 10110-5 from `told`, the content of `figures.json`, with their intervals; `None` if one
-/// of them is missing.
+/// Returns the figures of ISO 10110-5 with their uncertainty. `told` is the content of `figures.json`. Returns `None`
+/// if one of the six figures is missing.
 fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     const MM_OF_NM: f64 = 1e-6;
     let rows = told["form"].as_array()?;
@@ -314,7 +324,9 @@ fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     AREAS.into_iter().map(figure).collect()
 }
 
-/// Returns `Beyond` if any figure is beyond its limit, and `Within` only if each figure with a limit is within it.
+/// Returns the status of a measurement: [`LimitStatus::Beyond`] if any figure is beyond its limit, otherwise
+/// [`LimitStatus::Undecided`] if any is undecided, otherwise [`LimitStatus::Within`] if any is within its limit,
+/// otherwise [`LimitStatus::NotJudged`].
 fn standing_of_all(figures: &[Figure]) -> LimitStatus {
     let any = |standing| figures.iter().any(|figure| figure.standing == standing);
     [LimitStatus::Beyond, LimitStatus::Undecided, LimitStatus::Within]

@@ -36,21 +36,22 @@ footer{margin-top:2.5em;border-top:1px solid #ddd;color:#555}\
 h2{break-after:avoid}figure,tr,#signatures,footer{break-inside:avoid}.good,.bad,.mark{print-color-adjust:exact}\
 td,th{padding:.2em .5em}}";
 
-/// Verifies the record of a run, writes its report into the run folder and returns the path of the report.
+/// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) into this folder,
+/// and returns its path.
 ///
 /// # Errors
-/// Fails if the record is missing or does not pass verification, if a file cannot be read, or if the folder cannot be
-/// written.
+/// Fails if the record is missing or does not pass verification, if a file on record cannot be read, or if the report
+/// cannot be written.
 pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
     let path = folder.join(RUN_REPORT);
     write_atomic(&path, run_report(folder)?.as_bytes())?;
     Ok(path)
 }
 
-/// Returns the report of a run as HTML, from its record.
+/// Verifies the record in the run folder `folder` and returns the report of the run as HTML.
 ///
 /// # Errors
-/// Fails if the record does not pass verification, or if a file on record cannot be read.
+/// Fails if the record is missing or does not pass verification, or if a file on record cannot be read.
 pub fn run_report(folder: &Path) -> Result<String, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
     html(&story, folder, &verified)
@@ -90,8 +91,8 @@ fn html(story: &RunHistory, folder: &Path, verified: &Verified) -> Result<String
     let by = if by.is_empty() { "Not signed.".into() } else { format!("Signed up to record {signed} with:{by}") };
     let _ = write!(
         html,
-        "<footer><p>Made from {records} records in an unbroken chain ({end}). Hash of the last:<br/><code>{head}</code><br/>{by}<br/>\
-         To prove it again: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n"
+        "<footer><p>Made from {records} records in an unbroken chain ({end}). Hash of the last record:<br/><code>{head}</code><br/>{by}<br/>\
+         To verify the record again: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n"
     );
     Ok(html)
 }
@@ -108,8 +109,8 @@ fn verdict(story: &RunHistory) -> String {
     format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
 }
 
-/// Returns the HTML paragraph about a last pass that did not reach its end, with the ground share of its path; empty if
-/// the pass is complete.
+/// Returns an HTML paragraph that says how the last pass ended and which share of its path was ground. Returns an empty
+/// text if the last pass is complete or no pass was started.
 fn broken_off_pass(story: &RunHistory) -> String {
     let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
     let how = match result {
@@ -131,7 +132,8 @@ fn broken_off_pass(story: &RunHistory) -> String {
     format!("<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part is unchanged.</p>\n")
 }
 
-/// Returns the HTML table of the judged figures of the last measurement with their limits.
+/// Returns the HTML table of the judged figures of the last measurement, with their uncertainty, their limits and the
+/// decision rule. Returns an empty text if there is no tolerance or no measurement on record.
 fn judged(story: &RunHistory) -> String {
     let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_measured()) else {
         return String::new();
@@ -139,7 +141,7 @@ fn judged(story: &RunHistory) -> String {
     let judged = if of.judgements.is_empty() { "measured and not judged" } else { "judged" };
     let mut html = format!(
         "<table id=\"judged\">\n<tr><th>{judged}, cycle {cycle}</th><th class=\"n\">found, \u{b5}m</th>\
-         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
+         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % credible interval, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
     );
     for compared in tolerance.compare(figures) {
         let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } =
@@ -164,7 +166,8 @@ fn um(mm: f64) -> String {
     format!("{:.2}", 1e3 * mm)
 }
 
-/// Returns the comparison of a figure with its limit, with the calculation shown to the reader.
+/// Returns in words if a figure is within its limit, with the compared numbers. `with_uncertainty` is true if the
+/// decision rule uses the uncertainty. Returns an empty text if the figure has no limit.
 fn comparison(compared: &ComparedFigure, with_uncertainty: bool) -> String {
     let ComparedFigure { median_mm: found_mm, compared_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
@@ -234,14 +237,14 @@ fn facts(story: &RunHistory, begin: &Value) -> String {
     format!("<h2>Run</h2>\n<table>\n{}</table>\n", rows.collect::<String>())
 }
 
-/// Formats a time of the record to the second, for people.
+/// Formats a time of the record (RFC 3339 in UTC) for people, to the second.
 pub(super) fn when(utc: &str) -> String {
     let second: String = utc.chars().take(19).collect();
     format!("{} UTC", second.replacen('T', " ", 1))
 }
 
-/// Returns the HTML table of the cycles: a row for each measurement with its verdict, and below it the reason and
-/// further remarks.
+/// Returns the HTML table of the cycles. Each measurement has a row with its verdict and figures, and a second row with
+/// the reason for the verdict and remarks.
 fn cycles(story: &RunHistory) -> String {
     let tolerance = story.tolerance();
     let named = |m: &Measurement| Some(tolerance.as_ref()?.compare(m.figures.as_ref()?)[0].name);
@@ -272,8 +275,8 @@ fn cycles(story: &RunHistory) -> String {
             (k = 2). The level is the height of the target surface above the nominal surface.</p>\n"
 }
 
-/// Returns the HTML table of the parameters of the machine that were compensated, and the error that was left for the
-/// map; empty if the recipe compensates no parameters.
+/// Returns the HTML table of the estimated machine parameters of each cycle, with the values that were compensated, and
+/// the rms of the error that was left for the map. Returns an empty text if the record contains no parameters.
 fn parameters(story: &RunHistory) -> String {
     let row = |number: u32, of: &RecordedParameter| {
         let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
@@ -295,8 +298,8 @@ fn parameters(story: &RunHistory) -> String {
         .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
-         <th class=\"n\">deviation</th><th class=\"n\">compensated</th><th class=\"n\">sent to the next pass</th>\
-         <th class=\"n\">removes, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
+         <th class=\"n\">deviation</th><th class=\"n\">compensated</th><th class=\"n\">correction of the next pass</th>\
+         <th class=\"n\">reduces the error by, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
     )
 }
 
@@ -316,8 +319,8 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
     )
 }
 
-/// Returns the figures of a measurement: the judged figures if the record contains the tolerance, otherwise the figures
-/// of all points.
+/// Returns the table cells, as HTML, with the figures of a measurement. With a tolerance they are the judged figures,
+/// otherwise the figures of all points. `level` is the text of the last cell.
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
     // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
@@ -336,8 +339,8 @@ fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> Strin
     )
 }
 
-/// Returns the verdict of a measurement and its reason. For a measurement without a judgement, the verdict is "not
-/// judged" or "no figures".
+/// Returns two texts: the verdict of a measurement, and its reason with any earlier judgements. If the measurement was
+/// not judged, the verdict is "not judged", or "no figures" if it has none.
 fn judgement_of(measurement: &Measurement) -> (String, String) {
     let unusable = || measurement.unusable.clone().unwrap_or_default();
     let Some((last, earlier)) = measurement.judgements.split_last() else {
@@ -353,7 +356,7 @@ fn alarms(story: &RunHistory) -> String {
         let withdrawn = told.withdrawn.as_deref().map_or("not withdrawn".to_owned(), when);
         [when(&told.raised), withdrawn, alarm_words(&told.alarm), role_words(&told.alarm)]
     };
-    let heads = ["raised", "withdrawn", "what, what follows, what to do", "cleared by"];
+    let heads = ["raised", "withdrawn", "cause, consequence, remedy", "cleared by"];
     table("Alarms", "alarms", "No alarm was raised.", heads, story.alarms.iter().map(row))
 }
 

@@ -91,7 +91,8 @@ pub(super) struct Measurement {
 }
 
 impl Measurement {
-    /// Returns true if further touches belong to this measurement.
+    /// Returns true if this measurement is not complete: the figures say which places to touch next, and these touches
+    /// belong to the same measurement.
     fn expects_more_touches(&self) -> bool {
         self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
     }
@@ -117,7 +118,8 @@ pub(super) struct Order {
 }
 
 impl RunHistory {
-    /// Verifies the record of a run and reads its history, as far as the record is verified.
+    /// Verifies the record in the run folder `folder`. Returns the history of the run and the result of the
+    /// verification. Records after the verified part are not read.
     ///
     /// # Errors
     /// Fails if the record cannot be read or does not pass verification.
@@ -269,7 +271,7 @@ impl RunHistory {
         self.cycles.entry(number).or_default()
     }
 
-    /// Returns the last measurement of a cycle.
+    /// Returns the last measurement of the cycle `number`; creates an empty one if the cycle has none.
     fn measurement(&mut self, number: u32) -> &mut Measurement {
         let measurements = &mut self.cycle(number).measurements;
         if measurements.is_empty() {
@@ -279,13 +281,14 @@ impl RunHistory {
         &mut measurements[last]
     }
 
-    /// Returns the tolerance of the recipe at the start of the run; `None` if it is not on record.
+    /// Returns the tolerance of the recipe, from the first record of the run. Returns `None` if it is not on record.
     pub(super) fn tolerance(&self) -> Option<Tolerance> {
         let begin = self.begin.as_ref()?.value();
         serde_json::from_value(begin["content"]["plan"]["tolerance"].clone()).ok()
     }
 
-    /// Returns the last measurement with figures, and its cycle.
+    /// Returns the last measurement that has figures: the number of its cycle, the measurement, and its figures.
+    /// Returns `None` if there is none.
     pub(super) fn last_measured(&self) -> Option<(u32, &Measurement, &Figures)> {
         let all = self.cycles.iter().flat_map(|(cycle, story)| story.measurements.iter().map(|of| (*cycle, of)));
         all.rev().find_map(|(cycle, of)| Some((cycle, of, of.figures.as_ref()?)))
@@ -297,7 +300,8 @@ impl Order {
         words(&self.record)
     }
 
-    /// Returns the result of the order in words.
+    /// Returns in words what became of the order: accepted, or refused with the reason. For an order that went directly
+    /// to a machine it is "on record", because later records show the result.
     pub(super) fn answer(&self) -> String {
         match (&self.refused, &self.event) {
             (Some(why), _) => format!("refused: {why}"),

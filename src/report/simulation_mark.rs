@@ -29,8 +29,9 @@ pub(super) struct MarkedPicture {
     pub rgba: Vec<u8>,
 }
 
-/// Puts the word SIMULATION in a band above the pixels. A small picture is enlarged: each pixel becomes a square of
-/// several pixels.
+/// Puts the word SIMULATION in a band above a picture. `pixels` (red, green, blue, opacity) are given row by row from
+/// the top, `columns` in each row. A small picture is enlarged, so that the word has room: each pixel becomes a square
+/// of several pixels.
 pub(super) fn mark_simulation(pixels: &[[u8; 4]], columns: usize) -> MarkedPicture {
     let rows = pixels.len() / columns;
     let enlarged = MIN_WIDTH.div_ceil(columns);
@@ -52,7 +53,8 @@ pub(super) fn mark_simulation(pixels: &[[u8; 4]], columns: usize) -> MarkedPictu
     MarkedPicture { width, height: band + rows * enlarged, rgba }
 }
 
-/// Returns true if a pixel of the band belongs to a letter. `x` counts from the first letter.
+/// Returns true if a pixel of the band belongs to a letter of the word. `x` counts from the left of the first letter,
+/// `y` from the top of the band; both are in pixels of the letters.
 fn is_inked(x: usize, y: usize) -> bool {
     const ABOVE: usize = 2;
     const WIDE: usize = 5;

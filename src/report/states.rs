@@ -137,7 +137,7 @@ struct Edge {
 /// Occupied rectangle: centre, and half of width and height.
 type OccupiedRectangle = ([f64; 2], [f64; 2]);
 
-/// Draws the state machine as SVG from its table.
+/// Draws the state machine of the cell as SVG. `rows` is its transition table.
 pub fn state_picture(rows: &[TransitionRow]) -> String {
     let mut svg = Svg::new(WIDTH_PX, HEIGHT_PX);
     svg.text([20.0, 30.0], Anchor::Start, LARGE, "The cell: states");
@@ -251,7 +251,7 @@ fn boxes(nodes: &[Node]) -> Vec<OccupiedRectangle> {
     nodes.iter().map(|node| (node.middle, node.half)).collect()
 }
 
-/// Returns an arrow for each entry of `ways` whose two states have a box.
+/// Returns an arrow for each pair of states in `ways`, if both states have a box in `nodes`.
 fn edges(nodes: &[Node], ways: &TransitionEvents) -> Vec<Edge> {
     let index = |name: &str| nodes.iter().position(|node| node.name == name);
     let known = ways
@@ -288,7 +288,8 @@ fn colour_of(events: &BTreeSet<String>) -> &'static str {
     }
 }
 
-/// Returns the names of at most two events: orders first, then the normal course of a run, then faults.
+/// Returns the label of an arrow: the names of at most two of its events, and the number of further events. Orders come
+/// first, then the normal course of a run, then faults.
 fn label_of(events: &BTreeSet<String>) -> String {
     let rank = |event: &&String| {
         let known = |names: &[&str]| names.contains(&event.as_str());
@@ -300,8 +301,8 @@ fn label_of(events: &BTreeSet<String>) -> String {
     if sorted.len() > 2 { format!("{named} +{}", sorted.len() - 2) } else { named }
 }
 
-/// Returns start, control point and end of the straightest curve between two boxes that touches no other box. `both` is
-/// true if there is also an arrow in the opposite direction.
+/// Returns start, control point and end of a curve between the two boxes of `edge`: the straightest curve that touches
+/// no other box. `both` is true if there is also an arrow in the opposite direction; then the curve is not straight.
 fn route(nodes: &[Node], edge: &Edge, both: bool) -> [[f64; 2]; 3] {
     let (from, to) = (&nodes[edge.from], &nodes[edge.to]);
     let [dx, dy] = [to.middle[0] - from.middle[0], to.middle[1] - from.middle[1]];
@@ -321,7 +322,7 @@ fn route(nodes: &[Node], edge: &Edge, both: bool) -> [[f64; 2]; 3] {
     bows.into_iter().map(curve).find(|c| is_free(c)).unwrap_or_else(|| curve(least))
 }
 
-/// Returns the point at which the line from the centre of a box to `to` leaves the box.
+/// Returns the point at which the straight line from the centre of the box `node` to the point `to` leaves the box.
 fn border(node: &Node, to: [f64; 2]) -> [f64; 2] {
     let [dx, dy] = [to[0] - node.middle[0], to[1] - node.middle[1]];
     let share = (node.half[0] / dx.abs()).min(node.half[1] / dy.abs()).min(1.0);
@@ -338,8 +339,9 @@ fn within(point: [f64; 2], middle: [f64; 2], half: [f64; 2], margin: f64) -> boo
     (0..2).all(|k| (point[k] - middle[k]).abs() < half[k] + margin)
 }
 
-/// Returns the first position along a curve, or next to it, at which a label covers no rectangle of `taken`. `half` is
-/// half of the width and of the height of the label.
+/// Returns a position for the centre of a label: the first position on the curve, or above or below it, at which the
+/// label covers no rectangle in `taken`. `half` is half of the width and height of the label. If no position is free,
+/// returns the middle of the curve.
 fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[OccupiedRectangle]) -> [f64; 2] {
     let is_free = |place: &[f64; 2]| {
         !taken.iter().any(|(middle, other)| within(*place, *middle, [other[0] + half[0], other[1] + half[1]], 1.0))

@@ -90,7 +90,7 @@ pub struct CycleSummary {
     pub deviations: Option<String>,
 }
 
-/// Reads the summary of a run for a list.
+/// Reads the record in the run folder `folder`, without verifying it, and returns its summary for a list of runs.
 ///
 /// # Errors
 /// Fails if the folder contains no record of a run, or if the record cannot be read.

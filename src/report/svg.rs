@@ -54,7 +54,7 @@ pub(super) struct Frame<'a> {
 }
 
 impl Svg {
-    /// Begins a document with a white background.
+    /// Begins an SVG document of this size in pixels, with a white background.
     pub(super) fn new(width: f64, height: f64) -> Self {
         let mut svg = Self { text: String::new() };
         svg.put(format_args!(
@@ -65,7 +65,7 @@ impl Svg {
         svg
     }
 
-    /// Ends the document.
+    /// Ends the document and returns its text.
     pub(super) fn finish(mut self) -> String {
         self.text.push_str("</svg>\n");
         self.text
@@ -81,7 +81,7 @@ impl Svg {
         ));
     }
 
-    /// Draws a filled or unfilled rectangle with a thin outline.
+    /// Draws a rectangle with a thin outline. `[x, y]` is its upper left corner; `fill` is a colour, or "none".
     pub(super) fn rectangle(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], fill: &str) {
         self.put(format_args!(
             "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"{fill}\" stroke=\"{INK}\"/>\n"
@@ -99,7 +99,8 @@ impl Svg {
         ));
     }
 
-    /// Draws a quadratic curve between two places, with an arrow head at its end.
+    /// Draws a quadratic Bézier curve from (x1, y1) to (x2, y2) with the control point (cx, cy), and an arrow head at
+    /// its end.
     pub(super) fn arrow(&mut self, [x1, y1]: [f64; 2], [cx, cy]: [f64; 2], [x2, y2]: [f64; 2], colour: &str) {
         let (dx, dy) = if (cx - x2).hypot(cy - y2) > 1.0 { (x2 - cx, y2 - cy) } else { (x2 - x1, y2 - y1) };
         let length = dx.hypot(dy).max(f64::MIN_POSITIVE);
@@ -111,7 +112,8 @@ impl Svg {
         ));
     }
 
-    /// Draws a white plate that covers earlier drawing.
+    /// Draws a nearly opaque white rectangle, as a background for a label over earlier drawing. `[x, y]` is its upper
+    /// left corner.
     pub(super) fn plate(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2]) {
         self.put(format_args!(
             "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"#ffffff\" \
@@ -119,7 +121,7 @@ impl Svg {
         ));
     }
 
-    /// Draws a text in a colour, centred on a place.
+    /// Draws the text `content` in a colour. `[x, y]` is the middle of its base line, `size` its font size in pixels.
     pub(super) fn coloured_text(&mut self, [x, y]: [f64; 2], size: f64, content: &str, colour: &str) {
         let content = escaped(content);
         self.put(format_args!(
@@ -127,7 +129,7 @@ impl Svg {
         ));
     }
 
-    /// Draws a marker: shape 0 is a disc, 1 a square, 2 a triangle, 3 a diamond.
+    /// Draws a marker centred at `[x, y]`. `shape` is 0 for a disc, 1 for a square, 2 for a triangle, 3 for a diamond.
     pub(super) fn marker(&mut self, [x, y]: [f64; 2], shape: usize, colour: &str) {
         if shape == 0 {
             return self.put(format_args!("<circle cx=\"{x:.2}\" cy=\"{y:.2}\" r=\"3.5\" fill=\"{colour}\"/>\n"));
@@ -140,7 +142,8 @@ impl Svg {
         self.put(format_args!("<path d=\"M{x:.2},{y:.2}{outline}\" fill=\"{colour}\"/>\n"));
     }
 
-    /// Draws the frame of a figure with its ticks, their labels, the names of both axes and optional grid lines.
+    /// Draws the frame around a figure, with its ticks and their labels, the labels of both axes, and grid lines if
+    /// requested.
     pub(super) fn frame(&mut self, frame: &Frame) {
         let Frame { corner: [left, top], size: [width, height], .. } = *frame;
         let (right, bottom) = (left + width, top + height);
@@ -159,7 +162,8 @@ impl Svg {
         self.upright([left - 46.0, top + height / 2.0], frame.y_label);
     }
 
-    /// Draws a text with its base line through a place.
+    /// Draws the text `content`. `[x, y]` is the point of its base line that `anchor` selects (start, middle or end),
+    /// `size` its font size in pixels.
     pub(super) fn text(&mut self, [x, y]: [f64; 2], anchor: Anchor, size: f64, content: &str) {
         let (anchor, content) = (anchor.name(), escaped(content));
         self.put(format_args!(
@@ -167,7 +171,7 @@ impl Svg {
         ));
     }
 
-    /// Draws a text that reads upwards, centred on a place.
+    /// Draws a text that is rotated by a quarter turn and reads upwards. `[x, y]` is the middle of its base line.
     pub(super) fn upright(&mut self, [x, y]: [f64; 2], content: &str) {
         let content = escaped(content);
         self.put(format_args!(
@@ -175,7 +179,8 @@ impl Svg {
         ));
     }
 
-    /// Draws the label of a tick, with its exponent raised.
+    /// Draws the label of a tick; an exponent is drawn raised after the label. `at` is the point of the base line that
+    /// `anchor` selects.
     pub(super) fn tick_label(&mut self, at: [f64; 2], anchor: Anchor, tick: &Tick) {
         let Some(exponent) = tick.exponent else { return self.text(at, anchor, SMALL, &tick.label) };
         let ([x, y], anchor, exponent) = (at, anchor.name(), exponent.to_string().replace('-', "\u{2212}"));
@@ -186,7 +191,8 @@ impl Svg {
         ));
     }
 
-    /// Draws a PNG, given in base 64, stretched over a rectangle.
+    /// Draws a PNG, stretched to a rectangle. `[x, y]` is the upper left corner, `base64` the PNG in base 64, and
+    /// `rendering` the CSS property `image-rendering`.
     pub(super) fn image(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], base64: &str, rendering: &str) {
         self.put(format_args!(
             "<image x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" preserveAspectRatio=\"none\" \
@@ -194,7 +200,8 @@ impl Svg {
         ));
     }
 
-    /// Defines a gradient from bottom to top through colours at places from 0 to 1. It is used as the fill `url(#id)`.
+    /// Defines a vertical colour gradient that shapes can use as the fill `url(#id)`. `stops` are pairs of a position,
+    /// from 0 at the bottom to 1 at the top, and the colour there.
     pub(super) fn gradient(&mut self, id: &str, stops: &[(f64, [u8; 3])]) {
         self.put(format_args!("<defs><linearGradient id=\"{id}\" x1=\"0\" y1=\"1\" x2=\"0\" y2=\"0\">"));
         for (offset, [r, g, b]) in stops {

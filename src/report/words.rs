@@ -11,8 +11,8 @@ use regrind_cell::{
 };
 use regrind_journal::Record;
 
-/// Returns the content of a record in one line. Content that this version of the program cannot read is returned as it
-/// was written.
+/// Returns the content of a record of the journal in one line for people. Content that this version of the program
+/// cannot read is shown as it stands in the record. Control characters become spaces.
 pub fn words(record: &Record) -> String {
     let told = content_words(&RecordContent::from_record(record));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
@@ -67,8 +67,9 @@ fn seal_words(value: &Value) -> Option<String> {
     Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
 }
 
-/// Returns a person's confirmation about a machine: the confirmed state, and the map and the file if they are given;
-/// `None` if no state is given.
+/// Returns in one line a person's confirmation of the state of a machine: the machine, the confirmed state, and the
+/// names of the map and the file if they are given. `value` is the content of the record. Returns `None` if it contains
+/// no state.
 fn person_words(device: Device, value: &Value) -> Option<String> {
     let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
     for key in ["map", "file"] {
@@ -84,13 +85,14 @@ fn step_words(device: Device, value: &Value) -> Option<String> {
     Some(format!("{device}: to be brought home by {step}, its state is {seen}"))
 }
 
-/// Returns in words, for CMM and grinder, if each is home.
+/// Returns in words which machines are home. `home` holds true for a machine that is home: first the CMM, then the
+/// grinder.
 pub(super) fn home_words(home: [bool; 2]) -> String {
     let of = |(device, home): (Device, bool)| format!("{device} {}", if home { "home" } else { "not home" });
     Device::BOTH.into_iter().zip(home).map(of).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns in words the share of the part that the wheel passes over without contact. Units: a share from 0 to 1.
+/// Formats the share of the part, from 0 to 1, over which the wheel passes without contact, such as "1.5 % in air".
 pub fn in_air(share: f64) -> String {
     match 100.0 * share {
         0.0 => "none in air".to_owned(),
@@ -99,7 +101,8 @@ pub fn in_air(share: f64) -> String {
     }
 }
 
-/// Returns the report of a grinder about a pass. Values that it does not report are omitted.
+/// Returns in one line what the grinder reported about a pass, such as path length and removed volume. `value` is the
+/// content of the record. Values that the grinder did not report are omitted.
 fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
     let told = [
@@ -131,7 +134,7 @@ fn transfer_words(value: &Value) -> Option<String> {
     Some(line)
 }
 
-/// Returns the ending of a run and its reason.
+/// Returns in one line how a run ended, with the reason: accepted, not accepted, stopped or aborted.
 pub fn ending_words(ending: &Ending) -> String {
     match ending {
         Ending::Accepted { reason, .. } => format!("ACCEPTED: {reason}"),
@@ -144,7 +147,8 @@ pub fn ending_words(ending: &Ending) -> String {
     }
 }
 
-/// Converts `load_confirmed` and `LoadConfirmed` to `load confirmed`.
+/// Converts a name of the program into lower-case words: both `load_confirmed` and `LoadConfirmed` become "load
+/// confirmed".
 fn spaced(name: &str) -> String {
     let mut words = String::new();
     for c in name.chars() {
@@ -156,27 +160,27 @@ fn spaced(name: &str) -> String {
     words
 }
 
-/// Returns the name of a command or event in words, after the name of the machine if there is one.
+/// Returns the name of a command or event in words. If a machine is given, its name comes first.
 fn named(name: &str, device: Option<Device>) -> String {
     device.map_or_else(|| spaced(name), |device| format!("{device}: {}", spaced(name)))
 }
 
-/// Returns the judgement of a cycle and its reason.
+/// Returns in one line the verdict of a judgement and its reason.
 pub(super) fn judgement_words(judgement: &Judgement) -> String {
     format!("judged, {}: {}", verdict_words(judgement), judgement.reason)
 }
 
-/// Returns the verdict, with the same name as in `result.json`.
+/// Returns the verdict of a judgement in lower-case words, as `result.json` names it.
 pub(super) fn verdict_words(judgement: &Judgement) -> String {
     spaced(&format!("{:?}", judgement.verdict))
 }
 
-/// Returns the cause of an alarm, its consequence and its remedy.
+/// Returns in one line the cause of an alarm, its consequence, and what to do.
 pub(super) fn alarm_words(alarm: &Alarm) -> String {
     format!("{} {} {}", alarm.what, alarm.consequence, alarm.remedy.join(" "))
 }
 
-/// Returns the role that can clear an alarm.
+/// Returns the role of the people who can clear an alarm; "itself" if the alarm clears without a person.
 pub(super) fn role_words(alarm: &Alarm) -> String {
     match alarm.clears {
         Role::Nobody => "itself".to_owned(),
@@ -188,7 +192,7 @@ fn command_words(command: &Command) -> String {
     match command {
         Command::Announce(judgement) => judgement_words(judgement),
         Command::Raise(alarm) => format!("ALARM {} {}", alarm.what, alarm.consequence),
-        Command::Withdraw { alarm } => format!("alarm over: {}", spaced(&format!("{alarm:?}"))),
+        Command::Withdraw { alarm } => format!("alarm withdrawn: {}", spaced(&format!("{alarm:?}"))),
         Command::Refuse { event, state, why } => format!("{} refused in {state}: {why}", spaced(event.name())),
         Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
         command => {
@@ -253,7 +257,7 @@ fn found_words(simulated: bool, found: &Occupation) -> String {
     let kind = if simulated { "a simulation" } else { "a real machine" };
     match found {
         Occupation::Idle => format!("{kind}, idle"),
-        Occupation::ToClear => format!("{kind}, to be cleared"),
+        Occupation::ToClear => format!("{kind}, aborted or in fault, must be cleared"),
         Occupation::Busy(words) => format!("{kind}, busy: {words}"),
     }
 }
@@ -262,10 +266,10 @@ fn mismatch_words(why: &ConnectionRefusal) -> String {
     match why {
         ConnectionRefusal::Unreachable(words) => format!("unreachable: {words}"),
         ConnectionRefusal::WrongDevice(words) => format!("another device: {words}"),
-        ConnectionRefusal::WordOrder(words) => format!("another word order: {words}"),
-        ConnectionRefusal::Inches => "in inches".to_owned(),
+        ConnectionRefusal::WordOrder(words) => format!("word order differs from the cell file: {words}"),
+        ConnectionRefusal::Inches => "the machine works in inches".to_owned(),
         ConnectionRefusal::Owned(words) => format!("owned by another client: {words}"),
-        ConnectionRefusal::AtAnotherJob(words) => format!("at the job of another run: {words}"),
+        ConnectionRefusal::AtAnotherJob(words) => format!("busy with the job of another run: {words}"),
     }
 }
 
@@ -279,13 +283,15 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
     }
 }
 
-/// Returns in words if a measurement is usable, or the reason why it is not.
+/// Returns in words if a measurement is usable; if not, with the reason.
 pub(super) fn gate_words(gate: &GateResult) -> String {
     match gate {
         GateResult::Passed => "usable".to_owned(),
         GateResult::Failed(GateFailure::NoPart) => "not usable: nothing was touched".to_owned(),
-        GateResult::Failed(GateFailure::Contacts) => "not usable: contact points".to_owned(),
-        GateResult::Failed(GateFailure::Inches) => "not usable: inches".to_owned(),
+        GateResult::Failed(GateFailure::Contacts) => {
+            "not usable: the CMM returned contact points instead of probe centres".to_owned()
+        }
+        GateResult::Failed(GateFailure::Inches) => "not usable: the coordinates seem to be in inches".to_owned(),
         GateResult::Failed(
             GateFailure::Coverage(words)
             | GateFailure::Foreign(words)
@@ -317,8 +323,8 @@ fn figures_words(figures: &Figures) -> String {
     line
 }
 
-/// Returns in words the estimates of the parameters of the machine with their compensation, and the error that is left
-/// for the map.
+/// Returns lines for people: one for each estimated machine parameter with its compensation, and one for the rms of the
+/// error that is left for the map. Returns no lines if no parameters were estimated.
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::RecordedParameter::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());

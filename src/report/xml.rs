@@ -15,7 +15,7 @@ impl Xml {
         Self { text: "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n".to_owned(), open: Vec::new() }
     }
 
-    /// Writes an element with child elements, which `inner` writes.
+    /// Writes an element with the name `name` that contains child elements. `inner` writes the children.
     pub(super) fn within(&mut self, name: &'static str, attributes: &[(&str, &str)], inner: impl FnOnce(&mut Self)) {
         self.begin(name, attributes);
         self.text.push_str(">\n");
@@ -26,18 +26,18 @@ impl Xml {
         let _ = writeln!(self.text, "</{name}>");
     }
 
-    /// Writes an element that contains a text.
+    /// Writes an element with the name `name` that contains only a text and has no attributes.
     pub(super) fn text(&mut self, name: &'static str, text: &str) {
         self.text_with(name, &[], text);
     }
 
-    /// Writes an element that contains a text, with attributes.
+    /// Writes an element with attributes that contains only a text. `attributes` are pairs of a name and a value.
     pub(super) fn text_with(&mut self, name: &'static str, attributes: &[(&str, &str)], text: &str) {
         self.begin(name, attributes);
         let _ = writeln!(self.text, ">{}</{name}>", escaped(text));
     }
 
-    /// Writes an element without content.
+    /// Writes an element that has attributes and no content. `attributes` are pairs of a name and a value.
     pub(super) fn empty(&mut self, name: &'static str, attributes: &[(&str, &str)]) {
         self.begin(name, attributes);
         self.text.push_str("/>\n");

@@ -27,9 +27,9 @@ pub enum TrustError {
         "{}: the password cannot be read: {source}; name its file with `password_file`; for a database, `regrind plant enrol` creates the file", .path.display()
     )]
     Password { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    #[error("{}: other users of this computer can read the password ({}); only its owner must be able to read it: {}", .path.display(), .open.how, .open.remedy)]
     PasswordIsOpen { path: PathBuf, open: OpenToOthers },
-    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
+    #[error("{}: no certificates in PEM can be read from it: {what}; give the certificates of the issuer of the server in PEM", .path.display())]
     Certificates { path: PathBuf, what: String },
     #[error(
         "{host} is another computer, and no certificates to authenticate it are given; name their file with `certificates` of {table}"
@@ -37,14 +37,14 @@ pub enum TrustError {
     Unproven { host: String, table: &'static str },
 }
 
-/// Returns the TLS configuration that verifies a server with the given certificates. Returns `None` for a server on
-/// this computer without certificates, which needs no proof.
+/// Returns the TLS configuration with which a client verifies the server `host` by the file `certificates`. Returns
+/// `None` if `certificates` is `None` and the server is on this computer, because it then needs no proof.
 ///
-/// `host` is a name, an address or the folder of a socket. `table` is the table of the file that names the host, for
-/// messages.
+/// `host` is a name, an address or the folder of a socket. `table` only names, in messages, the table of the settings
+/// that states the host.
 ///
 /// # Errors
-/// The certificates cannot be read, or a server on another computer has none.
+/// The certificates cannot be read; a server on another computer without `certificates`.
 pub fn tls_config(
     host: &str,
     certificates: Option<&Path>,
@@ -60,10 +60,10 @@ pub fn tls_config(
     }
 }
 
-/// Reads a password from a file that no other user can read. The line ending is not a part of the password.
+/// Reads a password from its file, without the line ending.
 ///
 /// # Errors
-/// The file cannot be read, is longer than the maximum, or other users can read it.
+/// The file cannot be read, is longer than 4096 bytes, or can be read by other users.
 pub fn read_password(path: &Path) -> Result<String, TrustError> {
     let unread = |source| TrustError::Password { path: path.to_owned(), source };
     if let Some(open) = readable_by_others(path).map_err(unread)? {

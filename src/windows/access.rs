@@ -56,13 +56,13 @@ impl OwnersAlone {
         Ok(Self { _descriptor: descriptor, attributes })
     }
 
-    /// Returns a pointer to the attributes, valid as long as `self` lives. Windows only reads them.
+    /// Returns a pointer to the security attributes, which is valid as long as `self` lives. Windows only reads them.
     pub(crate) fn attributes(&self) -> *const SECURITY_ATTRIBUTES {
         &raw const self.attributes
     }
 }
 
-/// Parses a descriptor from Windows' text form (SDDL).
+/// Parses a security descriptor from its text form (SDDL).
 fn parse(text: &str) -> io::Result<Descriptor> {
     let text = wide(OsStr::new(text))?;
     let mut descriptor = ptr::null_mut();
@@ -78,10 +78,11 @@ fn parse(text: &str) -> io::Result<Descriptor> {
     Ok(Descriptor(descriptor))
 }
 
-/// Returns the security identifiers of those who can read a file, except the owner, the system and the administrators.
+/// Returns the security identifiers (SIDs) of all who can read a file, except the user of this process, the system and
+/// the administrators.
 ///
 /// # Errors
-/// Returns an error if Windows does not report the access list.
+/// Windows does not report the access list.
 pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     let (mut list, mut descriptor) = (ptr::null_mut(), ptr::null_mut());
     let (what, unasked) = (DACL_SECURITY_INFORMATION, ptr::null_mut());
@@ -110,7 +111,8 @@ pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     Ok(others)
 }
 
-/// Returns the identifiers that a list allows to read. `list` must be a valid list from Windows that is not yet freed.
+/// Returns the security identifiers (SIDs) that an access list allows to read. `list` must be a valid list from Windows
+/// that is not yet freed.
 fn readers(list: *const ACL) -> io::Result<Vec<String>> {
     // SAFETY: every list begins with this header.
     let count = unsafe { list.read() }.AceCount;
@@ -136,7 +138,7 @@ fn readers(list: *const ACL) -> io::Result<Vec<String>> {
     Ok(found)
 }
 
-/// Returns true if an open object, such as a pipe, belongs to the user of this process.
+/// Returns true if an open object, such as a pipe, is owned by the user of this process.
 pub(crate) fn is_owned_here(open: BorrowedHandle<'_>) -> io::Result<bool> {
     let (mut owner, mut descriptor) = (ptr::null_mut(), ptr::null_mut());
     let unasked = ptr::null_mut();

@@ -19,7 +19,7 @@ use super::{succeeded, wide};
 /// so no other user can open it in between.
 ///
 /// # Errors
-/// Returns an error if the file exists or if the folder is not writable.
+/// The file exists, or its folder is not writable.
 pub fn create_owners_file(path: &Path) -> io::Result<File> {
     let (name, owners_alone) = (wide(path.as_os_str())?, OwnersAlone::new()?);
     // Others can read and rename the file while it is open, as with a file of std.
@@ -43,20 +43,20 @@ pub fn create_owners_file(path: &Path) -> io::Result<File> {
     Ok(unsafe { File::from_raw_handle(handle) })
 }
 
-/// Creates a folder that only its owner can read. The same holds for everything that will be created in it.
+/// Creates a folder that only its owner can read. Everything that is later created in it gets the same rights.
 ///
 /// # Errors
-/// Returns an error if the name exists or if the parent folder is not writable.
+/// The name exists, or the parent folder is not writable.
 pub fn create_owners_folder(path: &Path) -> io::Result<()> {
     let (name, owners_alone) = (wide(path.as_os_str())?, OwnersAlone::new()?);
     // SAFETY: the name ends with a zero. Name and attributes live longer than the call.
     succeeded(unsafe { CreateDirectoryW(name.as_ptr(), owners_alone.attributes()) })
 }
 
-/// Returns the number of free bytes for the user of this process on the disk of a folder.
+/// Returns the free space, in bytes, that the user of this process has on the disk of a folder.
 ///
 /// # Errors
-/// Returns an error if the folder does not exist or if the disk does not report its free space.
+/// The folder does not exist, or the disk does not report its free space.
 pub fn free_bytes(folder: &Path) -> io::Result<u64> {
     let folder = wide(folder.as_os_str())?;
     let mut left = 0;

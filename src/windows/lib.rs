@@ -25,7 +25,10 @@ use std::ffi::OsStr;
 use std::io;
 use std::os::windows::ffi::OsStrExt;
 
-/// Returns a text in the form that Windows expects: UTF-16 with a zero at the end and none inside.
+/// Returns a text in the form that Windows expects: UTF-16 with a zero at its end.
+///
+/// # Errors
+/// A text that contains a zero itself.
 fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     let mut units: Vec<u16> = text.encode_wide().collect();
     if units.contains(&0) {
@@ -35,12 +38,12 @@ fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     Ok(units)
 }
 
-/// Converts the result of a call that returns 0 on failure.
+/// Converts the answer of a Windows function that returns 0 on failure: 0 becomes the last error of the system.
 fn succeeded(answer: i32) -> io::Result<()> {
     if answer == 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
 }
 
-/// Converts the result of a call that returns an error number, or 0 on success.
+/// Converts the answer of a Windows function that returns an error number: 0 becomes `Ok`, any other number the error.
 fn no_error(number: u32) -> io::Result<()> {
     if number == 0 { Ok(()) } else { Err(io::Error::from_raw_os_error(number.cast_signed())) }
 }

@@ -28,7 +28,7 @@ pub fn own_name() -> io::Result<String> {
     Ok(String::from_utf16_lossy(name))
 }
 
-/// Returns the security identifier of the user of this process: `S-1-5-21-...`.
+/// Returns the security identifier (SID) of the user of this process, such as `S-1-5-21-...`.
 pub(crate) fn own_sid() -> io::Result<String> {
     let token = own_token()?;
     let mut length = 0;
@@ -56,7 +56,7 @@ fn own_token() -> io::Result<OwnedHandle> {
     Ok(unsafe { OwnedHandle::from_raw_handle(token) })
 }
 
-/// Returns a security identifier as text. The identifier must be complete, as all those from Windows are.
+/// Returns the text form of a security identifier (SID). `sid` must be a complete identifier from Windows.
 pub(crate) fn text_of(sid: PSID) -> io::Result<String> {
     let mut text = ptr::null_mut();
     // SAFETY: Windows wrote `sid`. The call reports an invalid one as an error.

@@ -9,10 +9,11 @@ use windows_sys::Win32::System::Pipes::GetNamedPipeClientProcessId;
 use super::access::{OwnersAlone, is_owned_here};
 use super::succeeded;
 
-/// Creates an end of a pipe for one client. With `is_first`, fails if a pipe of that name exists already.
+/// Creates the server end of the named pipe `name` for one client. Only the user of this process can connect. With
+/// `is_first`, a pipe of that name must not exist yet.
 ///
 /// # Errors
-/// Returns an error if the name exists already or is not a valid pipe name.
+/// `name` is not a valid pipe name, or belongs to another user; with `is_first`, a pipe of that name exists.
 ///
 /// # Panics
 /// Panics outside a tokio runtime with I/O enabled, like all sockets of tokio.
@@ -24,10 +25,10 @@ pub fn listen(name: &str, is_first: bool) -> io::Result<NamedPipeServer> {
     unsafe { options.create_with_security_attributes_raw(name, owners_alone.attributes().cast_mut().cast()) }
 }
 
-/// Returns the id of the process of the client.
+/// Returns the process id of the client that is connected to the pipe.
 ///
 /// # Errors
-/// Returns an error if no client is connected.
+/// No client is connected.
 pub fn client_process(pipe: &NamedPipeServer) -> io::Result<u32> {
     let mut process = 0;
     // SAFETY: the pipe is open, and `process` lives longer than the call.
@@ -35,11 +36,11 @@ pub fn client_process(pipe: &NamedPipeServer) -> io::Result<u32> {
     Ok(process)
 }
 
-/// Returns true if a pipe belongs to the user of this process. Another user could have created a pipe of that name
-/// first.
+/// Returns true if the server end of a pipe is owned by the user of this process. If it is not, another user created a
+/// pipe of that name first.
 ///
 /// # Errors
-/// Returns an error if Windows does not report the owner of the pipe.
+/// Windows does not report the owner of the pipe.
 pub fn is_of_this_user(pipe: &NamedPipeClient) -> io::Result<bool> {
     // SAFETY: the pipe stays open for as long as it is borrowed, which is longer than this.
     is_owned_here(unsafe { BorrowedHandle::borrow_raw(pipe.as_raw_handle()) })

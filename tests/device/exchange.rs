@@ -325,7 +325,7 @@ fn result_errors_include_remedy() {
             THREE.to_owned(),
             "neither the file nor the cell file states whether the coordinates are probe centres or contact points",
         ),
-        (format!("# units: inch\n{}", three()), "in the file the unit is inch, in the cell file mm"),
+        (format!("# units: inch\n{}", three()), "the unit: inch in this file, but mm in the cell file"),
         (format!("# probe radius mm: 1.49\n{}", three()), "probe radius of 1.49 mm; the recipe has 1.5 mm"),
         (with("index,x,y,z\n10,1,2,3\n99,4,5,6\n"), "index `99` is not a target of the plan"),
         (with("index,x,y,z\n10,1,2,3\n10,4,5,6\n"), "index `10` occurs twice"),
@@ -366,7 +366,7 @@ fn cell_file_completes_result_content() {
     };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });
     shop.put("SN_7_c2.csv", &three());
-    bench.refused("in the file coordinates is centres, in the cell file contacts");
+    bench.refused("coordinates: centres in this file, but contacts in the cell file");
     shop.put("SN_7_c2.csv", "1,000;2;3\n1.000,5;5;6\n7;8;9\n");
     let found = bench.settled().answer.unwrap();
     assert_eq!(found.coordinates, Coordinates::Contacts);

@@ -141,7 +141,7 @@ fn page_of_killed_cell_disables_orders() {
     let of_record = format!("new Date({ended}).toLocaleTimeString().match(/\\d+:\\d+:\\d+/)[0]");
     assert_eq!(later.read(&mut browser, since), later.read(&mut browser, &of_record));
     shown.page.signal("KILL");
-    tab.until(&mut browser, "document.querySelector('#old').innerText.includes('lost its server')");
+    tab.until(&mut browser, "document.querySelector('#old').innerText.includes('lost the connection')");
 }
 
 #[test]

@@ -214,7 +214,7 @@ async fn stop_not_executed_aborts() {
     assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::StopNotConfirmed, "{what}");
-    assert!(what.contains("it took the STOP, but is still EXECUTE"), "{what}");
+    assert!(what.contains("it accepted STOP, but is still in EXECUTE"), "{what}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
 }

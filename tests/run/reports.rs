@@ -389,7 +389,7 @@ fn report_lists_alarms_with_times() {
     let shown = shown(&folder);
     let said = |words: &str| shown.iter().any(|(_, row)| row.contains(words));
     assert!(said("ALARM A machine is in fault: grinder. The cell is held."), "{shown:#?}");
-    assert!(said("alarm over: link lost"), "{shown:#?}");
+    assert!(said("alarm withdrawn: link lost"), "{shown:#?}");
 }
 
 #[test]

@@ -56,20 +56,21 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     typed.then(|| io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0))
 }
 
-/// Returns true if this program has the terminal at the moment. A background process that reads from it is stopped by
-/// the system, even if it drives machines.
+/// Returns true if this program is in the foreground of its terminal. The system stops a background process that reads
+/// from the terminal, even if the process drives machines.
 pub(crate) fn is_in_front() -> bool {
     rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
 }
 
-/// Lowers the priority of this program.
+/// Lowers the scheduling priority of this process (nice 10), if the system permits it.
 #[cfg(feature = "plant")]
 pub(crate) fn give_way() {
     // Without the permission the program continues at its priority.
     let _ = rustix::process::nice(10);
 }
 
-/// Protects a child program from Ctrl-C at this program's terminal.
+/// Puts a child program, before its start, into a process group of its own. Ctrl-C at the terminal of this program then
+/// does not end the child.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::unix::process::CommandExt::process_group(command, 0);
 }

@@ -63,16 +63,17 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     event::read().is_ok_and(|typed| typed == Event::Key(enter)).then_some(true)
 }
 
-/// Returns true if this program has the terminal at the moment. A console gives its input to every program that reads.
+/// Returns true if this program can read the keyboard of its terminal. On Windows this does not depend on a foreground
+/// process.
 pub(crate) fn is_in_front() -> bool {
     true
 }
 
-/// Does nothing: on Windows the priority is left to the system.
+/// Does nothing. On Unix this function lowers the priority of the process; on Windows the system decides.
 #[cfg(feature = "plant")]
 pub(crate) fn give_way() {}
 
-/// Protects a child program from Ctrl-C at this program's terminal.
+/// Sets the start options of a child program so that Ctrl-C at the terminal of this program does not end the child.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::windows::process::CommandExt::creation_flags(command, NEW_GROUP);
 }

@@ -18,8 +18,12 @@ pub(in super::super) struct Copy {
     pub(in super::super) told: Value,
 }
 
-/// Verifies the plant's copy of a run. If there is a local journal, also checks that it contains the records that have
-/// arrived at the plant.
+/// Fetches the plant's copy of a run and verifies it with `keys`. `plant` is the path of the plant file, and `run` the
+/// folder or the name of the run. If the folder of the run exists here, also checks that its journal still contains the
+/// records that the plant has.
+///
+/// # Errors
+/// The plant cannot be reached or does not have the run, the copy is not valid, or the local journal differs from it.
 pub(in super::super) fn prove(
     plant: &Path,
     run: Option<&Path>,

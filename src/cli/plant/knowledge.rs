@@ -22,7 +22,9 @@ pub(in super::super) struct PlantKnowledge {
     pub(in super::super) words: Vec<String>,
 }
 
-/// Queries the knowledge of other cells about similar parts. An unreachable plant does not prevent the run.
+/// Queries the plant for what other cells have learned about parts of the same kind, for the run of `task`. Returns an
+/// error only if the plant file is invalid: a plant that does not answer is reported in the messages of the result, and
+/// the run begins without its knowledge.
 pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
     let config = super::read(plant)?;
     // A plant file for live values only has no database to query.
@@ -55,8 +57,8 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
     Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
 }
 
-/// Returns the similarity of the machines, from the value `machines_differ` of the plant file and from the results of
-/// two cells for the same kind of part.
+/// Returns the similarity of the machines. It combines the assumed difference `machines_differ` of the plant file with
+/// the results of pairs of cells that ground the same kind of part.
 fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilarity {
     let mut alike = MachineSimilarity::default();
     if let Some(share) = machines_differ {

@@ -133,8 +133,8 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the name of the database role for the name of a member. It has only small letters, digits and `_`, so it
-/// needs no quotes in SQL.
+/// Converts the name of a member into the name of its database role. Converts letters to lower case and replaces every
+/// other character except ASCII digits by `_`. Keeps at most 48 characters. The result needs no quotes in SQL.
 fn role_of(name: &str) -> String {
     let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '_' };
     let role: String = name.chars().map(plain).take(48).collect();

@@ -91,23 +91,23 @@ impl Where {
     }
 }
 
-/// Reads a plant file, or shows its problems.
+/// Reads a plant file. If it is invalid, prints its problems and returns a failure.
 pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
     check::or_show(PlantConfig::read(file))
 }
 
-/// Returns the database settings of a plant file, or shows the problem.
+/// Returns the table `[database]` of a plant file. If there is none, prints this problem and returns a failure.
 fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
     let missing = || config.problem("database", "is missing", "", "say where the database is, and who signs in");
     check::or_show(config.database.as_ref().ok_or_else(missing))
 }
 
-/// Signs in to the database of a plant file, with any schema version.
+/// Signs in to the database that the plant file names. Does not check the version of its tables.
 pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     Ok(DatabaseLink::open(database(config)?).await?)
 }
 
-/// Signs in to the database of a plant file. Returns an error if the layout of the database is not the one that this
+/// Signs in to the database that the plant file names. Returns an error if its tables do not have the layout that this
 /// program knows.
 pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     let link = open_any(config).await?;
@@ -123,8 +123,9 @@ pub(super) struct PlantProcesses {
 }
 
 impl PlantProcesses {
-    /// Starts the replication of the runs in a folder if the plant file names a database, and the publication of live
-    /// values if it names a receiver.
+    /// Starts programs in separate processes that serve the runs in the folder `runs`. If the plant file `plant` names
+    /// a database, one replicates the records to the plant. If it has a table `[sparkplug]` or `[opcua]`, another one
+    /// publishes live values. Both end when the returned value is dropped.
     pub(super) fn start(runs: &Path, plant: &Path) -> Result<Self, Failure> {
         // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;

@@ -127,7 +127,8 @@ pub(super) fn propose(arguments: &ToPropose) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the files that a recipe names, by their path in the recipe.
+/// Reads the files that a recipe names. Returns the content of each by its path relative to the folder of the recipe.
+/// Returns an error if a file is outside of this folder.
 pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
     let folder = recipe.path().parent().unwrap_or(Path::new(""));
     let mut files = BTreeMap::new();

@@ -149,7 +149,8 @@ fn seeds(text: &str) -> Result<(u64, u64), String> {
     }
 }
 
-/// Parses a dotted key and its values in TOML notation.
+/// Parses an argument such as `compensation.gain=0.8,1.0` into the dotted recipe key and its values, which are in TOML
+/// notation. Returns the reason if the key or the values are invalid, or if there is no value.
 fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     let (key, values) = text.split_once('=').ok_or("give a key and its values, such as compensation.gain=0.8,1.0")?;
     let key = key.trim();
@@ -167,7 +168,8 @@ fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     }
 }
 
-/// Returns every combination of the values of all keys.
+/// Returns all combinations of the values of the keys in `vary` (Cartesian product). Each combination maps every key to
+/// one value.
 fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     vary.iter().fold(vec![Map::new()], |all, (key, values)| {
         let mut every = Vec::with_capacity(all.len() * values.len());
@@ -182,7 +184,8 @@ fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     })
 }
 
-/// Returns the text of a recipe with the given values. Each key is dotted, such as `compensation.gain`.
+/// Returns the text of a recipe in which each key of `values` has its new value. The keys are dotted, such as
+/// `compensation.gain`. Returns the reason if the recipe is not valid TOML.
 fn varied(text: &str, values: &Map<String, Value>) -> Result<String, String> {
     let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is not valid TOML: {error}"))?;
     for (key, value) in values {
@@ -274,8 +277,9 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     })
 }
 
-/// Runs a job in a separate process. Returns the summary of the run with the true state of the simulated part, or the
-/// reason why there is no run.
+/// Runs the recipe of `study`, with the values and the seed of `job`, in a separate process with a simulated cell.
+/// Returns the summary of the run with the true state of the simulated part. If there is no such run, returns the
+/// reason as a text.
 fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
@@ -334,7 +338,8 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns one line per set of values, in the order of the input.
+/// Returns the results of the jobs of a study as a table: a line for each set of values, in the order of the first job
+/// of the set.
 fn in_words(jobs: &[Value]) -> String {
     let mut sets: BTreeMap<String, (i64, Vec<&Value>)> = BTreeMap::new();
     for job in jobs {
@@ -399,7 +404,8 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     Some((low + values.get(middle)?) / 2.0)
 }
 
-/// Returns the 95 % interval of the share of `of` in `all`, in per cent (Wilson 1927).
+/// Returns the 95 % Wilson score interval of a proportion, in per cent: `of` successes among `all` (E. B. Wilson, JASA
+/// 22, 1927).
 fn wilson(of: usize, all: usize) -> [f64; 2] {
     let (n, p) = (all as f64, of as f64 / all as f64);
     let middle = p + Z * Z / (2.0 * n);

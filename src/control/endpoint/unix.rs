@@ -54,12 +54,14 @@ impl Endpoint {
         Ok(Self { listener, mark, is_for_user: false })
     }
 
-    /// Opens a socket outside a run folder, for the user of this program and root only. Always returns `Some` on Unix.
+    /// Creates a second socket at the path `place`, outside the run folder. Only the user of this program and root can
+    /// connect. Always returns `Some` on Unix.
     pub(crate) fn open_for_user(place: &Path) -> io::Result<Option<Self>> {
         Self::open_at(place.to_owned()).map(|door| Some(Self { is_for_user: true, ..door }))
     }
 
-    /// Returns the identity of the socket file; `None` if it could not be read.
+    /// Returns the identity of the socket file, by which a removed or replaced file is recognised. Returns `None` if it
+    /// could not be read.
     pub(crate) fn mark(&self) -> Option<EndpointIdentity> {
         self.mark.clone()
     }
@@ -76,7 +78,8 @@ impl Endpoint {
 }
 
 impl EndpointIdentity {
-    /// Returns true if the socket file is still at the path where it was created.
+    /// Returns true if the file at the path of the socket is still the one that this program created. Also returns true
+    /// if this cannot be read at the moment.
     pub(crate) fn is_in_place(&self) -> bool {
         match identity(&self.path) {
             Ok(identity) => identity == self.identity,
@@ -85,7 +88,8 @@ impl EndpointIdentity {
         }
     }
 
-    /// Creates the socket again, and its folder if that is missing.
+    /// Creates a new socket at the same path, after its file was removed or replaced. Creates the folder too if it is
+    /// missing.
     pub(crate) fn open_again(&self) -> io::Result<Endpoint> {
         if let Some(folder) = self.path.parent() {
             std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -98,7 +102,7 @@ fn identity(path: &Path) -> io::Result<[u64; 2]> {
     std::fs::symlink_metadata(path).map(|found| [found.dev(), found.ino()])
 }
 
-/// Returns true if the files of a user can be trusted: the user of this program, or root.
+/// Returns true if `uid` is the user of this program or root.
 fn is_trusted(uid: u32) -> bool {
     uid == 0 || Some(uid) == own_uid()
 }
@@ -118,7 +122,7 @@ pub(crate) fn remove_endpoint_at(path: &Path) {
 pub(crate) struct Client(UnixStream);
 
 impl Client {
-    /// Returns the person at the other end, as identified by the operating system.
+    /// Returns the user and the process at the other end of a connection, as the operating system identifies them.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let peer = self.0.peer_cred()?;
         let uid = peer.uid();
@@ -136,7 +140,7 @@ impl Client {
     }
 }
 
-/// Returns true if a client has already closed its end.
+/// Returns true if the client has already closed its end of the connection. Does not wait.
 pub(crate) fn is_closed(says: &ClientReader) -> bool {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let closed = PollFlags::RDHUP | PollFlags::HUP | PollFlags::ERR;
@@ -169,13 +173,14 @@ pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> i
     exchange_on(connect_stream(&socket_path(folder))?, line, patience)
 }
 
-/// Sends a line to the cell of a socket outside a run folder, and returns the line of its answer.
+/// Sends a line to the cell that listens at a socket outside a run folder, and returns the line of its answer.
+/// `patience` is the timeout. Returns an error if the socket belongs to another user than this one or root.
 pub(crate) fn exchange_line_at(place: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     exchange_on(connect_trusted(place)?, line, patience)
 }
 
-/// Connects to a socket outside a run folder. Other users may be able to create files at that path, so the socket must
-/// belong to this user or to root.
+/// Connects to a socket at `place`, outside a run folder. Returns an error if it belongs to a user other than this one
+/// or root, because any user may be able to create files there.
 fn connect_trusted(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     if !is_trusted(std::fs::symlink_metadata(place)?.uid()) {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the socket belongs to another user"));
@@ -183,8 +188,8 @@ fn connect_trusted(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     connect_stream(place)
 }
 
-/// Connects without waiting. Returns a timeout error if the queue of the listener is full, because its process does not
-/// answer.
+/// Connects to the socket at `place` without waiting. If the queue of the listener is full because its process does not
+/// answer, returns an error of the kind `TimedOut`.
 fn connect_stream(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;

@@ -46,12 +46,13 @@ impl Endpoint {
         Ok(Self { name, next })
     }
 
-    /// Returns `None`: a pipe is in no folder and cannot be removed, so no second one is needed.
+    /// Returns `None`. On Windows a cell has one endpoint only: a pipe is not a file in the run folder, so it cannot be
+    /// removed with the folder.
     pub(crate) fn open_for_user(_: &Path) -> io::Result<Option<Self>> {
         Ok(None)
     }
 
-    /// Returns `None`: a pipe is not watched, because nobody can remove it.
+    /// Returns `None`: nobody can remove or replace a pipe, so it needs no identity.
     pub(crate) fn mark(&self) -> Option<EndpointIdentity> {
         None
     }
@@ -102,8 +103,8 @@ pub(crate) fn remove_endpoint(_: &Path) {}
 pub(crate) struct Client(NamedPipeServer);
 
 impl Client {
-    /// Returns the person at the other end. It is the user of this program: the operating system lets no other user
-    /// connect.
+    /// Returns the user at the other end of a connection. This is always the user of this program, because the
+    /// operating system lets no other user connect.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let process = regrind_windows::client_process(&self.0);
         let station = process.map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
@@ -115,7 +116,8 @@ impl Client {
     }
 }
 
-/// Returns false without a check: on Windows only a debugger can suspend this process, and its user knows about it.
+/// Returns false: on Windows, clients are not checked for a closed connection. The check is for a process that was
+/// suspended, and on Windows only a debugger can do this.
 pub(crate) fn is_closed(_: &ClientReader) -> bool {
     false
 }

@@ -28,33 +28,37 @@ pub struct Correction {
 }
 
 impl Correction {
-    /// Returns the correction for the first pass of a part, before anything is known: 0 everywhere.
+    /// Returns the correction for the first pass of a part: 0 at every node of `grid`, number of the pass 1, no
+    /// parameter corrections. `level_mm` is the height of the target surface above the nominal surface, in millimetres.
     pub fn zero(grid: Grid, level_mm: f64) -> Self {
         Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
     }
 
-    /// Returns true if the map is 0 everywhere and no parameter is compensated.
+    /// Returns true if `values_mm` is 0 at every node and `set` is `None`.
     pub fn is_zero(&self) -> bool {
         self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
-    /// Returns the joint effect of map and parameters as it appears after registration, at every node, in
-    /// millimetres.
+    /// Returns `values_mm` plus the part of the parameter corrections that a registered measurement shows
+    /// ([`ParameterCorrections::seen_mm`]), at every node, in millimetres.
+    ///
+    /// Registration removes the rest of the parameter corrections, because it looks like a motion of the part.
     pub fn apparent_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.seen_mm)
     }
 
-    /// Returns the displacement of the surface by map and parameters together, at every node, in millimetres.
+    /// Returns the total displacement of the surface along its normal at every node, in millimetres: `values_mm` plus
+    /// the displacement by the parameter corrections ([`ParameterCorrections::displaced_mm`]).
     ///
-    /// This is the displacement that decides how much material is removed.
+    /// This displacement decides how much material is removed.
     pub fn displacement_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.displaced_mm)
     }
 
-    /// Returns the map that the grinder receives, at every node, in millimetres.
+    /// Returns the map that is sent to the grinder, at every node, in millimetres: `values_mm` plus the displacement by
+    /// the corrections of wheel setting and part tilt ([`ParameterCorrections::setting_mm`]).
     ///
-    /// It is the sum of `values_mm` and of the displacement by wheel setting and tilt, which the grinder can apply
-    /// only in its map.
+    /// The grinder has an input for the wheel radius, but none for setting and tilt.
     pub fn map_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.setting_mm)
     }
@@ -66,7 +70,8 @@ impl Correction {
         }
     }
 
-    /// Returns the interpolated `values_mm` at a place in x and y, in millimetres.
+    /// Returns `values_mm`, interpolated bilinearly at a place `[x, y]` of the model frame, in millimetres. Beyond the
+    /// border of the grid, returns the value of the nearest place on the border.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
         self.grid.interpolate(&self.values_mm, place_mm)
     }

@@ -13,18 +13,20 @@ const SAME_PLACE: f64 = 0.02;
 
 /// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
 ///
-/// `wheel_radius_mm` (R) is the radius of the section across which the width is measured, `depth_mm` (a) the depth of
-/// cut. The wheel averages within that width, so no shorter wave can be ground in.
+/// `wheel_radius_mm` (R) is the radius of the wheel in the section plane in which the width is measured. `depth_mm` (a)
+/// is the depth of cut; a value outside 0 to R is clamped. The wheel averages over this width, so it cannot grind a
+/// shorter wave.
 pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
     let depth_mm = depth_mm.clamp(0.0, wheel_radius_mm.max(0.0));
     2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
 }
 
-/// Checks a cut-off against twice the larger of contact width and distance of the points: a shorter wave is either
-/// not resolved by the points or cannot be ground by the wheel.
+/// Checks that a cut-off is at least 0.9 times the minimum cut-off: twice the contact width of the wheel or twice the
+/// distance of the points, whichever is larger. The points do not resolve a shorter wave, or the wheel cannot grind it.
 ///
 /// # Errors
-/// Returns an error with cause and remedy if the cut-off is below this limit.
+/// Returns [`MapError::CutoffBelowContact`] if the contact width is the larger of the two, otherwise
+/// [`MapError::CutoffBelowSpacing`].
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
     let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
     // 10 % is the uncertainty of an estimated spacing.
@@ -38,17 +40,20 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
     })
 }
 
-/// Estimates the distance between neighbouring readings in millimetres, in the direction in which it is larger.
+/// Estimates the distance between neighbouring readings along x and along y, and returns the larger of the two, in
+/// millimetres. Returns 0 if no reading has a neighbour at another place.
 ///
-/// Around a reading the nearest other place is searched in each of four sectors, about +x, -x, +y and -y. The median
-/// over readings is computed for x and y separately: rows that are dense along and sparse across give the distance
-/// across. Repeated readings of a place count as one place. Returns 0 if there are too few readings for an estimate.
+/// Around some of the readings, the nearest other place is searched in each of four sectors: about +x, -x, +y and -y.
+/// The estimate along x is the median of the distances in the sectors about +x and -x, and likewise along y. For scan
+/// lines that are dense along x and far apart along y, the result is the distance between the lines. Repeated readings
+/// of one place count as one place.
 pub fn point_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
 }
 
-/// Returns the distance between neighbouring readings along x and along y, in millimetres.
+/// Returns the distance between neighbouring readings along x and along y, in millimetres, estimated as described at
+/// [`point_spacing_mm`]. An element is 0 if no reading has a neighbour along that axis.
 pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     let step = readings.len().div_ceil(PROBED).max(1);
     let chosen: Vec<&DeviationSample> = readings.iter().step_by(step).collect();
@@ -64,7 +69,8 @@ pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     [median([0, 1]), median([2, 3])]
 }
 
-/// Returns the spacing that the same number of readings would have on a square grid over their bounding box.
+/// Returns the node spacing, in millimetres, of a square grid that has as many nodes as there are readings and covers
+/// their bounding box.
 fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [width, depth] = [0, 1].map(|axis| {
         let along = readings.iter().map(|r| r.place_mm[axis]);
@@ -73,8 +79,9 @@ fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
 }
 
-/// Returns the distance to the nearest reading at another place in each of the four sectors about +x, -x, +y and -y;
-/// infinite for a sector without such a reading. A reading nearer than `same_mm` is a repeat of the same place.
+/// Returns the distances from the place `[x, y]` to the nearest reading in each of four sectors: about +x, -x, +y and
+/// -y. A reading nearer than `same_mm` is a repeat of the same place and does not count. Returns infinity for a sector
+/// without a reading.
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[DeviationSample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {

@@ -61,11 +61,12 @@ pub enum FilterOrder {
 }
 
 impl FilterOrder {
-    /// Returns alpha, the ratio of the width of the weights to the cut-off. With this ratio half of the amplitude of a
-    /// wave at the cut-off passes.
+    /// Returns alpha of the weights exp(-pi (r / (alpha cutoff))^2), where r is the distance of a reading. With this
+    /// alpha, half of the amplitude of a wave at the cut-off passes.
     ///
-    /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u).
-    /// Each is one half at u = ln 2 and at u = 1.678347, respectively, and alpha = sqrt(u / pi).
+    /// With u = pi (alpha cutoff / wavelength)^2, the constant and the plane pass the share exp(-u) of a wave, the
+    /// quadric passes (1 + u) exp(-u). This share is one half at u = ln 2 for constant and plane, and at u = 1.678347
+    /// for the quadric. At the cut-off u = pi alpha^2, so alpha = sqrt(u / pi) with this u.
     pub fn alpha(self) -> f64 {
         match self {
             Self::Constant | Self::Plane => 0.469_718_639_349_825_66,
@@ -73,8 +74,8 @@ impl FilterOrder {
         }
     }
 
-    /// Returns the share, from 0 to 1, of the amplitude of a wave that passes far from edges and holes.
-    /// `wavelength_in_cutoffs` is the wavelength divided by the cut-off.
+    /// Returns the transmission of the filter: the share, from 0 to 1, of the amplitude of a wave that passes.
+    /// `wavelength_in_cutoffs` is the wavelength divided by the cut-off. The value is valid far from edges and holes.
     pub fn transmission(self, wavelength_in_cutoffs: f64) -> f64 {
         let u = PI * (self.alpha() / wavelength_in_cutoffs).powi(2);
         if self == Self::Quadric { (1.0 + u) * (-u).exp() } else { (-u).exp() }
@@ -94,7 +95,7 @@ const TERMS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
 /// Number of moments up to the fourth degree.
 const MOMENTS: usize = 15;
 
-/// Returns the index of the moment of x^a y^b: ordered by degree, then by b.
+/// Returns the index of the moment of x^a y^b in a list of moments. The list is ordered by the degree a + b, then by b.
 const fn moment(a: usize, b: usize) -> usize {
     (a + b) * (a + b + 1) / 2 + b
 }
@@ -127,26 +128,29 @@ pub(super) struct FilterResult {
 }
 
 impl GaussianFilter {
-    /// Returns the product of leverage and density far from edges and holes: the leverage of a reading at its own
-    /// place, times the number of readings per square millimetre.
+    /// Returns the leverage of a reading at its own place far from edges and holes, multiplied by the number of
+    /// readings per square millimetre. The leverage is the change of the filtered value per unit change of this
+    /// reading. The product does not depend on the density of the readings. Units: 1/mm².
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
         if self.order == FilterOrder::Quadric { 2.0 / weight } else { 1.0 / weight }
     }
 
-    /// Returns the standard deviation of the weights, in millimetres.
+    /// Returns the standard deviation of the Gaussian weight function, in millimetres.
     fn sigma_mm(&self) -> f64 {
         self.order.alpha() * self.cutoff_mm / (2.0 * PI).sqrt()
     }
 
-    /// Returns the number of steps into which a grid's spacing must be divided along x and y for this filter.
+    /// Returns into how many steps the spacing of `grid` must be divided along x and along y, so that no step is wider
+    /// than [`MAX_STEP`] standard deviations of the weights.
     pub fn division(&self, grid: &Grid) -> [usize; 2] {
         let widest_mm = MAX_STEP * self.sigma_mm();
         grid.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
     }
 
-    /// Filters values at arbitrary places and returns the result on a grid; `weights` holds a factor from 0 to 1 for
-    /// each value.
+    /// Filters readings at arbitrary places and returns the filtered surface at the nodes of `grid`. `places` and
+    /// `values` have one entry for each reading. `weights` holds a factor from 0 to 1 for each reading; `None` stands
+    /// for 1.
     pub fn filter_scattered(
         &self,
         places: &[[f64; 2]],
@@ -167,7 +171,8 @@ impl GaussianFilter {
         filtered
     }
 
-    /// Filters values at the nodes of a grid; uses only the nodes with a weight above 0.
+    /// Filters values that are known at the nodes of `grid` and returns the filtered surface at the same nodes.
+    /// `values` and `weights` have one entry for each node. A node with weight 0 has no value.
     pub fn filter_nodes(&self, values: &[f64], weights: &[f64], grid: &Grid) -> FilterResult {
         let degree = self.order.degree();
         let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
@@ -188,7 +193,7 @@ impl GaussianFilter {
         filtered
     }
 
-    /// Returns the reach of the weights along x and y, in nodes.
+    /// Returns how many nodes the weights reach to either side of a node, along x and along y.
     fn taps(&self, grid: &Grid) -> [usize; 2] {
         [0, 1].map(|k| {
             let nodes = grid.counts()[k];
@@ -267,8 +272,12 @@ fn fit_node(order: FilterOrder, sums: &[Vec<Vec<f64>>; 3], i: usize) -> NodeFit 
     }
 }
 
-/// Solves the normal equations of a polynomial of P terms about a node. `weight`, `value` and `weight2` are the moments
-/// of the weights, of the weighted values and of the squared weights. Returns `None` if the node is not supported.
+/// Fits a polynomial of P terms to the readings around a node by weighted least squares and returns height, slopes,
+/// leverage and relative variance at the node. `weight`, `value` and `weight2` are the moments of the weights, of the
+/// weighted values and of the squared weights, indexed by [`moment`].
+///
+/// Returns `None` if the readings are one-sided ([`is_one_sided`]), if they do not determine the polynomial, or if the
+/// relative variance exceeds [`MAX_VARIANCE`].
 fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> NodeFit {
     if is_one_sided(weight) {
         return None;
@@ -286,10 +295,11 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     (variance <= MAX_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
 }
 
-/// Returns true if the readings around a node lie on a line, all to one side of the node, or all far from it as around
-/// a hole. A polynomial at the node would then extrapolate, or bridge an area without any reading.
+/// Returns true if the readings around a node do not surround it closely: they lie on a line, all on one side of the
+/// node, or all far from it as around a hole. A polynomial at the node would then extrapolate, or bridge an area
+/// without readings.
 ///
-/// `m` holds the moments of the weights.
+/// `m` holds the moments of the weights, indexed by [`moment`].
 fn is_one_sided(m: &[f64; MOMENTS]) -> bool {
     let (mx, my) = (m[1] / m[0], m[2] / m[0]);
     let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
@@ -336,7 +346,9 @@ impl GridSums {
     }
 }
 
-/// Spreads readings over the nodes around them.
+/// Distributes each reading over the nodes around it with Gaussian shares, and returns the sums at all nodes: of the
+/// weights, of the weighted values and of the squared weights. `border` is the number of nodes that are added on each
+/// side of `grid`, along x and along y.
 fn spread_readings(
     places: &[[f64; 2]],
     values: &[f64],
@@ -409,13 +421,14 @@ fn spread_reading(
     }
 }
 
-/// Returns one sampled kernel for each power k from 0 to `most`. After the spreading, kernel k gives the moment t^k of
-/// the weights exp(-(scale t)^2 / 2).
+/// Returns the convolution kernels for the powers k from 0 to `most`, each sampled at 2 `taps` + 1 nodes. Applied to
+/// the sums of [`spread_readings`], kernel k gives the moment of t^k under the weights exp(-(`scale` t)^2 / 2).
 ///
-/// t is the distance of a reading from the node in standard deviations, `step` the spacing of the nodes and `spread`
-/// the width of the spreading, both in the same unit. With G the required Gaussian, G = S * T for the spreading S and
-/// a narrower Gaussian T. t^k G is a sum of derivatives of G, and each of them is S convolved with the same
-/// derivative of T: a Hermite polynomial times T.
+/// t is the distance of a reading from the node. `step` is the node spacing, `spread` the standard deviation of the
+/// Gaussian by which the readings were spread; t, `step` and `spread` are in standard deviations of the filter. Let G
+/// be the required Gaussian, S the spreading Gaussian and T the narrower Gaussian with G = S * T (convolution). t^k G
+/// is a sum of derivatives of G. Each of them is S convolved with the same derivative of T: a Hermite polynomial times
+/// T.
 fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<Vec<f64>> {
     let tau = (1.0 - (scale * spread).powi(2)).sqrt();
     let (t1, t2) = (1.0 / tau, 1.0 / (tau * tau));
@@ -466,7 +479,9 @@ impl RowSums {
         Self { columns, powers }
     }
 
-    /// Returns the moments up to a degree along one row of nodes, indexed by [`moment`].
+    /// Returns the moments x^a y^b with a + b up to `degree` at the nodes of one row: a list for each moment, in the
+    /// order of [`moment`], with one value for each node. `kernels` holds the kernels along y for the powers 0 to
+    /// `degree`.
     fn along_y(&self, kernels: &[Vec<f64>], degree: usize, row: usize) -> Vec<Vec<f64>> {
         let mut moments = vec![vec![0.0; self.columns]; terms(degree)];
         for (a, sums) in self.powers.iter().enumerate().take(degree + 1) {
@@ -509,7 +524,8 @@ impl ReadingCounts {
         Self { grid: *grid, sums }
     }
 
-    /// Returns the number of readings in the square with the half side `half_side_mm` around a node.
+    /// Returns the number of readings in a square about the node in column `i` and row `j`. `half_side_mm` is half of
+    /// the side of the square.
     fn within(&self, i: usize, j: usize, half_side_mm: f64) -> u32 {
         let range = |at: usize, k: usize, nodes: usize| {
             let reach = (half_side_mm / self.grid.spacing_mm[k]).round().min(1e9) as usize;
@@ -529,8 +545,9 @@ pub(super) struct Trend {
 }
 
 impl Trend {
-    /// Fits a polynomial of this degree, at most 2. If the readings do not determine it, fits the highest degree below
-    /// it that they determine.
+    /// Fits a polynomial in x and y of at most `degree` (0, 1 or 2) to the readings by least squares. If the readings
+    /// do not determine this degree, fits the highest lower degree that they determine. Without readings the polynomial
+    /// is 0.
     pub fn fit(places: &[[f64; 2]], values: &[f64], degree: usize) -> Self {
         let [low, high] = bounds(places.iter().copied());
         let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
@@ -573,7 +590,8 @@ impl Trend {
         self.terms.iter().zip(self.basis(place)).map(|(term, basis)| term * basis).sum()
     }
 
-    /// Adds the polynomial to values and slopes at the nodes of a grid for which `wanted` returns true.
+    /// Adds the height of the polynomial to `values` and its slopes to `slopes` at the nodes of `grid`, but only at
+    /// nodes for whose index `wanted` returns true.
     pub fn put_back(&self, grid: &Grid, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
         let term = |k: usize| self.terms.get(k).copied().unwrap_or(0.0);
         for k in (0..grid.len()).filter(|&k| wanted(k)) {
@@ -592,11 +610,13 @@ impl FilterResult {
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }
 
-    /// Returns value, leverage and variance at a place of the grid; `None` if no node around it is supported.
+    /// Returns value, leverage and variance (fields of [`FilterResult`]), interpolated at a place `[x, y]`; `None` if
+    /// none of the four nodes around the place is supported.
     ///
     /// Interpolates bilinearly between the four nodes around the place. Each node contributes its value plus half of
     /// the rise along its slope from the node to the place. This is exact for quadrics: the second-order error of the
-    /// values cancels that of the slopes. If a node is not supported, the others contribute with their full slopes.
+    /// values cancels that of the slopes. If one of the four nodes is not supported, the others contribute with their
+    /// full slopes.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
         let grid = &self.grid;
         let [(i, u), (j, v)] = grid.cell(place);

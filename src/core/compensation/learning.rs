@@ -155,10 +155,11 @@ pub struct PassObservation<'a> {
 pub type ParameterExplainer<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
-    /// Creates a state without knowledge of any pass.
+    /// Creates a state that has not learned from any pass: response 1, no estimate of the repeatable error.
     ///
-    /// `repeatability_mm` is the rms of the non-repeatable error of a pass, if it is known from elsewhere; its
-    /// variance is divided equally between the bands.
+    /// `map` gives the shortest wavelength (its cut-off), and `size_mm`, the extent of the part along x and y, the
+    /// longest. `repeatability_mm` is the rms of the non-repeatable error of a pass (grinding and measuring), if it is
+    /// stated; its square is divided equally between the bands.
     pub fn new(rule: GainRule, map: &MapOptions, size_mm: [f64; 2], repeatability_mm: Option<f64>) -> Self {
         let mut edges = vec![map.cutoff_mm];
         if rule == GainRule::Wavelength {
@@ -192,9 +193,11 @@ impl LearningState {
         }
     }
 
-    /// Updates the state with the error of a pass; afterwards [`Self::next_correction_mm`] returns the next correction.
+    /// Returns the state after one more measured pass. [`Self::next_correction_mm`] of the new state is the next
+    /// correction.
     ///
-    /// A pass that was not ground as commanded changes no estimate, and its correction is commanded again.
+    /// If the response shows that the pass was not ground as commanded, no estimate changes, and the next correction is
+    /// the correction of this pass again.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
         if seen
@@ -238,13 +241,14 @@ impl LearningState {
         known
     }
 
-    /// Returns the correction of the next pass, in millimetres, at each node of the grid of the last one; `None`
-    /// before a pass of this part was processed.
+    /// Returns the correction of the next pass at each node of the grid of the last correction, in millimetres. Returns
+    /// `None` if no pass of this part has been processed and no state of another machine was taken over.
     pub fn next_correction_mm(&self) -> Option<&[f64]> {
         self.wanted_mm.as_deref()
     }
 
-    /// Returns the initial state for the next part of the same kind.
+    /// Returns the state with which the next part of the same recipe begins. The learned error and the response are
+    /// kept with a larger uncertainty; the correction is dropped.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -256,12 +260,12 @@ impl LearningState {
         known
     }
 
-    /// Returns the forecast of the error after the next pass. `error` is the error after the last pass, `scallops_mm`
-    /// the rms of the scallops between the tracks.
+    /// Returns the forecast of the rms of the error after the next pass. `error` is the map after the last pass.
+    /// `scallops_mm` is the rms of the scallops between the tracks, in millimetres.
     ///
-    /// Structure too fine for the map remains: the noise of the points, and the scallops. A probe that reaches the
-    /// bottom of the grooves has already measured the scallops. So the larger of the measured residuals and the known
-    /// scallops counts, not their sum.
+    /// The forecast includes structure that is too fine for the map: noise of the points, and scallops. A probe that
+    /// reaches the bottom of the grooves has already measured the scallops. So the larger of the measured residuals and
+    /// the known scallops counts, not their sum.
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
@@ -294,24 +298,27 @@ impl LearningState {
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
 
-    /// Returns the share of the newest error that is compensated in each band, with the shortest wavelength of the
-    /// band in millimetres first: `[from_mm, share]`, from the shortest waves to the longest.
+    /// Returns a pair `[from_mm, share]` for each band of wavelengths, from the shortest waves to the longest.
+    /// `from_mm` is the shortest wavelength of the band in millimetres, `share` the share of the newest error that the
+    /// next correction compensates.
     pub fn gains(&self) -> Vec<[f64; 2]> {
         self.bands.iter().map(|band| [band.from_mm, self.compensated_share(band)]).collect()
     }
 
-    /// Returns the share of the newest error that is compensated in a band.
+    /// Returns the share of the newest error that the next correction compensates in this band, from 0 to 1 for an
+    /// adaptive rule. For [`GainRule::Fixed`] it is the fixed gain.
     fn compensated_share(&self, band: &Band) -> f64 {
         if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
 
-    /// Returns the response, the share of a correction that the part answers with, and its standard uncertainty.
+    /// Returns the response and its standard uncertainty. The response is the change of the surface divided by the
+    /// commanded change of the correction; 1 is as commanded.
     pub fn response(&self) -> [f64; 2] {
         self.response
     }
 
-    /// Returns the rms of the non-repeatable error of a pass, in millimetres; `None` while it is neither stated nor
-    /// estimated.
+    /// Returns the rms of the non-repeatable error of a pass, in millimetres. Returns `None` if it was not stated and
+    /// no two passes have given an estimate.
     pub fn repeatability_mm(&self) -> Option<f64> {
         self.whole.noise_mm2().map(f64::sqrt)
     }
@@ -321,7 +328,8 @@ impl LearningState {
         self.passes
     }
 
-    /// Returns true if every number is in its valid range, for a state read from a file.
+    /// Returns true if every number is in its valid range and the sizes of the grids and vectors agree. Call it for a
+    /// state that was read from a file.
     pub fn is_valid(&self) -> bool {
         let number = |v: f64| v.is_finite() && v >= 0.0;
         let [least, most] = RESPONSE_LIMITS;
@@ -344,7 +352,8 @@ impl LearningState {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits values on the grid of an error into one part for each band; the parts add up to the values.
+    /// Splits a map into its bands of wavelengths and returns one map for each band, from the shortest waves to the
+    /// longest. `rest` holds the values at the nodes of `told`. The returned maps add up to `rest`.
     pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -357,13 +366,13 @@ impl LearningState {
         parts
     }
 
-    /// Returns the mean square of the noise of the measured points in each band of a map. `whole_mm2` is the mean
-    /// square of this noise in the whole map.
+    /// Returns how much the noise of the measured points contributes to each band of a map, as a mean square in mm².
+    /// `whole_mm2` is the mean square of this noise in the whole map.
     ///
-    /// Equation: white noise that passes a Gaussian of width s has a power of 1 / s^2. Between two Gaussians of
-    /// widths s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of
-    /// the cut-off, so that the squares of the widths add up. This holds in the open; near the border the longest
-    /// waves contain up to twice as much.
+    /// Equation: white noise that passes a Gaussian of width s has a power of 1 / s^2. Between two Gaussians of widths
+    /// s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of the
+    /// cut-off, so that the squares of the widths add up. This holds far from edges; near the border the longest waves
+    /// contain up to twice as much.
     fn band_noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
         let first2 = self.bands[0].from_mm.powi(2);
         let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
@@ -374,8 +383,8 @@ impl LearningState {
 }
 
 impl MeanError {
-    /// Returns the mean, multiplied by `factor`, on a grid. On its own grid nothing is interpolated. If `mean` is
-    /// `None`, all values are 0.
+    /// Returns the learned mean error, interpolated to the nodes of `grid` and multiplied by `factor`. If `mean`
+    /// already has this grid, nothing is interpolated. If `mean` is `None`, all values are 0.
     fn resampled(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
@@ -384,10 +393,10 @@ impl MeanError {
 }
 
 impl ResampledError {
-    /// Returns an error on another grid, that of the correction.
+    /// Returns an error map, interpolated to the nodes of `grid`, the grid of the correction.
     ///
-    /// All learned values are on the grid of the correction, so that only the error, which becomes small, is ever
-    /// interpolated.
+    /// All learned values are on the grid of the correction. So only the measured error is ever interpolated, and its
+    /// size, and with it the error of the interpolation, falls from pass to pass.
     fn resampled(error: &ErrorMap, grid: Grid) -> Self {
         let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
         let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
@@ -398,7 +407,8 @@ impl ResampledError {
         mean_square(&self.valid, values)
     }
 
-    /// Returns values without the waves that are shorter than `cutoff_mm`.
+    /// Returns `values`, given at the nodes of the grid, after a Gaussian low-pass filter with the cut-off `cutoff_mm`.
+    /// Returns 0 at every node if the map is too small for this cut-off.
     fn low_pass(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
         match filter_grid(&self.grid, values, &self.valid, cutoff_mm, FilterOrder::default(), false) {
             Ok(smooth) => smooth.values,
@@ -414,13 +424,15 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
-    /// Returns true if the noise of this band comes only from a stated total or from other machines, and no own pass
-    /// has estimated it.
+    /// Returns true if the noise variance of this band was only stated for all bands together, or taken over from other
+    /// machines, and no pass of this machine has estimated it yet.
     fn is_guessed(&self) -> bool {
         self.scatter[1] > 0.0 && self.scatter[1] < 1.0
     }
 
-    /// Updates the band with the mean square of the innovation of a pass, from `independent` independent values.
+    /// Updates the Kalman filter of the band after a pass. The innovation is the observed error minus its prediction.
+    /// `news_mm2` is the mean square of the innovation in this band, in mm². `independent` is the number of independent
+    /// values that it was computed from.
     fn update(&mut self, news_mm2: f64, independent: f64) {
         let expected = self.belief.zip(self.noise_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
         let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
@@ -447,9 +459,9 @@ impl Band {
         self.borrowed *= 1.0 - self.gain;
     }
 
-    /// Updates the share of the mean that remains after shrinkage. `mean_mm2` is the mean square of the mean.
-    /// `noise_mm2` is the mean square of the noise of the points; it counts only while the noise N of the band is
-    /// unknown.
+    /// Computes `share`, the share of the mean error that remains after Wiener shrinkage (see the module). `mean_mm2`
+    /// is the mean square of the mean error in this band. `noise_mm2` is the mean square of the noise of the points; it
+    /// is used only if the variance of the non-repeatable error is unknown.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
@@ -458,7 +470,7 @@ impl Band {
         self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
     }
 
-    /// Returns the number of independent values that a map has in this band.
+    /// Returns the number of independent values that the valid area of `told` contains in this band, at least 1.
     pub(super) fn independent(&self, told: &ResampledError) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
@@ -466,15 +478,18 @@ impl Band {
     }
 }
 
-/// Returns the number of independent values on an area for waves longer than `from_mm`.
-/// [`VALUES_PER_INDEPENDENT_VALUE`] squares, each with sides of twice this wavelength, make one independent value.
+/// Returns how many statistically independent values a map of the area `area_mm2` contains for waves longer than
+/// `from_mm`, at least 1. A square with sides of twice this wavelength counts as one value, and
+/// [`VALUES_PER_INDEPENDENT_VALUE`] of these correlated values count as one independent value.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
     (area_mm2 / (2.0 * from_mm).powi(2) / VALUES_PER_INDEPENDENT_VALUE).max(1.0)
 }
 
-/// Returns the response and its standard uncertainty, combined with a newly measured response by inverse variances.
-/// `independent` is the number of independent values of the measurement. A response outside [`RESPONSE_LIMITS`] changes
-/// nothing.
+/// Combines the known response (`before`, with its standard uncertainty `sigma`) with the newly measured response
+/// `answer`, weighted by inverse variances. Returns the new response and its standard uncertainty.
+///
+/// `independent` is the number of independent values of the measurement. If the measured response is outside
+/// [`RESPONSE_LIMITS`], returns the known response unchanged.
 fn combine_responses([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
     let [least, most] = RESPONSE_LIMITS;
     if !(least..=most).contains(&answer.slope) {
@@ -489,7 +504,7 @@ fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
-/// Returns the mean square of the valid values.
+/// Returns the mean of the squared `values` for which `valid` is true; 0 if there are none.
 fn mean_square(valid: &[bool], values: &[f64]) -> f64 {
     let used = || valid.iter().zip(values).filter(|(valid, _)| **valid);
     used().map(|(_, value)| value * value).sum::<f64>() / used().count().max(1) as f64

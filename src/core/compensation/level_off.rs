@@ -9,12 +9,14 @@ pub(super) struct Levelled {
     pub sources: Vec<usize>,
 }
 
-/// Gives every node without a value the value of the nearest node that has one.
+/// Extends a surface from the nodes with a value (`known`) to all nodes of `grid`. Far from the known nodes, a node
+/// gets the value of the nearest known node, its source.
 ///
-/// The surface changes into that constant over `distance_mm` (L) without a kink. At the distance t from the source it
-/// differs from the constant by g t (1 - t / L)^2, where g is the slope at the source in the direction of the node.
-/// So the surface leaves the source with the slope that it has there, never differs from the constant by more than
-/// 4/27 g L, and equals the constant, with slope 0, from L on. With L = 0 the constant begins at once.
+/// `slopes` are the slopes of the surface along x and y at the nodes. The surface changes into the constant value of
+/// the source over `distance_mm` (L) without a kink: at the distance t from the source it differs from the constant by
+/// g t (1 - t / L)^2, where g is the slope at the source in the direction of the node. So it starts with the slope g,
+/// differs from the constant by at most 4/27 |g| L, and equals the constant from t = L on. With L = 0 it is constant
+/// outside the known nodes.
 pub(super) fn level_off(
     grid: &Grid,
     mut values: Vec<f64>,
@@ -34,10 +36,10 @@ pub(super) fn level_off(
     Levelled { values, sources }
 }
 
-/// Returns the nearest known node of every node; a known node is its own. At least one node must be known.
+/// Returns, for every node of `grid`, the index of the nearest node for which `known` is true; for a known node its own
+/// index. At least one node must be known.
 ///
-/// Two sweeps over the grid, down and up, pass the nearest known node on from neighbour to neighbour (Danielsson
-/// 1980).
+/// Two sweeps over the grid pass the nearest known node on from neighbour to neighbour (Danielsson 1980).
 pub(super) fn nearest_known(grid: &Grid, known: &[bool]) -> Vec<usize> {
     const NONE: usize = usize::MAX;
     let (columns, rows) = (grid.columns, grid.rows);

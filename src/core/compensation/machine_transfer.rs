@@ -87,15 +87,17 @@ struct BandEvidence {
 }
 
 impl MachineSimilarity {
-    /// Adds a person's estimate as one comparison. `rms_share` is the rms of a machine's own repeatable error divided
-    /// by the rms of the whole repeatable error; it applies to all wavelengths.
+    /// Adds a person's estimate of the similarity as one comparison, for all wavelengths. `rms_share` (0 to 1) is the
+    /// rms of a machine's own part of the repeatable error, divided by the rms of the whole repeatable error.
     pub fn add_statement(&mut self, rms_share: f64) {
         let share = rms_share * rms_share;
         self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
     }
 
-    /// Adds a comparison of the states of two machines for one recipe, in any order, and returns true if at least one
-    /// band is comparable. `is_own` is true if one of the two is the machine that receives the initial state.
+    /// Compares what two machines learned for the same recipe and adds the comparison. Returns true if the machines can
+    /// be compared in at least one band of wavelengths; otherwise adds nothing and returns false.
+    ///
+    /// `is_own` is true if one of the two is the machine that is to receive an initial state.
     pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
         let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
         if !has_same_bands(one, other) {
@@ -116,12 +118,13 @@ impl MachineSimilarity {
         is_compared
     }
 
-    /// Returns the number of comparisons, including a statement.
+    /// Returns the number of comparisons. Each statement of a person counts as one.
     pub fn comparisons(&self) -> usize {
         self.comparisons.len()
     }
 
-    /// Returns the machine's own share of the power in the band that starts at the wavelength `from_mm`; `None` if no
+    /// Returns which share of the power (mean square) of the repeatable error is a machine's own, not common to all
+    /// machines, in the band that begins at the wavelength `from_mm`. The share is from 0 to 1. Returns `None` if no
     /// comparison covers this band.
     pub fn own_share(&self, from_mm: f64) -> Option<f64> {
         let all = self.expected_share(from_mm, |_| true)?;
@@ -137,8 +140,9 @@ impl MachineSimilarity {
 }
 
 impl Comparison {
-    /// Returns the machine's own share in the band that contains this wavelength. The longest band of a smaller part
-    /// contains all longer waves.
+    /// Returns the share of the power that is a machine's own, in the band that contains the wavelength `from_mm`. A
+    /// longer wavelength than that of the last band belongs to the last band. Returns `None` if the two machines were
+    /// not comparable in this band.
     fn share(&self, from_mm: f64) -> Option<f64> {
         let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
         share.map(|share| share.max(self.whole))
@@ -146,9 +150,11 @@ impl Comparison {
 }
 
 impl LearningState {
-    /// Returns why this state cannot seed, or be compared with, another machine's; `None` if it can.
+    /// Returns the reason why this state cannot be an initial state for another machine, nor be compared with the state
+    /// of another machine. Returns `None` if there is no obstacle.
     ///
-    /// The state can be unfit even if [`LearningState::is_valid`] returns true.
+    /// A state that is valid ([`LearningState::is_valid`]) can still have an obstacle: a learned error without
+    /// uncertainty, an implausibly large learned error, or too many nodes.
     pub fn transfer_obstacle(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
             return Some("a learned mean error has no uncertainty".into());
@@ -160,16 +166,19 @@ impl LearningState {
         }
         let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
         let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
-        let why = || format!("{columns} x {rows} nodes in {bands} bands make {steps:.0e} steps, limit {MAX_STEPS:.0e}");
+        let why = || {
+            format!("{columns} x {rows} nodes in {bands} bands: {steps:.0e} computation steps, limit {MAX_STEPS:.0e}")
+        };
         (steps > MAX_STEPS).then(why)
     }
 
-    /// Returns the initial state of a machine that has not ground the recipe, from the states of other machines that
-    /// have.
+    /// Returns an initial state for a machine that has not ground this recipe, predicted from the machines that have
+    /// (best linear unbiased prediction with random effects).
     ///
-    /// `self` is the state of the machine without this transfer, `others` are the states of the other machines, and
-    /// `grid` is the grid of the correction. Only the bands in which machines are similar are taken over. Returns
-    /// `None` if no other state has a mean in the same bands.
+    /// `self` is the state of the machine without this transfer, `others` are the states of the other machines, `alike`
+    /// is the similarity of the machines, and `grid` is the grid of the correction. A band of wavelengths is taken over
+    /// only if the machines have at least half of its power in common. Returns `None` if no other state has learned an
+    /// error in the same bands.
     #[must_use]
     pub fn seeded_from(&self, others: &[&Self], alike: &MachineSimilarity, grid: Grid) -> Option<TransferredState> {
         let others: Vec<&Self> =
@@ -213,13 +222,14 @@ fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
-/// Returns an error of 0 on all of a grid.
+/// Returns an error that is 0 and valid at every node of `grid`.
 fn zero_error(grid: Grid) -> ResampledError {
     ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
 }
 
-/// Returns the evidence of a machine for each band, on a grid; `None` for a band whose variance is unknown, or whose
-/// mean comes mostly from other machines.
+/// Returns, for each band of wavelengths, the repeatable error that the machine's own passes show, at the nodes of
+/// `grid`. `known` is the state of the machine. An element is `None` if the variance in this band is unknown, or if
+/// most of the learned error comes from other machines.
 fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>> {
     let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
     let on_grid = zero_error(*grid);
@@ -235,8 +245,8 @@ fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>
     known.bands.iter().zip(parts).map(of_band).collect()
 }
 
-/// Returns two mean squares of the repeatable error of two machines in a band, in mm²: of the part that is a machine's
-/// own, and of the whole. Returns `None` if the whole does not exceed the noise.
+/// Returns two mean squares of the repeatable error in one band, averaged over two machines, in mm²: first of the part
+/// that differs between the machines, then of the whole. Returns `None` if the whole does not exceed its noise.
 fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
     let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
     let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
@@ -245,8 +255,11 @@ fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
     (power_mm2 > 0.0).then_some([own_mm2, power_mm2])
 }
 
-/// Returns the predicted repeatable error in a band on a machine that has not ground the recipe, and its variance;
-/// `None` if there is no common part.
+/// Predicts the repeatable error in one band on a machine that has not ground the recipe. Returns the error at each of
+/// the `nodes` nodes in mm, and its variance in mm².
+///
+/// `machines` holds the evidence of the other machines, `own_share` the share of the power that is a machine's own.
+/// Returns `None` if the machines have no part of the error in common.
 fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option<(Vec<f64>, f64)> {
     let power = machines.iter().map(|of| of.mean_mm2 - of.variance_mm2).sum::<f64>() / machines.len().max(1) as f64;
     let (own, common) = (own_share * power, (1.0 - own_share) * power);
@@ -262,8 +275,9 @@ fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option
     Some((values_mm, own + common / rest))
 }
 
-/// Returns the estimate for all wavelengths together. If `own` has no estimate of the non-repeatable error, the mean of
-/// the other machines is used.
+/// Returns the estimate for all wavelengths together, for a machine that starts from others. `own` is the estimate of
+/// the machine itself, `variance_mm2` the variance of the predicted error. If `own` has no estimate of the
+/// non-repeatable error, the mean estimate of `others` is used.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
@@ -278,9 +292,9 @@ fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     Band { belief, borrowed: 1.0, ..with }
 }
 
-/// Returns the expected response of a machine and its standard uncertainty. It is the mean response of the other
-/// machines combined with the earlier estimate, weighted by inverse variances. The variance between machines is
-/// included.
+/// Returns the expected response of a machine and its standard uncertainty: the mean response of `others`, combined
+/// with the earlier estimate (`before`, with the standard uncertainty `sigma`) by inverse variances. The variance of
+/// the mean includes the variance between machines.
 fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
     let n = others.len() as f64;
     let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;

@@ -56,8 +56,9 @@ pub struct MapOptions {
 }
 
 impl MapOptions {
-    /// Returns the options of a Gaussian filter of first order that rejects outliers beyond five standard deviations
-    /// and levels off at once.
+    /// Returns options for the Gaussian filter of order 1 ([`FilterOrder::Plane`]) with the cut-off `cutoff_mm` and the
+    /// node spacing `spacing_mm`. Outliers are rejected beyond 5 standard deviations. Outside the measured area the map
+    /// is constant.
     pub fn new(cutoff_mm: f64, spacing_mm: f64) -> Self {
         Self {
             cutoff_mm,
@@ -99,18 +100,21 @@ pub struct ErrorMap {
     pub advice: Vec<String>,
 }
 
-/// Rejects outliers among the deviations, filters the rest and returns the map on a grid.
+/// Computes the map of the error from deviations: rejects outliers, filters the remaining readings, and returns the
+/// result at the nodes of a grid over the readings.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least
-/// squares of a polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`FilterOrder::alpha`]; or the
-/// smoothing spline.
+/// squares of a polynomial at every node with the weights exp(-pi (r / (alpha cutoff))^2), where r is the distance of a
+/// reading, see [`FilterOrder::alpha`]; or the smoothing spline.
 ///
-/// A feature is far from the surface in two neighbouring readings. The Gaussian filter keeps at least half of its
-/// height, unless less than an eighth of it passes in one application. A cut-off that is too short for the wheel or
-/// for the distance of the points is no error; [`ErrorMap::advice`] reports it.
+/// Two neighbouring readings that are far from the surface on the same side are a feature of the part, not outliers.
+/// The Gaussian filter keeps at least half of the height of a feature, unless less than an eighth of it passes the
+/// filter. A cut-off that is too short for the wheel or for the distance of the points is no error;
+/// [`ErrorMap::advice`] reports it.
 ///
 /// # Errors
-/// Deviations that are not finite, too few of them for the cut-off, options out of range, and an invalid grid.
+/// Returns an error if a deviation is not finite, if there are too few readings for the cut-off, if an option is out of
+/// range, or if no grid fits the readings.
 pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
     let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm)?;
@@ -128,7 +132,7 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
         let all = wide.robust(&kept);
         let far = all.find_far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
             advice.push(
-                "over 10 % of the points would be outliers, so none is rejected; clean the part and probe".to_owned(),
+                "more than 10 % of the points look like outliers, so none is rejected; clean part and probe".to_owned(),
             );
             FarReadings::default()
         });
@@ -161,10 +165,11 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
-/// Filters the residuals of features again and adds the result, until at least half of each feature is in the
-/// surface.
-/// `features` holds the index of a reading of each feature and its height above the surface around it. A chip that
-/// covers only two touches is narrower than the filter.
+/// Restores the features of the part that the filter made too low: filters what is missing of them and adds the result
+/// to `filtered`, at most 8 times, until most of the height of each feature is in the surface.
+///
+/// `features` holds, for each feature, the index of a reading and its height above the surface around it. A small
+/// feature, such as a chip under only two touches, is narrower than the filter.
 fn preserve_features(
     filtered: &mut FilterResult,
     gaussian: &GaussianFilter,
@@ -197,14 +202,14 @@ fn preserve_features(
     }
 }
 
-/// Filters a form that a model predicts at many places, and returns its map.
+/// Computes the map of a form that a model predicts at many places.
 ///
-/// `told` holds each predicted deviation with its standard uncertainty in millimetres. The uncertainties pass the
-/// filter as the form does. A predicted form has no noise of its own, so no reading is rejected as an outlier.
-/// `scatter_mm` is the standard deviation of the noise of a point, as the model gives it.
+/// `told` holds each predicted deviation with its standard uncertainty, in millimetres. The uncertainties are filtered
+/// in the same way as the deviations. No prediction is rejected as an outlier, since predictions have no noise.
+/// `scatter_mm` is the standard deviation of the noise of a measured point, as the model estimates it.
 ///
 /// # Errors
-/// Those of [`error_map`].
+/// Returns the same errors as [`error_map`].
 pub fn map_from_model(
     told: &[(DeviationSample, f64)],
     options: &MapOptions,
@@ -235,7 +240,8 @@ impl ReferenceFilter {
         filter_robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
-    /// Returns the standard deviation of one reading; `filtered` is the result of the map's own filter.
+    /// Returns the standard deviation of a single reading, from the residuals of the reference filter. `filtered` is
+    /// the result of the filter of the map; it is used if the two filters are the same.
     fn point_sigma(&self, kept: &InlierReadings, filtered: &FilterResult) -> f64 {
         if self.is_map_filter {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
@@ -245,7 +251,8 @@ impl ReferenceFilter {
     }
 }
 
-/// Returns the typical number of readings per square millimetre, from their leverages.
+/// Returns the typical number of readings per square millimetre, computed from the median leverage at the supported
+/// nodes of `filtered`. `gaussian` is the filter that gave this result.
 fn density(filtered: &FilterResult, gaussian: &GaussianFilter) -> f64 {
     let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
@@ -277,8 +284,11 @@ fn check(readings: &[DeviationSample], options: &MapOptions) -> Result<(), MapEr
     }
 }
 
-/// Returns the grid that the filter works on: the nodes of the map, and as many nodes between them as the weights
-/// need.
+/// Returns the grid on which the filter computes: the nodes of `grid`, and as many nodes between them as the filter
+/// needs ([`GaussianFilter::division`]).
+///
+/// # Errors
+/// Returns [`MapError::CutoffTooShort`] if this grid would have more than [`MAX_FILTER_NODES`] nodes.
 fn refined_grid(grid: &Grid, gaussian: &GaussianFilter) -> Result<Grid, MapError> {
     let division = gaussian.division(grid);
     let finer = |k: usize| (grid.counts()[k] - 1) as f64 * division[k] as f64 + 1.0;
@@ -301,7 +311,8 @@ struct UnlevelledMap {
 }
 
 impl UnlevelledMap {
-    /// Selects the nodes of the map from those that the filter worked on.
+    /// Selects the nodes of `grid`, the grid of the map, from the finer grid of `filtered`. `point_sigma` is the
+    /// standard deviation of a single reading.
     fn from_filtered(filtered: &FilterResult, grid: &Grid, point_sigma: f64) -> Self {
         let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
         let (across, along) = (step(filtered.grid.columns, grid.columns), step(filtered.grid.rows, grid.rows));
@@ -316,7 +327,11 @@ impl UnlevelledMap {
         }
     }
 
-    /// Replaces the surface of the filter by that of the spline; `valid` stays unchanged.
+    /// Replaces values, slopes and uncertainties of the Gaussian filter by those of the smoothing spline. `valid` stays
+    /// as it is. `density` is the number of readings per square millimetre.
+    ///
+    /// # Errors
+    /// Returns the error of the spline fit.
     fn with_spline(
         self,
         grid: &Grid,
@@ -353,7 +368,7 @@ impl UnlevelledMap {
 }
 
 impl ErrorMap {
-    /// Returns a map with exactly known values: no noise, no outliers.
+    /// Returns an error map with exactly known values: all uncertainties are 0, there are no outliers and no advice.
     pub fn exact(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
             grid,
@@ -368,7 +383,8 @@ impl ErrorMap {
         }
     }
 
-    /// Returns the filtered error at a place, in millimetres.
+    /// Returns `values_mm`, interpolated bilinearly at a place `[x, y]` of the model frame, in millimetres. Beyond the
+    /// border of the grid, returns the value of the nearest place on the border.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
         self.grid.interpolate(&self.values_mm, place_mm)
     }
@@ -406,14 +422,15 @@ pub struct FilteredGrid {
     pub rounds: usize,
 }
 
-/// Filters a map on a grid, such as that of an interferometer: ISO 16610-61, or its robust form ISO 16610-71.
+/// Filters a map that is given on a grid, such as that of an interferometer: by ISO 16610-61, or with `robust_form` by
+/// the robust form ISO 16610-71.
 ///
-/// Shapes: a value and its validity for every node, row by row, x fastest. Values that are not valid are not read.
-/// Units: any for the values; the cut-off in millimetres.
+/// Shapes: `values` and `valid` have an entry for every node, row by row, x fastest. A value that is not valid is not
+/// used. Units: any for the values; the cut-off in millimetres.
 ///
 /// # Errors
-/// A number of values other than that of the nodes, valid values that are not finite, a cut-off that is not above 0,
-/// and no node with enough valid values around it.
+/// Returns an error if the number of values is not that of the nodes, if a valid value is not finite, if the cut-off is
+/// not above 0, or if no node has enough valid values around it.
 pub fn filter_grid(
     grid: &Grid,
     values: &[f64],

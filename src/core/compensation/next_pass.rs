@@ -70,10 +70,11 @@ pub enum NextPassError {
 }
 
 impl Correction {
-    /// Returns the correction that compensates the learned error, for the same pass and level, without any check of
-    /// limits.
+    /// Returns this correction with its values replaced by those that compensate the learned error. Number of the pass
+    /// and level stay the same, and no limit is checked.
     ///
-    /// The map leaves out the part that the parameters in `set` compensate.
+    /// `known` gives the learned correction. `set` holds the parameter corrections of the next pass; the map does not
+    /// repeat the part of the error that they compensate.
     pub fn compensating(&self, known: &LearningState, set: Option<&ParameterCorrections>) -> Self {
         let seen_mm = self.apparent_mm();
         let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
@@ -83,11 +84,12 @@ impl Correction {
         Self { values_mm, set: set.cloned(), ..self.clone() }
     }
 
-    /// Returns the total removal at the place of the most removal, below the surface of a first pass without a
-    /// correction, in millimetres.
+    /// Returns the largest total removal at any node, in millimetres, measured from the surface that a first pass
+    /// without a correction leaves.
     ///
     /// # Errors
-    /// A correction above its limit, and a removal above the budget.
+    /// Returns [`NextPassError::TooLarge`] if the correction exceeds its limit at a node, and
+    /// [`NextPassError::BudgetSpent`] if the removal exceeds the budget in `limits`.
     pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, NextPassError> {
         let within = |v: f64| v.abs() <= limits.max_correction_mm;
         if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
@@ -104,8 +106,10 @@ impl Correction {
         Ok(removed_mm)
     }
 
-    /// Returns the next pass: it compensates the learned part of the error of the last pass, and is deep enough to
-    /// cut everywhere. The parameters in `set` compensate a part of the error, and the map the rest.
+    /// Returns the next pass: its correction compensates the learned error, and it is deep enough to cut everywhere.
+    ///
+    /// `self` is the correction of the last pass, `error` the map measured after it, and `known` the learned state. The
+    /// parameter corrections in `set` compensate a part of the error, the map compensates the rest.
     ///
     /// A pass can only remove material: the new surface must lie below the present one everywhere. A rise of the
     /// correction by d raises the surface by s d, where s is the response of the part, and every pass adds its own
@@ -115,7 +119,8 @@ impl Correction {
     /// Frames: x and y of the model frame. Units: millimetres.
     ///
     /// # Errors
-    /// A correction above its limit, a pass deeper than the machine may cut, and a removal above the budget.
+    /// Returns an error if the correction exceeds its limit, if the pass is deeper than the machine may cut, or if the
+    /// removal exceeds the budget.
     pub fn next_pass(
         &self,
         error: &ErrorMap,
@@ -146,7 +151,8 @@ impl Correction {
     }
 }
 
-/// Returns the share of a normal distribution that lies more than z standard deviations below its mean; within 1e-7.
+/// Returns the probability that a standard normal variable exceeds `z`, with an error below 1e-7; 0 if `z` is NaN or
+/// above 8.
 fn normal_tail(z: f64) -> f64 {
     if z.is_nan() || z > 8.0 {
         return 0.0;

@@ -60,12 +60,13 @@ const WELL_EXPLAINED: f64 = 0.05;
 /// Slope above which a response is nearer to twice the command than to a single command on a stiff machine.
 const TWICE: f64 = 1.6;
 
-/// Compares the change of the error with the change of the correction, and returns the response.
+/// Compares the change of the error from one pass to the next with the commanded change of the correction, and returns
+/// the response of the part: its slope and its classification.
 ///
-/// Shapes: `errors` and `corrections` of the pass before and of the last pass; `places` are points of the nominal
-/// surface with their unit normals, in any order, where both maps were measured. `scatter_mm` is the standard
-/// deviation by which the error changes without any command: the repeatability of grinding and measuring together.
-/// Frames: the model frame.
+/// Shapes: `errors` and `corrections` belong to the pass before and to the last pass, in this order. `places` are
+/// points of the nominal surface with their unit normals, in any order, where both maps were measured. `scatter_mm` is
+/// the repeatability of grinding and measuring together: the standard deviation by which the error changes without a
+/// command. Frames: the model frame.
 pub fn estimate_response(
     errors: [&ErrorMap; 2],
     corrections: [&Correction; 2],
@@ -176,7 +177,8 @@ impl MotionProjector {
         Self { inverse: inverse.sum(), rows }
     }
 
-    /// Returns the values at the places minus the part of them that a motion explains.
+    /// Returns `values`, given at the places of this projector, minus the part of them that a rigid motion of the part
+    /// explains.
     fn without(&self, mut values: Vec<f64>) -> Vec<f64> {
         let seen: Vector6<f64> = self.rows.iter().zip(&values).map(|(row, v)| row * *v).sum();
         let motion = self.inverse * seen;

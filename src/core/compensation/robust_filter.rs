@@ -70,7 +70,8 @@ pub(super) struct Residuals {
     pub freedom: Vec<f64>,
 }
 
-/// Returns the residuals of readings from the surface that was filtered from them.
+/// Returns the residual of each reading from the surface `filtered`, and its freedom. The surface must be the result of
+/// filtering these readings with these `weights`; `None` stands for 1.
 pub(super) fn residuals(
     filtered: &FilterResult,
     places: &[[f64; 2]],
@@ -95,8 +96,8 @@ impl Residuals {
         self.values.iter().zip(&self.freedom).map(each).collect()
     }
 
-    /// Returns the standard deviation of one reading: the square root of the sum of the squared residuals divided by
-    /// the sum of their freedoms.
+    /// Estimates the standard deviation of one reading: the square root of the sum of the squared residuals, divided by
+    /// the sum of their freedoms. Returns 0 if no residual has enough freedom.
     pub fn sigma(&self) -> f64 {
         let known = (0..self.values.len()).filter(|&k| self.freedom[k] > MIN_FREEDOM && self.values[k].is_finite());
         let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.values[k].powi(2), f + self.freedom[k]));
@@ -104,7 +105,8 @@ impl Residuals {
     }
 }
 
-/// Applies the robust filter.
+/// Filters readings with the robust Gaussian filter of ISO 16610-71, which gives readings far from the surface less
+/// weight. `gaussian` is the filter without weights, `grid` the grid of the result.
 pub(super) fn filter_robust(
     gaussian: &GaussianFilter,
     places: &[[f64; 2]],
@@ -116,8 +118,11 @@ pub(super) fn filter_robust(
     iterate(gaussian.filter_scattered(places, values, None, grid), values.len(), again, compare)
 }
 
-/// Alternates filtering and weighting, starting from `first`, the result of the plain filter. `again` filters with
-/// given weights, `compare` returns the residuals from a filtered surface, and `count` is the number of readings.
+/// Repeats two steps until the weights converge (iteratively reweighted least squares): weights the readings by their
+/// residuals, and filters them again.
+///
+/// `first` is the result without weights, `count` the number of readings. `again` filters the readings with given
+/// weights. `compare` returns the residuals from a filtered surface and the weights that gave it.
 pub(super) fn iterate(
     first: FilterResult,
     count: usize,
@@ -158,10 +163,12 @@ pub(super) struct FarReadings {
 }
 
 impl RobustResult {
-    /// Returns the readings far from the surface: with a scaled residual above `limit` standard deviations.
+    /// Finds the readings that are far from the surface, with a scaled residual above `limit` standard deviations, and
+    /// divides them into outliers and features. A feature is confirmed by a neighbouring reading.
     ///
-    /// `apart` is the distance of neighbouring readings along x and y. Returns `None` if more than a tenth of the
-    /// readings would be outliers: so many are no exception, and the surface itself is doubtful.
+    /// `places` and `values` are those of the readings, `apart` is the distance of neighbouring readings along x and y.
+    /// With fewer than 20 readings none is far. Returns `None` if more than a tenth of the readings would be outliers:
+    /// then the surface itself is doubtful.
     pub fn find_far(
         &self,
         (places, values): (&[[f64; 2]], &[f64]),
@@ -196,8 +203,9 @@ impl RobustResult {
         (outliers.len() * 10 <= places.len()).then_some(FarReadings { outliers, features })
     }
 
-    /// Returns true if one of the eight neighbours of the reading `off[n]` deviates to the same side, by at least
-    /// [`MIN_HEIGHT_SHARE`] of its height. `off` holds the candidate readings, sorted along x.
+    /// Returns true if a neighbour confirms the reading `off[n]`: one of its eight neighbours deviates to the same
+    /// side, by at least a quarter of its residual. `off` holds the indices of the readings that deviate much, sorted
+    /// along x. `apart` is the distance of neighbouring readings along x and y.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
@@ -213,7 +221,8 @@ impl RobustResult {
     }
 }
 
-/// Returns true if a place at this distance along x and y is one of the eight neighbours, and not the same place.
+/// Returns true if a reading at the distance `away` along x and y is one of the eight neighbours of another reading,
+/// and not a repeat of the same place. `apart` is the distance of neighbouring readings along x and y.
 fn is_neighbour(away: [f64; 2], apart: [f64; 2]) -> bool {
     is_within(away, apart, NEIGHBOUR) && !is_within(away, apart, SAME_PLACE)
 }
@@ -232,8 +241,8 @@ struct ReadingIndex<'r> {
 
 impl ReadingIndex<'_> {
     /// Returns true if a neighbour confirms the reading `k`. Heights are measured from the plane through the readings
-    /// around both. The neighbour must be at least as high as `least` and as a quarter of the height of the reading.
-    /// `side` is 1 for a reading above the surface, -1 below.
+    /// farther around. The height of the neighbour must be at least `least`, and at least a quarter of the height of
+    /// the reading. `side` is 1 for a reading above the surface, and -1 for one below.
     fn is_confirmed(&self, k: usize, side: f64, least: f64) -> bool {
         let own = on_plane(&self.places[k]);
         let near = self.tree.nearest(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
@@ -260,7 +269,7 @@ fn on_plane(&[x, y]: &[f64; 2]) -> Point {
     Point::new(x, y, 0.0)
 }
 
-/// Returns the median of the absolute values, without `NaN`; 0 if there is none.
+/// Returns the median of the absolute values, ignoring NaN; 0 if there are no values.
 fn median_size(values: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = values.iter().filter(|v| !v.is_nan()).map(|v| v.abs()).collect();
     if sizes.is_empty() {

@@ -81,9 +81,15 @@ pub(super) struct SplineResult {
     pub cutoff_mm: f64,
 }
 
-/// Fits a smoothing surface to readings over a grid.
+/// Fits a smoothing surface (cubic B-splines with a penalty on bending) to the readings `kept` and returns it at the
+/// nodes of `grid`.
 ///
-/// `density` is the number of readings per square millimetre.
+/// `density` is the number of readings per square millimetre. `cutoff_mm` is the wavelength at which half of the
+/// amplitude passes; `roughness` selects if this cut-off or cross-validation sets the smoothness.
+///
+/// # Errors
+/// Returns [`SplineError::TooFine`] if the cut-off needs too many coefficients, and [`SplineError::NotDetermined`] if
+/// the readings do not determine a surface.
 pub(super) fn fit_spline(
     kept: &InlierReadings,
     grid: &Grid,
@@ -130,7 +136,8 @@ struct SplineAxis {
     cells: usize,
 }
 
-/// Returns the four cubic B-splines of one cell, or a derivative of them by u, at u from 0 to 1.
+/// Returns the values of the four uniform cubic B-splines that are not 0 in a cell, at the position `u` (0 to 1) in the
+/// cell. `derivative` is 0 for the values, 1 or 2 for the first or second derivative by `u`.
 fn basis(derivative: usize, u: f64) -> [f64; 4] {
     let v = 1.0 - u;
     match derivative {
@@ -154,15 +161,16 @@ impl SplineAxis {
         self.cells as f64 * self.step
     }
 
-    /// Returns the index of the first of the four splines at a place, and its position u within the cell.
+    /// Finds the cell that contains the coordinate `at`. Returns the index of the first of the four splines that are
+    /// not 0 there, and the position in the cell, from 0 to 1. A coordinate beyond the axis counts as its end.
     fn cell(&self, at: f64) -> (usize, f64) {
         let u = ((at - self.first) / self.step).clamp(0.0, self.cells as f64);
         let cell = (u as usize).min(self.cells - 1);
         (cell, u - cell as f64)
     }
 
-    /// Returns the integrals of products of derivatives of neighbouring splines: for each spline with itself and the
-    /// next three.
+    /// Returns, for each spline, the integrals of its product with itself and with the next three splines along the
+    /// axis. `derivative` is 0, 1 or 2: the derivative of the splines that is multiplied.
     fn products(&self, derivative: usize) -> Vec<[f64; 4]> {
         // Gauss-Legendre with four points is exact up to the seventh degree; here the degree is at most six.
         const GAUSS: [(f64, f64); 4] = [
@@ -190,7 +198,8 @@ impl SplineAxis {
 /// Number of entries of a coefficient: with itself and 24 later neighbours.
 const LATER: usize = 25;
 
-/// Returns the index, among a coefficient's entries, of the neighbour di columns and dj rows later.
+/// Returns the index of a neighbour among the entries of a coefficient. The neighbour is `di` columns and `dj` rows
+/// after the coefficient; [`offset`] is the inverse.
 fn later(di: isize, dj: isize) -> usize {
     if dj == 0 { di as usize } else { (4 + (dj - 1) * 7 + di + 3) as usize }
 }
@@ -243,7 +252,9 @@ impl<'a> NormalEquations<'a> {
         }
     }
 
-    /// Returns A for the weight mu of the bending, in the order of the pattern.
+    /// Returns the entries of the system matrix A = B^T B + `mu` P, in the order of the sparsity pattern. B is the
+    /// matrix of the splines at the readings, P the bending, `mu` its weight. A tiny ridge on the diagonal keeps A
+    /// positive definite.
     fn matrix(&self, mu: f64) -> Vec<f64> {
         let at = |&(c, s): &(u32, u8)| c as usize * LATER + s as usize;
         let largest =
@@ -252,7 +263,8 @@ impl<'a> NormalEquations<'a> {
         self.entries.iter().map(|e| self.normal[at(e)] + mu * self.bending[at(e)] + ridge(e)).collect()
     }
 
-    /// Returns the entries of an inverse in the layout of `normal`: [`LATER`] entries to a coefficient.
+    /// Copies the entries of an inverse into the layout of `normal`: [`LATER`] entries for each coefficient; 0 where a
+    /// neighbour does not exist.
     fn spread(&self, inverse: &SelectedInverse) -> Vec<f64> {
         let nx = self.axes[0].count();
         let mut spread = vec![0.0; self.right.len() * LATER];
@@ -272,7 +284,8 @@ impl<'a> NormalEquations<'a> {
         self.pattern.factor(&self.matrix(mu))?.solve(&self.right)
     }
 
-    /// Returns the sum of the products of the entries of two symmetric matrices.
+    /// Returns the trace of the product of two symmetric matrices, which is the sum of the products of their entries.
+    /// Both have [`LATER`] entries for each coefficient.
     fn trace(&self, a: &[f64], b: &[f64]) -> f64 {
         let twice = |k: usize| if k.is_multiple_of(LATER) { 1.0 } else { 2.0 };
         a.iter().zip(b).enumerate().map(|(k, (a, b))| twice(k) * a * b).sum()
@@ -312,10 +325,12 @@ impl<'a> NormalEquations<'a> {
         })
     }
 
-    /// Returns the weight of the bending in a range that minimises n |d - B c|^2 / (n - tr H)^2.
+    /// Chooses the weight of the bending between `least` and `most` by generalised cross-validation: returns the weight
+    /// mu that minimises n |d - B c|^2 / (n - tr H)^2, with the symbols of the module. Returns `None` if a matrix
+    /// cannot be factored.
     ///
-    /// Nine weights, evenly spaced in their logarithm, are tried; golden section then searches between the neighbours
-    /// of the best.
+    /// Nine weights, evenly spaced in their logarithm, are tried; golden-section search then continues between the
+    /// neighbours of the best.
     fn cross_validated(&self, least: f64, most: f64) -> Option<f64> {
         const TRIED: usize = 9;
         let count = self.values.len() as f64;
@@ -339,12 +354,15 @@ impl<'a> NormalEquations<'a> {
     }
 }
 
-/// Returns the offset in columns and rows from a coefficient to its later neighbour with index `s`.
+/// Returns how many columns and rows a neighbour is after its coefficient. `s` is the index of the neighbour among the
+/// entries of the coefficient; [`later`] is the inverse.
 fn offset(s: usize) -> [isize; 2] {
     if s < 4 { [s as isize, 0] } else { [((s - 4) % 7) as isize - 3, ((s - 4) / 7) as isize + 1] }
 }
 
-/// Returns the existing entries, the start of each column, and the rows.
+/// Returns the sparsity pattern of the system for `nx` x `ny` coefficients: the entries (a coefficient, and the index
+/// of a later neighbour that exists), the index of the first entry of each matrix column, and the matrix row of each
+/// entry.
 fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) {
     let (mut entries, mut begins, mut rows) = (Vec::new(), vec![0], Vec::new());
     for c in 0..nx * ny {
@@ -361,7 +379,8 @@ fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) 
     (entries, begins, rows)
 }
 
-/// Returns the bending of every pair of neighbouring splines.
+/// Returns the bending energy (the matrix P) for every pair of neighbouring splines, [`LATER`] entries for each
+/// coefficient.
 fn bending(axes: &[SplineAxis; 2]) -> Vec<f64> {
     let [x, y] = axes.map(|axis| [0, 1, 2].map(|derivative| axis.products(derivative)));
     let (nx, ny) = (axes[0].count(), axes[1].count());
@@ -412,7 +431,8 @@ impl LocalSplines {
         })
     }
 
-    /// Returns b^T S b for the splines b and a symmetric matrix S with [`LATER`] entries to a coefficient.
+    /// Returns b^T S b, where b holds the splines at this place and S is the symmetric `matrix` with [`LATER`] entries
+    /// for each coefficient.
     fn quadratic_form(&self, matrix: &[f64]) -> f64 {
         let mut sum = 0.0;
         for a in 0..16 {

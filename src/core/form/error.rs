@@ -13,20 +13,20 @@ pub enum FormError {
         "there are {points} points; at least {min_points} are required; measure more points or request fewer terms"
     )]
     TooFewPoints { points: usize, min_points: usize },
-    #[error("point {} has a position or a deviation that is not a finite number; remove it", index + 1)]
+    #[error("point {} has a position or a deviation that is not a finite number; remove this point", index + 1)]
     NotFinite { index: usize },
-    #[error("the points lie at one place or on a line; the figure requires an area; measure across the part")]
+    #[error("the points lie at one place or on a line; a form figure requires an area; measure points across the part")]
     NoArea,
     #[error(
         "the positions of the {points} points do not separate the term {term} from the terms before it; measure more \
          densely or request fewer terms"
     )]
     Undetermined { term: String, points: usize },
-    #[error("{terms} terms are requested, and {basis} has 1 to {max_terms}; request fewer")]
+    #[error("{terms} terms of {basis} polynomials are requested; request from 1 to {max_terms} terms")]
     Terms { terms: usize, basis: &'static str, max_terms: usize },
     #[error(
         "point {} lies {distance_mm} mm from the centre of the Zernike disc; the limit is 1.5 times the radius of the \
-         disc, {radius_mm} mm; correct the aperture or remove the point", index + 1
+         disc, which is {radius_mm} mm; correct the aperture or remove the point", index + 1
     )]
     FarOut { index: usize, distance_mm: f64, radius_mm: f64 },
     #[error("the wavelength is {wavelength_nm} nm; it must be a finite number above 0")]
@@ -40,7 +40,8 @@ pub enum FormError {
     NoSlope { integration_mm: f64 },
 }
 
-/// Returns an error if there are fewer than `least` samples, or if a number of a sample is not finite.
+/// Returns [`FormError::TooFewPoints`] if there are fewer than `least` samples, or [`FormError::NotFinite`] with the
+/// index of the first sample whose position or deviation is not a finite number; otherwise `Ok`.
 pub(super) fn check(samples: &[DeviationSample], least: usize) -> Result<(), FormError> {
     if samples.len() < least {
         return Err(FormError::TooFewPoints { points: samples.len(), min_points: least });

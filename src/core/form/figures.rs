@@ -100,14 +100,16 @@ pub struct DeviationFigures {
     pub legendre: Option<PolynomialFit>,
 }
 
-/// Computes the form figures of deviations.
+/// Computes the form figures of a surface from its deviations: PV, PVr, RMS, coverage, ISO 10110-5 and polynomial fits.
 ///
-/// Shapes: samples in any order, without the rejected points. Frame: x and y of the model frame. Units: millimetres.
-/// The polynomials of PVr suit the aperture: Zernike or Legendre ([`PolynomialBasis::for_aperture`]).
+/// The samples are the measured points in any order, without the rejected points. Their x and y are in the model frame,
+/// in millimetres. The forms in [`FormOptions::removed`] are removed from the deviations first. PVr uses the
+/// polynomials that [`PolynomialBasis::for_aperture`] selects.
 ///
 /// # Errors
-/// Fewer than four points, points on a line, numbers that are not finite, a point far outside of the aperture, and a
-/// wavelength that is not a finite number above 0.
+/// Returns an error if there are fewer than four points, if they lie on a line or do not determine a removed form, if a
+/// number is not finite, if a point lies more than 1.5 radii from the centre of a round or elliptical aperture, or if
+/// the wavelength is not a finite number above 0.
 pub fn compute_figures(samples: &[DeviationSample], options: &FormOptions) -> Result<DeviationFigures, FormError> {
     check(samples, 4)?;
     let aperture = match &options.aperture {
@@ -152,6 +154,7 @@ fn rectangle_from_bounds([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormErr
     if has_area { Ok(Aperture::from_corners([low, high])) } else { Err(FormError::NoArea) }
 }
 
+/// Computes PVr: the PV of `fit` at the samples plus three times the RMS of its residuals.
 fn robust_pv(fit: &PolynomialFit, samples: &[DeviationSample]) -> Result<RobustPv, FormError> {
     let values = fit.values_mm(samples)?;
     let fit_pv_mm = pv(values.into_iter());
@@ -176,9 +179,12 @@ pub fn pv_998(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
-/// Divides the bounds of the aperture into square cells, and computes the share of the cells within the aperture that
-/// contain a point. A cell has the area that contains four points on average, but its side is at least 1/64 of the
-/// longer side of the bounds.
+/// Computes which share of the aperture is measured. The bounds of the aperture are divided into square cells. Only
+/// cells with their centre in the aperture count; the share is the number of those that contain a point, divided by the
+/// number of all of them.
+///
+/// A cell has the area that contains four points on average. Its side is at least 1/64 of the longer side of the
+/// bounds.
 fn coverage(aperture: &Aperture, samples: &[DeviationSample]) -> Coverage {
     let [low, high] = aperture.bounds();
     let size: [f64; 2] = std::array::from_fn(|k| high[k] - low[k]);

@@ -40,13 +40,14 @@ pub struct PolynomialFit {
     pub points: usize,
 }
 
-/// Fits the first `terms` polynomials of a basis to samples by least squares.
+/// Fits the first `terms` polynomials of `basis` to the deviations of the samples by least squares.
 ///
 /// Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if the number of terms is out of range, if there are fewer points than terms, if the points do not
-/// determine a term, or if a point is not finite or lies more than 1.5 radii from the centre of a Zernike disc.
+/// Returns an error if `terms` is 0 or above the number of terms of the basis (37 for Fringe Zernike, otherwise 105),
+/// if there are fewer points than terms, if the points do not determine a term, or if a point is not finite or lies
+/// more than 1.5 radii from the centre of a Zernike disc.
 pub fn fit_polynomials(
     basis: &PolynomialBasis,
     terms: usize,
@@ -68,12 +69,14 @@ pub fn fit_polynomials(
     })
 }
 
-/// Fits as many polynomials as the points determine, at most `most`: complete orders only, with at least four points
-/// per term.
+/// Fits as many of the first `most` polynomials of `basis` as the points determine, by least squares.
+///
+/// Only complete orders are fitted, with at least four points per term: with a Legendre basis, for example, all terms
+/// of a total degree or none.
 ///
 /// # Errors
-/// Returns an error if the points do not determine even one term, or if a point is not finite or lies more than 1.5
-/// radii from the centre of a Zernike disc.
+/// Returns an error if there are fewer than four points, if they do not determine even the first term, if `most` is 0,
+/// or if a point is not finite or lies more than 1.5 radii from the centre of a Zernike disc.
 pub fn fit_determined_terms(
     basis: &PolynomialBasis,
     most: usize,
@@ -90,7 +93,8 @@ pub fn fit_determined_terms(
 }
 
 impl PolynomialFit {
-    /// Returns the value of the fit at every sample, in millimetres and in the order of the samples.
+    /// Evaluates the fitted polynomials at the position of every sample. Returns the values in millimetres, in the
+    /// order of the samples. The deviations of the samples are not used.
     ///
     /// # Errors
     /// Returns an error if a sample lies more than 1.5 radii from the centre of a Zernike disc.
@@ -117,8 +121,14 @@ pub(super) struct LeastSquaresSolution {
     pub(super) undetermined: Option<usize>,
 }
 
-/// Fits a weighted sum of `terms` functions to the deviations by least squares. `row` is called with the index of a
-/// sample and the sample, and writes the values of all functions at that sample.
+/// Fits a weighted sum of `terms` functions to the deviations of the samples by least squares (QR decomposition).
+///
+/// For each sample, `row(index, sample, values)` is called; it writes the value of every function at that sample into
+/// `values`. If the samples do not determine a function, the result names the first such function in
+/// [`LeastSquaresSolution::undetermined`], and its coefficients are 0.
+///
+/// # Errors
+/// Returns the error of the first sample for which `row` fails.
 pub(super) fn solve_least_squares(
     terms: usize,
     samples: &[DeviationSample],
@@ -157,6 +167,8 @@ pub(super) fn solve_least_squares(
     Ok(back_substituted(&r, terms, samples.len()))
 }
 
+/// Solves the least-squares problem from `r`, the triangular factor of the matrix of all terms with the deviations as
+/// the last column. `points` is the number of points.
 fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> LeastSquaresSolution {
     let scale = (points as f64).sqrt();
     let undetermined = (0..terms).find(|&k| {

@@ -44,13 +44,14 @@ pub struct Iso10110 {
     pub notation: String,
 }
 
-/// Computes the ISO 10110-5 figures of deviations.
+/// Computes the ISO 10110-5 figures of the deviations of a surface: power, irregularity and others.
 ///
-/// Frame: model; symmetry is about the centre of the aperture's bounds. Units: samples in millimetres.
+/// The samples are in the model frame, in millimetres. The symmetric part is symmetric about the centre of the bounds
+/// of `aperture`. `wavelength_nm` only appears in the notation.
 ///
 /// # Errors
-/// Fewer than four points, points on a line, numbers that are not finite, and a wavelength that is not a finite number
-/// above 0.
+/// Returns an error if there are fewer than four points, if they lie on a line, if a number is not finite, or if the
+/// wavelength is not a finite number above 0.
 pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm: f64) -> Result<Iso10110, FormError> {
     check(samples, 4)?;
     if !(wavelength_nm > 0.0 && wavelength_nm.is_finite()) {
@@ -92,10 +93,12 @@ pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm
     Ok(found)
 }
 
-/// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 to the samples and returns the values of the fit at the
-/// samples. `square` returns (r/R)^2 of a sample: r is its distance from the centre, R the largest distance of all
-/// samples. These polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer polynomials if the
-/// samples do not determine all of them.
+/// Fits a rotationally symmetric form to the deviations by least squares. Returns the value of this form at each
+/// sample.
+///
+/// `square` returns (r/R)^2 of a sample, where r is the distance of the sample from the centre and R the largest
+/// distance of all samples. The form is a sum of the polynomials of [`even_terms`]. Fewer of them are used if the
+/// samples do not determine all seven.
 fn fit_symmetric_part(
     samples: &[DeviationSample],
     square: impl Fn(&DeviationSample) -> f64 + Sync,
@@ -116,7 +119,10 @@ fn fit_symmetric_part(
     }
 }
 
-/// Returns the Legendre polynomials P_0 to P_6 at 2 `square` - 1: the terms of the symmetric part. `square` is (r/R)^2.
+/// Returns the Legendre polynomials P_0 to P_6 at the argument 2 `square` - 1.
+///
+/// `square` is (r/R)^2, with the distance r of a point from the centre and the largest distance R. Up to a factor, the
+/// polynomials are the Zernike terms without azimuth.
 pub(super) fn even_terms(square: f64) -> [f64; MAX_SYMMETRIC_DEGREE + 1] {
     let t = 2.0 * square - 1.0;
     let mut row = [1.0; MAX_SYMMETRIC_DEGREE + 1];
@@ -139,14 +145,18 @@ fn notation(found: &Iso10110) -> String {
     iso_10110_notation([power_nm, irregularity_nm, symmetric_nm], rms_nm, found.wavelength_nm)
 }
 
-/// Returns the ISO 10110-5 notation of the values A, B, C, RMSt, RMSi and RMSa, each rounded up. All values and the
-/// wavelength are in nanometres.
+/// Formats six figures and the wavelength as an ISO 10110-5 indication: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F; lambda=G`.
+///
+/// All arguments are in nanometres: first the PV of power, irregularity and symmetric part (A, B, C), then the RMS of
+/// total, irregularity and varying part (D, E, F), as in [`Iso10110`]. Each figure is rounded up, the wavelength is
+/// not.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
     let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(format_rounded_up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")
 }
 
-/// Formats a value in nanometres, rounded up: to whole nanometres from 10 nm on, to hundredths below.
+/// Formats `value_nm` rounded up: to a whole nanometre if it is at least 10 nm, otherwise to 0.01 nm. A negative value
+/// gives `0`.
 fn format_rounded_up(value_nm: f64) -> String {
     // The rounding error of a zero must not become a hundredth, and a zero has no sign.
     let steps = if value_nm >= 10.0 { 1.0 } else { 100.0 };

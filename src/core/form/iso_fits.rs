@@ -46,10 +46,13 @@ pub struct IsoFormValues {
 }
 
 impl IsoFits {
-    /// Builds the fits over places. Symmetry is about `middle_mm`, or about the centre of the places' bounds. Returns
-    /// `None` if the places are too few or do not determine a fit.
+    /// Prepares the least-squares fits of ISO 10110-5 for many forms at the same `places`.
     ///
-    /// Frame: model. Units: millimetres.
+    /// `middle_mm` is the centre of symmetry; with `None` it is the centre of the bounds of the places. Frame: model.
+    /// Units: millimetres.
+    ///
+    /// Returns `None` if there are fewer than 12 places, or if the places do not determine piston, tilt and power, for
+    /// example on a line.
     pub fn new(places: &[[f64; 2]], middle_mm: Option<[f64; 2]>) -> Option<Self> {
         if places.len() < MIN_PLACES {
             return None;
@@ -72,7 +75,8 @@ impl IsoFits {
         Some(Self { quadric_terms: base, power: 1.0 / scales[3], power_pv: most - least, symmetric_terms: even })
     }
 
-    /// Computes the figures of a form. `form` has one value in millimetres per place, in the order of the places.
+    /// Computes the ISO 10110-5 figures of one form. `form` has one value in millimetres for each place of
+    /// [`IsoFits::new`], in the same order.
     pub fn evaluate(&self, form: &[f64]) -> IsoFormValues {
         let n = form.len() as f64;
         let dot = |row: &[f64], with: &[f64]| row.iter().zip(with).map(|(a, b)| a * b).sum::<f64>();
@@ -105,9 +109,12 @@ impl IsoFits {
     }
 }
 
-/// Returns the orthonormalised columns of `rows` (the matrix Q of its QR decomposition) and the diagonal of R. Each
-/// diagonal element is the signed norm of the part of a column that is independent of the columns before it. Returns
-/// `None` if a column depends on those before it.
+/// Orthonormalises the columns of `rows` one after another (QR decomposition). Returns the columns of the matrix Q and
+/// the diagonal elements of the triangular matrix R.
+///
+/// A diagonal element is, apart from its sign, the length of that part of a column that is independent of the columns
+/// before it. Returns `None` if for a column this length is at most [`MIN_INDEPENDENT_SHARE`] of the length of the
+/// whole column.
 fn orthogonalize(rows: &DMatrix<f64>) -> Option<(Vec<Vec<f64>>, Vec<f64>)> {
     let (q, r) = rows.clone().qr().unpack();
     let columns = q.column_iter().map(|column| column.iter().copied().collect()).collect();

@@ -40,7 +40,7 @@ pub struct RemovedParts {
 }
 
 impl RemovedParts {
-    /// Returns the removed motion and the names of the removed forms, separated by commas.
+    /// Returns [`RemovedParts::motion`] and the names of `forms` as one text, separated by commas.
     pub fn describe(&self, forms: &[RemovedForm]) -> String {
         let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.name()));
         words.collect::<Vec<_>>().join(", ")
@@ -50,9 +50,10 @@ impl RemovedParts {
 /// Cut-off label of figures that are computed from the points, without a filter.
 pub const NO_CUT_OFF: &str = "none: every point used";
 
-/// Returns the figures of points with their labels, in the order of a report.
+/// Converts figures of points to labelled figures for a report, from PV to coverage; the ISO 10110-5 figures are not
+/// included.
 ///
-/// Units: micrometres; coverage in percent.
+/// `taken_out` states the motion that the registration removed. Units: micrometres; coverage in percent.
 pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
     let DeviationFigures { pvr, highest, lowest, coverage, .. } = figures;
     let removed = taken_out.describe(&figures.removed);
@@ -64,7 +65,7 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
         1e3 * pvr.fit_pv_mm,
         1e3 * pvr.residual_rms_mm
     );
-    let cells = format!("cells of {:.3} mm within the aperture that hold a point", coverage.cell_mm);
+    let cells = format!("share of the cells of {:.3} mm within the aperture that contain a point", coverage.cell_mm);
     vec![
         um("PV of the points", figures.pv_mm, "of all points: largest minus smallest"),
         um("PVr", pvr.value_mm, &of_fit),
@@ -84,9 +85,9 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
     ]
 }
 
-/// Returns the slopes of a map with their labels.
+/// Converts the slopes of a map to labelled figures for a report: the RMS and the largest slope, in microradians.
 ///
-/// Units: microradians.
+/// `taken_out` states the motion that the registration removed and what the filter of the map removed.
 pub fn label_slope(slope: &Slope, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
     let [x, y] = slope.integration_mm;
     let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);

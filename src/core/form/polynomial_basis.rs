@@ -59,13 +59,14 @@ impl PolynomialBasis {
         Self::Zernike { numbering: ZernikeNumbering::Fringe, centre_mm, radius_mm }
     }
 
-    /// Returns the Legendre polynomials on a rectangle, given by its two corners in mm.
+    /// Returns the Legendre polynomials on a rectangle. `bounds_mm` has the lower and the upper corner of the
+    /// rectangle, each as x and y in mm.
     pub fn legendre(bounds_mm: [[f64; 2]; 2]) -> Self {
         let (centre_mm, half_mm) = centre_and_half(bounds_mm);
         Self::Legendre { centre_mm, half_mm }
     }
 
-    /// Returns the name of the polynomials.
+    /// Returns the name of the polynomials for a report, such as `Zernike (Fringe)` or `Legendre`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Zernike { numbering: ZernikeNumbering::Noll, .. } => "Zernike (Noll)",
@@ -91,7 +92,7 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the maximum number of terms.
+    /// Returns the number of terms that the basis has: 37 for Fringe Zernike, otherwise 105.
     pub(super) fn max_terms(&self) -> usize {
         match self {
             Self::Zernike { numbering: ZernikeNumbering::Fringe, .. } => 37,
@@ -100,7 +101,11 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the largest number of terms, at most `most`, with which every order is complete; 0 if `most` is 0.
+    /// Returns the largest number of terms, at most `most` and at most [`Self::max_terms`], that ends with a complete
+    /// order; 0 if `most` is 0.
+    ///
+    /// The complete orders end at the terms 1, 4, 9, 16 and so on for Fringe Zernike, and at the terms 1, 3, 6, 10 and
+    /// so on (all terms up to a degree) for the other polynomials.
     pub(super) fn complete_terms(&self, most: usize) -> usize {
         let counts =
             |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
@@ -108,10 +113,11 @@ impl PolynomialBasis {
         counts(fringe).take_while(|count| *count <= most.min(self.max_terms())).last().unwrap_or(0)
     }
 
-    /// Prepares the first `terms` polynomials for evaluation.
+    /// Prepares the first `terms` polynomials for evaluation at many samples.
     ///
     /// # Errors
-    /// Returns an error if the number of terms is out of range, or if the disc or rectangle has no area.
+    /// Returns [`FormError::Terms`] if `terms` is 0 or above [`Self::max_terms`], and [`FormError::NoArea`] if the disc
+    /// or the rectangle of the basis has no area.
     pub(super) fn prepare_terms(&self, terms: usize) -> Result<Terms, FormError> {
         if !(1..=self.max_terms()).contains(&terms) {
             return Err(FormError::Terms { terms, basis: self.name(), max_terms: self.max_terms() });
@@ -146,7 +152,11 @@ impl Terms {
         }
     }
 
-    /// Writes the value of every term at a sample to `row`. `index` identifies the sample in errors.
+    /// Writes the value of every term at the position of `sample` to `row`.
+    ///
+    /// # Errors
+    /// Returns [`FormError::FarOut`] with `index`, the index of the sample, if the sample lies more than 1.5 radii from
+    /// the centre of a Zernike disc.
     pub(super) fn values(&self, index: usize, sample: &DeviationSample, row: &mut [f64]) -> Result<(), FormError> {
         let [x, y] = sample.place_mm;
         match self {
@@ -187,7 +197,8 @@ pub(super) struct AzimuthalOrder {
 }
 
 impl AzimuthalOrder {
-    /// Groups terms, given by degree and azimuthal order, by the absolute azimuthal order.
+    /// Groups Zernike terms by the absolute value of their azimuthal order. `terms` has the degree and the azimuthal
+    /// order of each term. The group of the azimuthal order m has the index m in the result.
     fn grouped(terms: impl Iterator<Item = (u32, i32)>) -> Vec<Self> {
         let mut orders: Vec<Self> = Vec::new();
         for (place, (n, m)) in terms.enumerate() {
@@ -204,9 +215,11 @@ impl AzimuthalOrder {
     }
 }
 
-/// Writes the values of all Zernike terms at the point (u, v), in radii of the disc, to `row`. `q` is rho^2 = u^2 +
-/// v^2. The real and the imaginary part of (u + i v)^m are rho^m cos(m theta) and rho^m sin(m theta). The radial factor
-/// is the Jacobi polynomial P_k^(0, m)(2 rho^2 - 1).
+/// Writes the values of all Zernike terms in `orders` at one point to `row`.
+///
+/// The coordinates `[u, v]` of the point are in radii of the disc, from its centre, and `q` is u^2 + v^2. A term is a
+/// radial factor, the Jacobi polynomial P_k^(0, m)(2 q - 1), times the real part (cosine) or the imaginary part (sine)
+/// of (u + i v)^m.
 fn zernike(orders: &[AzimuthalOrder], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
     let mut power = [1.0, 0.0];
     let mut radial = [0.0; MAX_RADIAL_TERMS];
@@ -222,7 +235,8 @@ fn zernike(orders: &[AzimuthalOrder], [u, v]: [f64; 2], q: f64, row: &mut [f64])
 /// Number of Legendre polynomials in one variable: degrees 0 to 13.
 const DEGREES: usize = 14;
 
-/// Returns the Legendre polynomials of degree 0 to 13 at `t`, times sqrt(2 n + 1), by Bonnet's recurrence.
+/// Returns the Legendre polynomials P_0 to P_13 at `t`, computed by Bonnet's recurrence. Each P_n is multiplied by
+/// sqrt(2 n + 1), so that its mean square from -1 to 1 is 1.
 fn legendre(t: f64) -> [f64; DEGREES] {
     let mut plain = [1.0; DEGREES];
     plain[1] = t;

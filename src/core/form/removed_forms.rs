@@ -27,7 +27,7 @@ pub enum RemovedForm {
 }
 
 impl RemovedForm {
-    /// Returns the name of the form.
+    /// Returns the name of the form for a label, such as `astigmatism`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Piston => "piston",
@@ -40,10 +40,12 @@ impl RemovedForm {
     }
 }
 
-/// Fits simple forms by least squares, all at once, and returns the samples without them.
+/// Fits the forms in `removed` to the deviations by least squares, all at once. Returns the samples with the fit
+/// subtracted from the deviations, or unchanged if `removed` is empty.
 ///
 /// # Errors
-/// Too few points, points at one place, and forms that the points do not determine.
+/// Returns an error if there are fewer points than terms of the forms, if a number is not finite, if all points lie at
+/// one place, or if the points do not determine a form.
 pub(super) fn remove_forms(
     removed: &[RemovedForm],
     samples: &[DeviationSample],
@@ -91,7 +93,7 @@ pub(super) fn remove_forms(
     Ok(samples.iter().map(left).collect())
 }
 
-/// Returns the number of terms of a form.
+/// Returns the number of terms of a form: 2 for tilt, astigmatism and coma, otherwise 1.
 fn term_count(form: RemovedForm) -> usize {
     if matches!(form, RemovedForm::Tilt | RemovedForm::Astigmatism | RemovedForm::Coma) { 2 } else { 1 }
 }

@@ -20,14 +20,15 @@ pub struct Slope {
     pub nodes: usize,
 }
 
-/// Computes the slopes of values on a grid. A slope is the difference of two values an integration length apart,
-/// divided by that length.
+/// Computes the slopes of a map: the root mean square and the maximum over all nodes that have a slope.
 ///
-/// Shapes: a value and a valid flag for every node. Units: millimetres. The integration length is rounded to an even
-/// number of grid steps, at least two. A node has a slope if its four neighbours at half the length are all valid.
+/// `values_mm` and `valid` have one entry for each node of `grid`. The slope at a node, along x and along y, is the
+/// difference of the values half of `integration_mm` before and after the node, divided by `integration_mm`. For this,
+/// `integration_mm` is rounded to an even number of grid steps, at least two. A node has a slope if these four
+/// neighbours are all valid.
 ///
 /// # Errors
-/// Returns an error if the length is not a finite number above 0, or if no node has a slope.
+/// Returns an error if `integration_mm` is not a finite number above 0, or if no node has a slope.
 pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
     if !(integration_mm > 0.0 && integration_mm.is_finite()) {
         return Err(FormError::Integration { integration_mm });

@@ -40,11 +40,14 @@ pub struct SlopeOperator {
 }
 
 impl SlopeOperator {
-    /// Builds the weights for an integration length. `None` selects the shortest length that the places allow. If the
-    /// places are too far apart for the given length, it is increased. Returns `None` if the places are too few or
-    /// allow no length.
+    /// Prepares the computation of slopes for many forms at the same scattered `places`.
     ///
-    /// Frame: model. Units: millimetres.
+    /// `integration_mm` is the length over which a slope is taken. With `None`, it is the shortest length that the
+    /// spacing of the places allows. If the places are too far apart for the given length, a longer one is used
+    /// ([`SlopeOperator::integration_mm`]). Frame: model. Units: millimetres.
+    ///
+    /// Returns `None` if there are fewer than 20 places, or if too few of them have a slope at every length that fits
+    /// the part.
     pub fn new(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
         if places.len() < MIN_PLACES {
             return None;
@@ -72,6 +75,8 @@ impl SlopeOperator {
         None
     }
 
+    /// Builds the weights for slopes from planes over the places within `radius_mm`, at no more than [`MAX_NODES`]
+    /// nodes. `order` has the indices of all places, sorted by x.
     fn with_radius(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
         let most = places.len().min(MAX_NODES);
         let (mut begins, mut weights) = (vec![0], Vec::new());
@@ -84,8 +89,9 @@ impl SlopeOperator {
         Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, node_starts: begins, weights }
     }
 
-    /// Returns the root mean square and the maximum of the slopes of a form, in radians. `form` has one value in
-    /// millimetres per place, in the order of the places.
+    /// Computes the slope of a form at each node. Returns the root mean square and the maximum of these slopes (the
+    /// lengths of the gradients), in radians. `form` has one value in millimetres for each place of
+    /// [`SlopeOperator::new`], in the same order.
     pub fn evaluate(&self, form: &[f64]) -> [f64; 2] {
         let (mut squares, mut most) = (0.0, 0.0_f64);
         for ends in self.node_starts.windows(2) {
@@ -102,9 +108,12 @@ impl SlopeOperator {
     }
 }
 
-/// Returns the places within the radius around the place `of`, each as its index and the weights of its value for the
-/// slopes along x and y of a least-squares plane. `order` has the indices of all places, sorted by x. Returns `None` if
-/// there are fewer than four such places, or if they do not surround the place.
+/// Computes the weights that give the slope at the place with the index `of`: the slope of the least-squares plane
+/// through the values at the places within `radius_mm` of it.
+///
+/// Returns, for each of at most 24 places used, the index of the place and the weights of its value for the slopes
+/// along x and y. `order` has the indices of all places, sorted by x. Returns `None` if fewer than four places are
+/// within the radius, or if they do not surround the place.
 fn plane_slope_weights(
     places: &[[f64; 2]],
     order: &[usize],

@@ -98,7 +98,7 @@ pub enum ApertureError {
 }
 
 impl ApertureError {
-    /// Returns the key the error is about, as written in TOML.
+    /// Returns the TOML key that has the wrong value, such as `radius_mm`.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Coordinate { key, .. } | Self::Size { key, .. } => key,
@@ -118,8 +118,9 @@ impl Aperture {
     /// Checks that the numbers describe a closed outline with an area above 0.
     ///
     /// # Errors
-    /// Returns an error if a coordinate or size is not finite or is too large, if a size is not positive, if a hole is
-    /// as large as the rim, or if a polygon is not a simple closed line of at least three corners.
+    /// Returns an error if a coordinate is not finite or beyond a kilometre in magnitude, if a size is not above 0 or
+    /// above a kilometre, if the hole of an annulus is as large as its rim, or if a polygon is not a simple closed line
+    /// of 3 to 4000 corners.
     pub fn validate(&self) -> Result<(), ApertureError> {
         match self {
             Self::Rectangle { centre_mm, width_mm, height_mm } => {
@@ -147,9 +148,8 @@ impl Aperture {
         }
     }
 
-    /// Returns true if a place lies in the aperture or on its boundary.
-    ///
-    /// Units: millimetres. Returns false for NaN.
+    /// Returns true if the place (`x`, `y`), in mm, lies in the aperture or on its boundary; false if a coordinate is
+    /// NaN.
     pub fn contains(&self, x: f64, y: f64) -> bool {
         match self {
             Self::Rectangle { centre_mm: [cx, cy], width_mm, height_mm } => {
@@ -167,9 +167,8 @@ impl Aperture {
         }
     }
 
-    /// Returns the distance of a place outside the aperture to the nearest point of the aperture; 0 inside.
-    ///
-    /// Units: millimetres.
+    /// Returns the distance, in mm, of the place (`x`, `y`) to the nearest point of the aperture; 0 if it lies in the
+    /// aperture.
     pub fn distance_mm(&self, x: f64, y: f64) -> f64 {
         match self {
             Self::Rectangle { centre_mm: [cx, cy], width_mm, height_mm } => {
@@ -258,11 +257,11 @@ impl Aperture {
         }
     }
 
-    /// Returns a fixed set of places: those of 800 places spread over the bounds that lie in the aperture, then at
-    /// least 240 places along the outline.
+    /// Returns places in mm that represent the aperture, always the same ones: up to 800 places inside, then at least
+    /// 240 along the outline.
     ///
-    /// Units: millimetres. The places inside follow the additive recurrence of the plastic number, a sequence that
-    /// leaves no gaps and forms no lattice.
+    /// The places inside are those of 800 places spread over the bounds that lie in the aperture. They follow the
+    /// additive recurrence of the plastic number, a sequence that leaves no gaps and forms no lattice.
     pub(crate) fn places_mm(&self) -> Vec<[f64; 2]> {
         let [least, most] = self.bounds();
         let plastic = 1.324_717_957_244_746_f64;
@@ -277,7 +276,8 @@ impl Aperture {
     }
 }
 
-/// Checks that the coordinates of a point are numbers of at most [`MAX_COORDINATE_MM`] in magnitude.
+/// Returns [`ApertureError::Coordinate`] with `key`, the key in TOML, if a coordinate of `point` is NaN or beyond
+/// [`MAX_COORDINATE_MM`] in magnitude.
 fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
     match point.iter().find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_MM) {
         Some(&value_mm) => Err(ApertureError::Coordinate { key, value_mm }),
@@ -285,12 +285,18 @@ fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), Aperture
     }
 }
 
-/// Checks that a size is above 0 and at most [`MAX_COORDINATE_MM`].
+/// Returns [`ApertureError::Size`] with `key`, the key in TOML, if `value_mm` is not above 0 or is above
+/// [`MAX_COORDINATE_MM`].
 fn check_size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
     if value_mm > 0.0 && value_mm <= MAX_COORDINATE_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
 }
 
-/// Checks that the corners, in order, form a simple polygon.
+/// Checks that `corners`, joined in order and back to the first, form a simple polygon: no edges cross, touch or fold
+/// back.
+///
+/// # Errors
+/// Returns an error for fewer than 3 or more than [`MAX_CORNERS`] corners, for an invalid coordinate, for two equal
+/// neighbouring corners, and for edges that cross, touch or fold back.
 fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
     let count = corners.len();
     if !(3..=MAX_CORNERS).contains(&count) {
@@ -338,24 +344,25 @@ fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     places.collect()
 }
 
-/// Returns true if the ray from a place towards +x crosses an edge. An edge includes its lower end only, so that no
-/// corner counts twice.
+/// Returns true if the ray from the place (`x`, `y`) towards +x crosses the edge from `p` to `q`. Of the two ends of an
+/// edge, only the lower one belongs to it, so that a corner is not counted twice.
 fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
     (p[1] > y) != (q[1] > y) && x < p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
 }
 
-/// Returns twice the signed area of a triangle, positive if p, q and r are in anticlockwise order.
+/// Returns twice the signed area of the triangle `p`, `q`, `r`: positive if the three points are in anticlockwise
+/// order, 0 if they lie on a line.
 fn orient2d(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
     (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
 }
 
-/// Returns true if an edge runs back over the edge before it.
+/// Returns true if the second edge starts at the end `q` of the first and runs back over it.
 fn folds_back([p, q]: [[f64; 2]; 2], [_, r]: [[f64; 2]; 2]) -> bool {
     let forward = (q[0] - p[0]) * (r[0] - q[0]) + (q[1] - p[1]) * (r[1] - q[1]);
     orient2d(p, q, r) == 0.0 && forward < 0.0
 }
 
-/// Returns true if two segments cross or touch.
+/// Returns true if the segment from `a` to `b` and the segment from `c` to `d` cross or touch.
 fn segments_meet([a, b]: [[f64; 2]; 2], [c, d]: [[f64; 2]; 2]) -> bool {
     let (c_side, d_side, a_side, b_side) = (orient2d(a, b, c), orient2d(a, b, d), orient2d(c, d, a), orient2d(c, d, b));
     if c_side * d_side < 0.0 && a_side * b_side < 0.0 {
@@ -367,7 +374,7 @@ fn segments_meet([a, b]: [[f64; 2]; 2], [c, d]: [[f64; 2]; 2]) -> bool {
     within(a, b, c) || within(a, b, d) || within(c, d, a) || within(c, d, b)
 }
 
-/// Returns the distance from a place to a segment.
+/// Returns the distance of the place (`x`, `y`) to the nearest point of the segment from `p` to `q`.
 fn segment_distance([p, q]: [[f64; 2]; 2], x: f64, y: f64) -> f64 {
     let (ex, ey) = (q[0] - p[0], q[1] - p[1]);
     let t = (((x - p[0]) * ex + (y - p[1]) * ey) / (ex * ex + ey * ey)).clamp(0.0, 1.0);

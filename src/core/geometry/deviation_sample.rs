@@ -10,7 +10,7 @@ pub struct DeviationSample {
 }
 
 impl DeviationSample {
-    /// Returns true if all numbers are finite.
+    /// Returns true if x, y and the deviation are finite numbers.
     pub fn is_finite(&self) -> bool {
         (self.place_mm[0] + self.place_mm[1] + self.deviation_mm).is_finite()
     }

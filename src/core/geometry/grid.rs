@@ -25,7 +25,7 @@ pub struct Grid {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum GridError {
-    #[error("the spacing of the map is {spacing_mm} mm; it must be above 0")]
+    #[error("the spacing of the map is {spacing_mm} mm; it must be a finite number above 0")]
     Spacing { spacing_mm: f64 },
     #[error(
         "a map with nodes every {spacing_mm} mm over {width_mm:.1} x {depth_mm:.1} mm has {nodes:.0} nodes, more than \
@@ -37,11 +37,12 @@ pub enum GridError {
 }
 
 impl Grid {
-    /// Builds a grid over the bounds of some places. Its spacing is at most `spacing_mm`, and its border lies on the
-    /// bounds.
+    /// Builds a grid over the smallest rectangle that contains `places_mm`, with nodes on its border. The spacing along
+    /// x and along y is at most `spacing_mm`: it is reduced to divide the side of the rectangle.
     ///
     /// # Errors
-    /// Returns an error if the spacing is not above 0, if it makes too many nodes, or if there is no place.
+    /// Returns an error if `spacing_mm` is not a finite number above 0, if the grid would have more than four million
+    /// nodes, or if there is no place.
     pub fn over(places_mm: impl Iterator<Item = [f64; 2]>, spacing_mm: f64) -> Result<Self, GridError> {
         let mut bounds: Option<[[f64; 2]; 2]> = None;
         for [x, y] in places_mm {
@@ -85,14 +86,14 @@ impl Grid {
         self.len() == 0
     }
 
-    /// Returns x and y of a node, in millimetres.
+    /// Returns x and y of the node with the index `node`, in millimetres. Nodes are counted row by row, x fastest.
     pub fn place_mm(&self, node: usize) -> [f64; 2] {
         let (i, j) = (node % self.columns.max(1), node / self.columns.max(1));
         [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
     }
 
-    /// Returns true if the grid has nodes, not more than the maximum, at finite places; checks a grid that was read
-    /// from a file.
+    /// Returns true if the grid has at least one and at most four million nodes, a finite first node and a finite
+    /// spacing above 0. Use it for a grid that was read from a file.
     pub fn is_valid(&self) -> bool {
         let nodes = self.columns as f64 * self.rows as f64;
         self.columns > 0
@@ -102,7 +103,8 @@ impl Grid {
             && self.spacing_mm.iter().all(|v| *v > 0.0 && v.is_finite())
     }
 
-    /// Returns the node nearest to a place; `None` if the place is more than half a cell beyond the border.
+    /// Returns the index of the node nearest to `place_mm`; `None` if the place lies outside the grid by more than half
+    /// a spacing.
     pub fn nearest(&self, place_mm: [f64; 2]) -> Option<usize> {
         let along = |k: usize, nodes: usize| {
             let node = ((place_mm[k] - self.first_mm[k]) / self.spacing_mm[k]).round();
@@ -111,8 +113,8 @@ impl Grid {
         Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
     }
 
-    /// Interpolates values on this grid to the nodes of the grid `onto`. Returns the values unchanged if the grids are
-    /// equal.
+    /// Interpolates `values`, one for each node of this grid, to the nodes of the grid `onto`. Returns one value for
+    /// each node of `onto`; these are `values` themselves if the grids are equal.
     pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
         if self == onto {
             return values.to_vec();
@@ -120,8 +122,10 @@ impl Grid {
         (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
     }
 
-    /// Returns the cell that contains a place, or the nearest cell if the place lies outside the grid. For x and for y,
-    /// the result has the index of the lower node, and the position between this node and the next, from 0 to 1.
+    /// Finds the cell of the grid that contains `place_mm`, or the cell nearest to a place outside the grid.
+    ///
+    /// Returns two pairs, for x and for y: the index of the lower node of the cell along this axis, and the position of
+    /// the place between this node (0) and the next (1).
     pub fn cell(&self, place_mm: [f64; 2]) -> [(usize, f64); 2] {
         [0, 1].map(|k| {
             let nodes = self.counts()[k];
@@ -131,8 +135,8 @@ impl Grid {
         })
     }
 
-    /// Returns the bilinear interpolation of values at a place. Beyond the border, returns the value at the nearest
-    /// place on the border.
+    /// Interpolates `values`, one for each node, bilinearly at `place_mm`. For a place outside the grid, returns the
+    /// value at the nearest place on the border.
     pub fn interpolate(&self, values: &[f64], place_mm: [f64; 2]) -> f64 {
         let [(i, u), (j, v)] = self.cell(place_mm);
         let at = |i: usize, j: usize| values[j.min(self.rows - 1) * self.columns + i.min(self.columns - 1)];

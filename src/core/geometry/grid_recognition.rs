@@ -25,7 +25,8 @@ pub struct GriddedCloud {
 }
 
 impl GriddedCloud {
-    /// Returns true if the points already are row by row, x fastest, without a hole.
+    /// Returns true if the points are stored in the order of the nodes (row by row, x fastest), and every node has a
+    /// point.
     pub(crate) fn is_ordered(&self) -> bool {
         self.holes == 0 && self.point_indices.iter().enumerate().all(|(node, &point)| node as u32 == point)
     }
@@ -44,10 +45,11 @@ pub(crate) struct OrderedGrid {
 /// extent. A smaller difference is rounding.
 const COLUMN_TOLERANCE: f64 = 5e-7;
 
-/// Recognises a complete regular grid whose points are row by row, x fastest, in one pass and without a copy of the
-/// points. Returns `None` for all other points.
+/// Recognises a complete regular grid of at least 3 by 3 points that are stored row by row, x fastest. Returns `None`
+/// for all other points.
 ///
-/// [`recognise_grid`] recognises all these grids too, and also grids in another order and grids with holes.
+/// This is a fast case of [`recognise_grid`], in one pass and without a copy of the points. [`recognise_grid`] also
+/// recognises grids in another order and grids with holes.
 pub(crate) fn recognise_ordered_grid(points: &[Point]) -> Option<OrderedGrid> {
     let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
     let rows = points.len() / columns;
@@ -75,7 +77,7 @@ pub(crate) fn recognise_ordered_grid(points: &[Point]) -> Option<OrderedGrid> {
     })
 }
 
-/// Returns true if the coordinates rise in equal steps.
+/// Returns true if the coordinates `at` rise in equal steps, within [`NODE_TOLERANCE`] of a step.
 fn is_even(at: &[f64]) -> bool {
     let step = (at[at.len() - 1] - at[0]) / (at.len() - 1) as f64;
     step > 0.0
@@ -83,10 +85,11 @@ fn is_even(at: &[f64]) -> bool {
         && at.iter().enumerate().all(|(k, c)| (c - at[0] - k as f64 * step).abs() <= NODE_TOLERANCE * step)
 }
 
-/// Recognises a regular grid in x and y, whatever the order of the points and even if nodes are missing.
+/// Recognises a regular grid in x and y, whatever the order of the points and even if nodes are missing. Returns the
+/// index of the point at each node.
 ///
-/// Shapes: at least 3 nodes on each axis, and at most 4 nodes per point: a sparser grid may be a coincidence. Returns
-/// `None` for scattered points, for two points at one node, and for coordinates that are not finite.
+/// Returns `None` if the points do not lie on a grid of at least 3 by 3 nodes, if two points lie at one node, if there
+/// are more than 4 nodes for each point (such a grid may be a coincidence), or if a coordinate is not finite.
 pub fn recognise_grid(points: &[Point]) -> Option<GriddedCloud> {
     if points.len() < 9 || points.len() >= NO_POINT as usize {
         return None;
@@ -116,9 +119,12 @@ struct UniformAxis {
 }
 
 impl UniformAxis {
-    /// Finds the spacing of the coordinates: the smallest gap between the sorted coordinates of a sample of the points.
-    /// The sample works for any order of the points. Returns `None` if a coordinate is not finite, if all are equal, or
-    /// if the gap gives 60,000 steps or more.
+    /// Finds the first coordinate, the spacing and the number of equally spaced nodes along one axis. `coordinate`
+    /// returns the x or the y of a point.
+    ///
+    /// The spacing is the smallest gap between the sorted coordinates of a sample of the points. Returns `None` if a
+    /// coordinate is not finite, if all coordinates are equal, or if the spacing divides their extent into 60,000 steps
+    /// or more.
     fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
         let (low, high) = points
             .par_chunks(8192)
@@ -142,7 +148,8 @@ impl UniformAxis {
         (steps < 6e4).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
     }
 
-    /// Returns the index of the node at a coordinate; `None` if no node is within the tolerance.
+    /// Returns the index of the node at `coordinate`; `None` if the coordinate is more than [`NODE_TOLERANCE`] spacings
+    /// from every node.
     #[inline]
     fn node(&self, coordinate: f64) -> Option<usize> {
         let at = (coordinate - self.first) * self.per_mm;
@@ -152,8 +159,8 @@ impl UniformAxis {
     }
 }
 
-/// Returns the first points and a sample spread over all points. A grid in order shows its spacing in the first points,
-/// a shuffled grid in the spread sample.
+/// Returns the first 4096 points, followed by a sample of up to 4096 points spread over all points. In a grid in row
+/// order, neighbouring nodes are among the first points; in a shuffled grid, they are in the spread sample.
 fn sampled(points: &[Point]) -> impl Iterator<Item = &Point> {
     const SAMPLE: usize = 4096;
     let n = points.len();

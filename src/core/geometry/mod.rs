@@ -26,7 +26,8 @@ pub type Point = nalgebra::Point3<f64>;
 /// A direction or a displacement in space.
 pub type Vector = nalgebra::Vector3<f64>;
 
-/// Returns the smallest rectangle along the axes that contains some places: `[[x min, y min], [x max, y max]]`.
+/// Returns the smallest rectangle along the axes that contains all `places`: `[[x min, y min], [x max, y max]]`.
+/// Without places, the minima are +infinity and the maxima -infinity.
 pub(crate) fn bounds(places: impl Iterator<Item = [f64; 2]>) -> [[f64; 2]; 2] {
     places.fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], [x, y]| {
         [[low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]]

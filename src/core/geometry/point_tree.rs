@@ -9,13 +9,15 @@ use super::Point;
 pub(crate) struct PointTree(KDTree<f64, TreePoint>);
 
 impl PointTree {
-    /// Builds the tree of some points. A point that is not finite gets an arbitrary position.
+    /// Builds the search tree of `points`. A point with a coordinate that is not finite is kept, at an arbitrary
+    /// position.
     pub(crate) fn new(points: impl Iterator<Item = Point>) -> Self {
         // With 16 points in a leaf the tree is built faster than with 8, and a query takes the same time.
         Self(KDTree::new_with_bucket_size(&points.map(TreePoint::from).collect::<Vec<_>>(), 16))
     }
 
-    /// Returns the indices of the points nearest to a place and their squared distances, the nearest first.
+    /// Returns the `count` points nearest to `p`, the nearest first: the index of each in [`PointTree::new`], and its
+    /// squared distance from `p`. Returns all points if there are fewer than `count`.
     pub(crate) fn nearest(&self, p: &Point, count: u32) -> impl Iterator<Item = (usize, f64)> {
         let exact = Parameters { epsilon: 0.0, max_radius: f64::INFINITY, allow_self_match: true, sort_results: true };
         // For some tens of neighbours a list is faster than the crate's default, a heap.

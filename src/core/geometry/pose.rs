@@ -46,8 +46,8 @@ pub enum PoseError {
     /// negative (-1 for a mirror image).
     #[error(
         "the upper left 3 x 3 block R of the pose is not a rotation: the largest entry of R R^T - 1 is {off:.3e} \
-         (limit {ROTATION_TOLERANCE:.0e}), and the determinant is {determinant:.6}; scale, shear and mirror images are \
-         not rigid"
+         (limit {ROTATION_TOLERANCE:.0e}), and the determinant is {determinant:.6}; give a matrix without \
+         scale, shear or mirror image"
     )]
     NotARotation { off: f64, determinant: f64 },
 }
@@ -58,9 +58,9 @@ impl Pose {
         Self { rotation: Matrix3::identity(), translation_mm: Vector::zeros() }
     }
 
-    /// Returns the exact exponential of a twist, the left side of eq. (10).
+    /// Returns the pose that the twist generates: the exact exponential map of SE(3), eq. (10) of the paper.
     ///
-    /// Units: the first three coordinates in millimetres, the last three in radians.
+    /// Units: the first three coordinates of the twist in millimetres, the last three in radians.
     pub fn exp(twist: &Twist) -> Self {
         let v: Vector = twist.fixed_rows::<3>(0).into();
         let omega: Vector = twist.fixed_rows::<3>(3).into();
@@ -160,7 +160,7 @@ impl Pose {
 impl std::ops::Mul for Pose {
     type Output = Pose;
 
-    /// Composes two poses: the right one is applied first.
+    /// Composes two poses. The result applies `right` first, then `self`.
     fn mul(self, right: Pose) -> Pose {
         Pose {
             rotation: self.rotation * right.rotation,
@@ -169,7 +169,8 @@ impl std::ops::Mul for Pose {
     }
 }
 
-/// Returns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 for t = `theta`, in radians.
+/// Returns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 for t = `theta` in radians, at least 0; for small t from their
+/// series.
 fn exponential_coefficients(theta: f64) -> [f64; 3] {
     let t2 = theta * theta;
     if theta < SERIES_BELOW_RAD {
@@ -183,7 +184,8 @@ fn exponential_coefficients(theta: f64) -> [f64; 3] {
     [theta.sin() / theta, 2.0 * half_sine * half_sine / t2, (theta - theta.sin()) / (t2 * theta)]
 }
 
-/// Returns the rotation vector of a rotation matrix. It uses the quaternion, which is well conditioned up to pi.
+/// Returns the rotation vector of a rotation matrix: the unit vector of the axis times the angle in radians, from 0 to
+/// pi. The computation over the quaternion is accurate up to pi.
 fn rotation_logarithm(rotation: &Matrix3<f64>) -> Vector {
     let q = UnitQuaternion::from_rotation_matrix(&nalgebra::Rotation3::from_matrix_unchecked(*rotation));
     let (w, v) = (q.w.abs(), q.imag() * if q.w < 0.0 { -1.0 } else { 1.0 });

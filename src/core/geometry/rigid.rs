@@ -50,7 +50,7 @@ pub enum RigidError {
     #[error("{points} pairs of points do not determine a pose; at least 3 are required; measure more reference points")]
     TooFew { points: usize },
     /// A coordinate is NaN or infinite.
-    #[error("pair {} of the points has a coordinate that is not finite; remove it", index + 1)]
+    #[error("pair {} of the points has a coordinate that is not finite; remove this pair", index + 1)]
     NotFinite { index: usize },
     /// All points lie on a line.
     #[error(
@@ -66,14 +66,12 @@ pub enum RigidError {
     Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
 }
 
-/// Returns the rigid motion that maps `from` onto `to` with the smallest sum of squared distances.
-///
-/// Shapes: two lists of equal length, pair by pair, with at least three pairs. Units: millimetres. Kabsch (1976),
-/// Umeyama (1991).
+/// Fits the rigid motion that maps the points `from` onto the points `to`, pair by pair, with the smallest sum of
+/// squared distances (Kabsch 1976, Umeyama 1991). Units: millimetres.
 ///
 /// # Errors
 /// Returns an error if the lists have different lengths or fewer than three pairs, if a coordinate is not finite, if
-/// the points of a set lie on one line, or if one set is the mirror image of the other.
+/// the points of a list lie on one line, or if one list is the mirror image of the other.
 pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
     check(from, to)?;
     let (a, b) = (centroid(from), centroid(to));
@@ -98,6 +96,7 @@ pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
     Ok(RigidFit { pose, residuals_mm, rms_mm })
 }
 
+/// Checks the two lists of points of [`fit_rigid`], and returns its errors except [`RigidError::Mirrored`].
 fn check(from: &[Point], to: &[Point]) -> Result<(), RigidError> {
     if from.len() != to.len() {
         return Err(RigidError::Counts { from: from.len(), to: to.len() });
@@ -127,7 +126,8 @@ fn rms(residuals: &[Vector]) -> f64 {
     (residuals.iter().map(Vector3::norm_squared).sum::<f64>() / residuals.len() as f64).sqrt()
 }
 
-/// Returns the rms spread of points along their three principal axes, the largest first.
+/// Returns the root mean square spread of the points about their centroid along their three principal axes, the largest
+/// first.
 fn spreads(points: &[Point]) -> [f64; 3] {
     let middle = centroid(points);
     let scatter: Matrix3<f64> = points.iter().map(|p| (p.coords - middle) * (p.coords - middle).transpose()).sum();

@@ -44,7 +44,7 @@ pub enum Layout {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum PatternError {
-    #[error("the measuring pattern has a spacing of {spacing_mm} mm; it must be above 0")]
+    #[error("the measuring pattern has a spacing of {spacing_mm} mm; it must be a finite number above 0")]
     Spacing { spacing_mm: f64 },
     #[error("the measuring pattern has {count:.0} points, more than {MAX_TARGETS:.0}; choose a wider spacing")]
     TooMany { count: f64 },
@@ -55,12 +55,15 @@ pub enum PatternError {
     NoneOnPart { requested: usize, margin_mm: f64 },
 }
 
-/// Returns targets on the part, `margin_mm` inside its edge, in the order of measurement.
+/// Returns the targets of a measuring pattern on the part, in the order of measurement: points of the nominal surface
+/// with their normals towards `side`.
 ///
-/// Frame: model. Units: millimetres. Places that are not on the part, or too near its edge, are omitted.
+/// `layout` gives the places over x and y. A place is omitted if it is not on the part, or less than `margin_mm` from
+/// the edge. Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if the spacing is not above 0, if there are too many places, or if none lies on the part.
+/// Returns an error if the spacing of the layout is not a finite number above 0, if the pattern has more than ten
+/// million places, or if every place is omitted.
 pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -> Result<Vec<Target>, PatternError> {
     let surface = OffsetSurface::new(nominal, 0.0, side).expect("a radius of 0 is good");
     let bounds = bounds(nominal);
@@ -79,8 +82,8 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     Ok(found)
 }
 
-/// Returns `count` targets spread evenly over the upper half of a reference sphere, for a probe that comes from above.
-/// The targets are in the frame of `centre`, in millimetres.
+/// Returns `count` targets spread evenly over the upper part of a reference sphere, from its top (+z) down to 80
+/// degrees from it, for a probe that comes from above. The targets are in the frame of `centre`, in millimetres.
 pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target> {
     // Equal areas from the pole down to 80 degrees, each turned by the golden angle.
     let lowest = 80f64.to_radians().cos();
@@ -115,6 +118,11 @@ fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
     }
 }
 
+/// Returns the places of a layout within the given bounds, reduced by `margin_mm` on every side, in the order of
+/// measurement.
+///
+/// # Errors
+/// Returns an error if the spacing is not a finite number above 0, or if there are more than [`MAX_TARGETS`] places.
 fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result<Vec<TargetRequest>, PatternError> {
     let [width, depth] = [0, 1].map(|k| (high[k] - low[k] - 2.0 * margin_mm).max(0.0));
     let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
@@ -157,6 +165,11 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
     }
 }
 
+/// Returns the places of an Archimedean spiral about `middle` that lie in the rectangle of size `[width, depth]` about
+/// it. `spacing` is the distance between turns and between successive places, in mm.
+///
+/// # Errors
+/// Returns an error if there are more than [`MAX_TARGETS`] places.
 fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Vec<TargetRequest>, PatternError> {
     let reach = 0.5 * width.hypot(depth);
     let count = PI * (reach / spacing).powi(2);
@@ -196,9 +209,12 @@ impl<'a> SurfaceWalk<'a> {
         Self { surface, facet: FacetIndex::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
-    /// Finds the point of the surface over x and y by Newton's method on the height. Each step intersects the vertical
-    /// line through x and y with the tangent plane at the projection of the current point. Returns `None` if the
-    /// surface is nearly vertical, if the iteration does not converge, or if the point lies beyond the edge.
+    /// Finds the target at the given x and y: the point of the surface above or below this place. Newton's method
+    /// searches its height; each step intersects the vertical line with the tangent plane at the projection of the
+    /// current point.
+    ///
+    /// Returns `None` if the surface is nearly vertical, if the iteration does not converge, or if the point lies
+    /// beyond the edge of the surface.
     fn target_at(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
         let mut p = Point::new(x, y, self.z);
         for _ in 0..MAX_ITERATIONS {
@@ -218,6 +234,8 @@ impl<'a> SurfaceWalk<'a> {
         None
     }
 
+    /// Returns the target at the projection of the point `p` onto the surface. Returns `None` if the projection lies
+    /// beyond the edge, or if `p` is farther from the surface than 5 % of the diagonal of the part.
     fn target_nearest_to(&mut self, p: &Point) -> Option<Target> {
         let foot = self.surface.project(p, self.facet);
         self.facet = foot.facet;
@@ -227,8 +245,9 @@ impl<'a> SurfaceWalk<'a> {
         (foot.beyond_edge_mm <= EDGE_TOLERANCE_MM && near).then_some(target)
     }
 
-    /// Returns true if the target lies within the outline, and if the surface extends at least `margin_mm` around it,
-    /// in eight directions.
+    /// Returns true if the target lies within the outline of the part and is not nearer than `margin_mm` to the edge.
+    /// For the distance, eight points around the target are checked, `margin_mm` away in the tangent plane: each must
+    /// lie within the outline and project onto the surface.
     fn is_inside(&self, target: &Target, margin_mm: f64) -> bool {
         let outline = self.surface.nominal().outline();
         let (u, _) = frame(&target.normal);
@@ -245,8 +264,9 @@ impl<'a> SurfaceWalk<'a> {
     }
 }
 
-/// Returns two unit vectors perpendicular to a normal and to each other. The first is the projection of the x axis, or
-/// of the y axis if the normal is close to x.
+/// Returns two unit vectors that are perpendicular to the unit vector `normal` and to each other. The first has the
+/// direction of the x axis projected onto the plane perpendicular to `normal`; if `normal` is close to x, that of the y
+/// axis.
 fn frame(normal: &Vector) -> (Vector, Vector) {
     let x = if normal.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
     let u = (x - normal * normal.dot(&x)).normalize();

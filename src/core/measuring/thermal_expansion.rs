@@ -34,9 +34,9 @@ impl ThermalExpansion {
     /// Converts points of a part, measured at `temperature_c` (degrees Celsius), to their positions at 20 degrees
     /// Celsius, by scaling about their centroid.
     ///
-    /// Frame: any. If the points are probe centres, the scaling also moves them nearer to the surface. Their distance
-    /// from the surface is then the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of
-    /// the ball itself is already in the radius that was found on the reference sphere.
+    /// Frame: any. If the points are centres of the probe's ball, their distance from the surface is scaled too: it
+    /// becomes the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the ball itself
+    /// is already in the radius that was found on the reference sphere.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;
         let middle = Point::from(points.iter().map(|p| p.coords).sum::<crate::geometry::Vector>() / n);

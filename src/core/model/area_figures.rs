@@ -65,9 +65,12 @@ pub struct IsoFigures {
 }
 
 impl SlopeFigures {
-    /// Computes the slope figures from sampled forms. Each matrix has one column per form. The first matrix gives the
-    /// intervals. The second matrix only raises the upper end of the maximum slope. If `is_seen` is false, the lower
-    /// ends are 0.
+    /// Computes the slope figures with their credible intervals from sampled forms. A matrix of `forms` has one column
+    /// for each sampled form, one row for each place of `slopes`.
+    ///
+    /// The first matrix gives the median and the interval of each figure. The second matrix, of samples with larger
+    /// extremes, can only raise the upper end of the maximum slope. `is_seen` is true if a form was detected; if it is
+    /// false, the lower ends are 0.
     pub(super) fn from_forms(
         slopes: &SlopeOperator,
         forms: &[DMatrix<f64>; 2],
@@ -89,9 +92,12 @@ impl SlopeFigures {
 }
 
 impl IsoFigures {
-    /// Computes the figures from sampled forms. Each matrix has one column per form. The first matrix gives the
-    /// intervals. The second matrix only raises the upper ends of the PV of irregularity and symmetric part. If
-    /// `is_seen` is false, the lower ends are 0, except that of `power_rim`.
+    /// Computes the ISO 10110-5 figures with their credible intervals from sampled forms. A matrix of `forms` has one
+    /// column for each sampled form, one row for each place of `fits`.
+    ///
+    /// The first matrix gives the median and the interval of each figure. The second matrix, of samples with larger
+    /// extremes, can only raise the upper ends of the PV of the irregularity and of the symmetric part. `is_seen` is
+    /// true if a form was detected; if it is false, the lower ends are 0, except that of `power_rim`.
     pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| fits.evaluate(form)));
         let values = |k: usize, of: fn(&IsoFormValues) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
@@ -115,7 +121,7 @@ impl IsoFigures {
     }
 }
 
-/// Calls `make` for each column and returns the results in the order of the columns.
+/// Calls `make` with each column of `forms`, in parallel. Returns the results in the order of the columns.
 fn map_columns<T: Send>(forms: &DMatrix<f64>, make: impl Fn(&[f64]) -> T + Send + Sync) -> Vec<T> {
     forms.as_slice().par_chunks(forms.nrows().max(1)).map(make).collect()
 }

@@ -44,10 +44,12 @@ pub(super) struct Basis {
 }
 
 impl Basis {
-    /// Returns the basis over the given places: the polynomials up to `degree` and `count` cosines.
+    /// Builds the basis functions for a field over the given places: polynomials of the degrees 2 to `degree`, and
+    /// `count` cosines.
     ///
-    /// The cosines are those with the largest variance in a field of this anisotropy, in descending order. The
-    /// polynomials begin at degree 2, because a constant and a tilt are rigid motions of the part.
+    /// `lay` is the anisotropy of the field. Of all cosines over the rectangle around the places, those with the
+    /// largest variance in such a field are used, in descending order of the variance. A constant and a tilt (degrees 0
+    /// and 1) are left out of the polynomials, because they are motions of the part.
     pub(super) fn over(places: &[[f64; 2]], lay: Anisotropy, count: usize, degree: usize) -> Self {
         let [low, high] = bounds(places.iter().map(|&place| lay.rotated(place)));
         let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
@@ -94,16 +96,17 @@ impl Basis {
         self.degrees.len()
     }
 
-    /// Returns half the wavelength of the shortest cosine, in mm.
+    /// Returns half the wavelength of the cosine with the shortest wavelength, in mm.
     pub(super) fn min_half_wavelength_mm(&self) -> f64 {
         std::f64::consts::PI / self.squared_wavenumbers.last().copied().unwrap_or(0.0).sqrt()
     }
 
-    /// Returns the standard deviation of each coefficient, and the share of the variance that the basis leaves out.
+    /// Returns the prior standard deviation of the coefficient of each basis function, and the share of the variance of
+    /// the field that the basis cannot represent.
     ///
-    /// Both are for a field of variance 1. The share is that of the waves shorter than the shortest cosine. The
-    /// polynomials have variance only if the field is differentiable and its range is at least the longer side of the
-    /// part.
+    /// Both are for a field of variance 1 with the given smoothness and range. The share is that of waves shorter than
+    /// the shortest cosine. The standard deviations of the polynomials are 0 unless the field is differentiable and its
+    /// range is at least the longer side of the part.
     pub(super) fn standard_deviations(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
         let strength = |number2: &f64| spectral_density_mm2(smoothness, range_mm, *number2).sqrt();
         let last2 = self.squared_wavenumbers.last().copied().unwrap_or(0.0);
@@ -134,8 +137,8 @@ impl Basis {
         waves
     }
 
-    /// Evaluates the cosines along an axis at the given coordinates: one vector for each order, one value for each
-    /// coordinate.
+    /// Evaluates the cosines of one variable along `axis` (0 for u, 1 for v) at the coordinates `at_mm`. Returns one
+    /// vector for each order from 0, with one value for each coordinate.
     fn cosines(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let length_mm = self.lengths_mm[axis];
         let scale = |order: usize| if order == 0 { 1.0 } else { 2.0_f64.sqrt() } / length_mm.sqrt();
@@ -145,8 +148,10 @@ impl Basis {
         (0..self.counts[axis]).map(of).collect()
     }
 
-    /// Evaluates the Legendre polynomials along an axis at the given coordinates: one vector for each degree, one value
-    /// for each coordinate. Each is scaled to the mean square of a cosine, 1 / L.
+    /// Evaluates the Legendre polynomials along `axis` (0 for u, 1 for v) at the coordinates `at_mm`. Returns one
+    /// vector for each degree from 0, with one value for each coordinate.
+    ///
+    /// The polynomials are scaled to the mean square of the cosines along this axis: 1 / (length of the rectangle).
     fn polynomials(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let root = self.lengths_mm[axis].sqrt().recip();
         let places: Vec<f64> = at_mm.iter().map(|at| (at - self.middle_mm[axis]) / self.halves_mm[axis]).collect();
@@ -163,10 +168,10 @@ impl Basis {
         all
     }
 
-    /// Evaluates the basis functions along each axis of a grid, as [`Self::on_grid`] needs them.
+    /// Evaluates the polynomials and cosines of one variable along both axes of a grid, as input of [`Self::on_grid`].
     ///
-    /// One row for each node along the axis. The columns are the polynomials from degree 0, then the cosines from order
-    /// 0.
+    /// Returns one matrix for u and one for v. It has one row for each node along the axis; the columns are the
+    /// polynomials from degree 0, then the cosines from order 0.
     pub(super) fn grid(&self, grid: &BasisGrid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
@@ -176,7 +181,9 @@ impl Basis {
         })
     }
 
-    /// Evaluates the field with these coefficients at all nodes of a grid: one row for each u, one column for each v.
+    /// Evaluates a field at all nodes of a grid. `coefficients` has the coefficient of each basis function; `along` and
+    /// `across` are the matrices of [`Self::grid`]. Returns one row for each node along u, one column for each node
+    /// along v.
     pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
         let mut square = Mat::<f64>::zeros(along.ncols(), across.ncols());
         let (polynomials, cosines) = coefficients.split_at(self.degrees.len().min(coefficients.len()));
@@ -196,23 +203,23 @@ pub(super) struct BasisGrid {
 }
 
 impl BasisGrid {
-    /// Returns the indices of a node along u and v; u is the fastest.
+    /// Converts the number of a node to its indices along u and v. Nodes are numbered along u first.
     pub(super) fn indices(&self, node: usize) -> [usize; 2] {
         [node % self.counts[0], node / self.counts[0]]
     }
 
-    /// Returns the coordinates u and v of a node, in mm.
+    /// Returns the coordinates u and v of the node with the number `node`, in mm.
     pub(super) fn place(&self, node: usize) -> [f64; 2] {
         let indices = self.indices(node);
         [0, 1].map(|axis: usize| self.corner_mm[axis] + self.spacing_mm * indices[axis] as f64)
     }
 }
 
-/// Returns the spectral density of a field of variance 1, in mm^2, at the squared wavenumber `number2` = w^2, in 1 /
-/// mm^2.
+/// Returns the spectral density of a field of variance 1, in mm^2, at the squared wavenumber `number2`, in 1 / mm^2.
 ///
-/// The covariance is exp(-2 (r / range)^2), or Matern's with kappa^2 = 8 nu / range^2. The spectral density of Matern's
-/// covariance is 4 pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
+/// For a squared-exponential field, the covariance is exp(-2 (r / range)^2). Otherwise, it is the Matern covariance
+/// with the smoothness nu, and with w^2 for `number2` and kappa^2 = 8 nu / range^2, the density is 4 pi nu kappa^(2 nu)
+/// / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
 fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return 0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp();
@@ -221,8 +228,8 @@ fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> 
     2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
 }
 
-/// Returns the share of the variance of a field in waves whose squared wavenumber is above `number2`, in 1 / mm^2: the
-/// integral of the spectral density outside a circle.
+/// Returns the share of the variance of a field that lies in waves with a squared wavenumber above `number2`, in 1 /
+/// mm^2: the integral of the spectral density outside a circle, from 0 to 1.
 fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return (-number2 * range_mm.powi(2) / 8.0).exp();

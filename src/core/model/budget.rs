@@ -39,11 +39,13 @@ struct VarianceComponents {
     random_effects: Vec<f64>,
 }
 
-/// Decomposes `uncertainties_mm`, the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per
-/// source; empty if the decomposition fails.
+/// Computes the uncertainty budget: divides the standard uncertainties of the root mean square and of PV 99.8 %, given
+/// as `uncertainties_mm`, among their sources. Returns one entry for each source; empty if the variances cannot be
+/// computed.
 ///
-/// `ground_in` has one row per place and one column per random effect: the form that one standard uncertainty of the
-/// effect has ground into the part, after its best fit. It is `None` before the first correction.
+/// `sources` has the source of each random effect in `observed`, or of each column of `ground_in`. `ground_in` has one
+/// row for each place of `drawn`, one column for each effect: the form that one standard uncertainty of the effect has
+/// ground into the part, without the best fit. It is `None` before the first correction.
 pub(super) fn decompose(
     (observed, sources): (&Observations, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -75,14 +77,14 @@ pub(super) fn decompose(
     UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
-/// Decomposes the variance of the sum a'f, where f is the form at `places` and a are the given `slopes`. The
-/// coefficients of the field are sigma D z: D are the standard deviations of the node, and z is independent with
-/// variance 1. The coordinates of the points are sigma B z, with B from [`FieldHypotheses::with_effects`].
+/// Divides the variance of a linear figure of the form among its sources. The figure is the sum, over `places`, of the
+/// form times the given `slopes` (derivatives of the figure). The most probable field is used.
 ///
-/// If the motions were known, w'd would estimate the sum, with the observed coordinates d and weights w. The variance
-/// of the error of this estimate has three parts: s^2 w'w from the noise s, (w'e)^2 from each random effect e, and the
-/// remainder from the field. The pose contributes the increase of the variance when the motions are unknown. Returns
-/// `None` if there is no hypothesis or a covariance is singular.
+/// If the motions of the part were known, the figure would be estimated as w'd, with weights w and the observed
+/// deviations d in the coordinates of [`FieldHypotheses::coordinates`]. The variance of its error consists of s^2 w'w
+/// from the noise s, (w'e)^2 from each random effect e, and the remainder from the field. The pose contributes the
+/// increase of the variance when the motions are unknown. Returns `None` if there is no hypothesis of the field or a
+/// covariance is singular.
 fn parts(
     observed: &Observations,
     fields: &FieldHypotheses,
@@ -143,12 +145,13 @@ fn parts(
     })
 }
 
-/// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the
-/// sampled forms. Also returns, for each column of `ground_in`, the mean square of the derivative along that column.
-/// Components along the motions are removed, because a best fit removes the motions.
+/// Computes the derivatives of the root mean square and of PV 99.8 % with respect to the form at each place, averaged
+/// over the sampled forms. Their components along the motions of the part are removed, because a best fit removes the
+/// motions.
 ///
-/// An effect that was ground into the part is itself form. The derivative along it is as often positive as negative
-/// over the samples, so its mean is 0, but its mean square is not.
+/// Also returns, for both figures, the mean square of the derivative along each column of `ground_in` (form that an
+/// effect of the machine has ground into the part). Along such a column, the derivative is as often positive as
+/// negative over the samples: its mean is 0, its mean square is not.
 fn slopes(drawn: &SampledForms, ground_in: Option<&DMatrix<f64>>) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let forms = &drawn.forms[0];
     let (n, count) = forms.shape();

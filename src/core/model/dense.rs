@@ -46,17 +46,25 @@ pub struct DensePosterior {
 }
 
 impl DensePosterior {
-    /// Fits the effects and the field to the observed points. The cost is cubic in the number of points.
+    /// Estimates the effects and the field from the observed points, for the given hyperparameters (generalised least
+    /// squares and kriging). The cost is cubic in the number of points.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows differ, a number is not finite, a hyperparameter is not above 0, or the
-    /// points do not separate the effects.
+    /// Returns an error if the numbers of rows differ, if there are not more points than fixed effects, if a number is
+    /// not finite, if a hyperparameter is out of range, if the points do not separate the effects, or if the covariance
+    /// of the points is not positive definite.
     pub fn fit(observed: &Observations, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
         Self::with_shared_covariance(observed, hyperparameters, |_, _| 0.0)
     }
 
-    /// Fits like [`Self::fit`], and adds `shared_mm2(a, b)` to the covariance of the observed points with the indices a
-    /// and b. [`Self::predict`] does not add it to the covariances of a place with the points.
+    /// Estimates effects and field as [`Self::fit`] does, with an additional covariance of the observed points:
+    /// `shared_mm2(a, b)` in mm^2 for the points with the indices `a` and `b`. A session of measurements, for example,
+    /// has such a covariance.
+    ///
+    /// The additional covariance belongs to the observed points alone: [`Self::predict`] predicts the field without it.
+    ///
+    /// # Errors
+    /// Those of [`Self::fit`].
     pub(super) fn with_shared_covariance(
         observed: &Observations,
         hyperparameters: Hyperparameters,
@@ -98,25 +106,30 @@ impl DensePosterior {
         })
     }
 
-    /// Returns the logarithm of the likelihood of the observed deviations, integrated over the fixed effects
-    /// (restricted likelihood, Patterson and Thompson 1971). It serves to compare hyperparameters.
+    /// Returns the logarithm of the restricted likelihood of the observed deviations: the likelihood integrated over
+    /// the fixed effects (Patterson and Thompson 1971). Of two sets of hyperparameters, the one with the higher value
+    /// fits better.
     pub fn log_likelihood(&self) -> f64 {
         self.likelihood
     }
 
-    /// Returns the sum of squares of the whitened residuals, d'K^-1 (d - H b), with the observed deviations d.
+    /// Returns the generalised residual sum of squares d'K^-1 (d - H b): d are the deviations in `observed`, which must
+    /// be those of the fit, K their covariance, H the effects and b their estimates.
     pub(super) fn whitened_squares(&self, observed: &Observations) -> f64 {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// Returns the estimated effects and their covariance: the fixed effects first, then the random effects. If the
-    /// fixed effects are the motions of the part, they give the pose of its nominal frame, and the covariance includes
-    /// the uncertainty due to the unknown field.
+    /// Returns the estimates of the effects and the covariance of these estimates: the fixed effects first, then the
+    /// random effects.
+    ///
+    /// The covariance includes the uncertainty due to the unknown field. If the fixed effects are the motions of the
+    /// part, the estimates are the pose of its nominal frame.
     pub fn estimated_effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.estimates, &self.covariance)
     }
 
-    /// Predicts the field at places, without the effects.
+    /// Predicts the field at each of `places`: posterior mean and standard uncertainty. The effects and the noise of a
+    /// touch are not included.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
         let p = self.estimates.len();
         let across = self.hyperparameters.field.pair_covariance().cross_covariance(&self.places, places);
@@ -134,8 +147,8 @@ impl DensePosterior {
             .collect()
     }
 
-    /// Predicts the field at places like [`Self::predict`]; returns the means in mm, and the covariance of every pair
-    /// of places in mm^2.
+    /// Predicts the field at several places together. Returns the posterior means in mm, and the posterior covariance
+    /// of every pair of places in mm^2. The effects and the noise of a touch are not included.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
         let p = self.estimates.len();
         let pairs = self.hyperparameters.field.pair_covariance();
@@ -150,8 +163,9 @@ impl DensePosterior {
     }
 }
 
-/// Returns the lower triangle of the covariance K of the points, without the effects. `shared_mm2(a, b)` is added for
-/// the points with the indices a and b.
+/// Computes the covariance of the deviations of all observed points, from the field and the noise, without the effects.
+/// `shared_mm2(a, b)` is added for the points with the indices `a` and `b`. Only the lower triangle of the result is
+/// filled.
 fn covariance_mm2(
     observed: &Observations,
     hyperparameters: &Hyperparameters,
@@ -180,10 +194,12 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the Cholesky factor of H'K^-1 H.
+/// Returns the Cholesky factor of `gram`, the matrix of the products of all pairs of effects (H'K^-1 H for the effects
+/// H and the covariance K of the points, or H'H).
 ///
 /// # Errors
-/// Returns [`ModelError::CollinearEffects`] if the matrix, scaled to a unit diagonal, is singular within 1e-12.
+/// Returns [`ModelError::CollinearEffects`] if one effect is nearly a combination of the others: the smallest
+/// eigenvalue of the matrix, scaled to a unit diagonal, is at most 1e-12.
 pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const MIN_PIVOT: f64 = 1e-12;
     if gram.nrows() == 0 {
@@ -307,7 +323,7 @@ mod tests {
             DensePosterior::fit(observed, hyperparameters).err().unwrap().to_string()
         };
         let two = Observations::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
-        assert_eq!(of(&two, HYPERPARAMETERS), "point 2 has a number that is not finite");
+        assert_eq!(of(&two, HYPERPARAMETERS), "point 2 has a number that is not finite; remove this point");
         let none = Observations::without_effects(vec![], vec![]);
         assert!(of(&none, HYPERPARAMETERS).contains("at least 1 points; 0"));
         let odd = Observations::without_effects(vec![[0.0; 2]; 2], vec![1.0]);

@@ -23,15 +23,18 @@ pub struct EffectEstimates {
 }
 
 impl EffectEstimates {
-    /// Estimates the effects by generalised least squares (Aitken 1935), b = (H'K^-1 H)^-1 H'K^-1 d with the covariance
-    /// (H'K^-1 H)^-1. The columns of H are the effects, and d are the deviations.
+    /// Estimates the fixed and random effects in `observed` together with a form of unknown strength and range, and
+    /// returns them with their covariance.
     ///
-    /// K is the covariance of one field. The result is the average over the fields, weighted with their posterior
-    /// probabilities, which do not depend on the effects. The covariance of the average is the mean of the covariances,
-    /// plus the covariance of the estimates over the fields.
+    /// For one field, the estimate is that of generalised least squares (Aitken 1935): b = (H'K^-1 H)^-1 H'K^-1 d with
+    /// the covariance (H'K^-1 H)^-1. The columns of H are the effects, d are the deviations, and K is the covariance of
+    /// the points. The result is the mean over the possible fields, weighted with their posterior probabilities
+    /// (Bayesian model averaging). The covariance includes the differences between these fields. `priors` is the prior
+    /// of the field.
     ///
     /// # Errors
-    /// Returns an error if there are too few points, if effects are collinear, or if the numbers of rows differ.
+    /// Returns an error if the prior is invalid, if there are too few points, if one effect is a combination of others,
+    /// if a number is not finite, or if the numbers of rows differ.
     pub fn estimate(observed: &Observations, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();

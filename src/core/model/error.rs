@@ -8,24 +8,24 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum ModelError {
     #[error(
-        "{points} places, {deviations} deviations and {rows} rows of effects do not match; give one deviation and one \
-         row of effects for each place"
+        "{points} places, {deviations} deviations and {rows} rows of effects do not match; give, for each place, one \
+         deviation, one row of fixed and of random effects, and one finite position on the path, if there is a path"
     )]
     Shape { points: usize, deviations: usize, rows: usize },
-    #[error("the model requires at least {min_points} points; {points} are given")]
+    #[error("the model requires at least {min_points} points; {points} are given; measure more points")]
     TooFewPoints { points: usize, min_points: usize },
-    #[error("point {} has a number that is not finite", point + 1)]
+    #[error("point {} has a number that is not finite; remove this point", point + 1)]
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
     Hyperparameter { what: &'static str, value: f64 },
     #[error(
-        "the lay of the field has the direction {along:?} and the stretch {stretch}; the direction must be a unit \
-         vector, and the stretch at least 1"
+        "the lay (anisotropy) of the field has the direction {along:?} and the stretch {stretch}; the direction must \
+         be a unit vector, and the stretch, the ratio of the ranges along and across it, at least 1"
     )]
     Anisotropy { along: [f64; 2], stretch: f64 },
     #[error(
-        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be at least 0 and plausible \
-         for a machine or a fixture: correct the stated value"
+        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be at least 0, and at most \
+         0.1 for scale, squareness and temperature or 10 for the others; correct the stated value"
     )]
     StatedUncertainty { what: &'static str, value: f64 },
     #[error(
@@ -37,7 +37,7 @@ pub enum ModelError {
     NoiseAutocorrelation { value: f64 },
     #[error(
         "the covariance of the points is not positive definite: their noise is too small compared with the field, or \
-         places coincide"
+         places coincide; remove repeated points or state a larger noise"
     )]
     NotDefinite,
     #[error(

@@ -40,7 +40,8 @@ pub struct Anisotropy {
 }
 
 impl Smoothness {
-    /// Returns nu; `None` if it is infinite.
+    /// Returns the parameter nu of the Matern covariance; `None` for [`Smoothness::SquaredExponential`], where nu is
+    /// infinite.
     pub(super) fn nu(self) -> Option<f64> {
         match self {
             Self::Exponential => Some(0.5),
@@ -49,7 +50,7 @@ impl Smoothness {
         }
     }
 
-    /// Returns the name of the smoothness: how many times the field can be differentiated.
+    /// Returns a word for how often the field can be differentiated: `never`, `once` or `endless`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "never",
@@ -63,18 +64,21 @@ impl Anisotropy {
     /// Isotropic: all directions are alike.
     pub const NONE: Self = Self { along: [1.0, 0.0], stretch: 1.0 };
 
-    /// Creates an anisotropy from its angle to the x axis and its stretch.
+    /// Creates an anisotropy from the angle between its direction and the x axis, and from its stretch, the ratio of
+    /// the range along this direction to the range across it.
     pub fn from_angle(angle_rad: f64, stretch: f64) -> Self {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
-    /// Returns the coordinates of a place along and across the direction of the anisotropy.
+    /// Rotates a place into the axes of the anisotropy: returns its coordinates along and across the direction
+    /// [`Anisotropy::along`].
     pub(super) fn rotated(self, [x, y]: [f64; 2]) -> [f64; 2] {
         let [c, s] = self.along;
         [c * x + s * y, c * y - s * x]
     }
 
-    /// Returns the angle to the x axis, in rad, above -90° and at most 90°; `None` if all directions are alike.
+    /// Returns the angle of the direction to the x axis, in radians, above -pi/2 and at most pi/2; `None` if the field
+    /// is isotropic.
     pub fn angle_rad(&self) -> Option<f64> {
         let [c, s] = self.along;
         let angle = if c > 0.0 || c == 0.0 && s > 0.0 { s.atan2(c) } else { (-s).atan2(-c) };
@@ -83,23 +87,25 @@ impl Anisotropy {
 }
 
 impl Field {
-    /// Creates an isotropic field that can be differentiated once.
+    /// Creates an isotropic field with the standard deviation `sigma_mm` and the range `range_mm`. Its smoothness is
+    /// [`Smoothness::Matern2`].
     pub const fn new(sigma_mm: f64, range_mm: f64) -> Self {
         Self { sigma_mm, range_mm, smoothness: Smoothness::Matern2, anisotropy: Anisotropy::NONE }
     }
 
-    /// Returns the covariance of the field at two places.
+    /// Returns the covariance of the values of the field at the places `a` and `b`, in mm^2.
     pub fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
         self.pair_covariance().covariance_mm2(a, b)
     }
 
-    /// Prepares the covariance for many pairs of places.
+    /// Prepares the field for the fast computation of the covariances of many pairs of places.
     pub(super) fn pair_covariance(&self) -> PairCovariance {
         let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.isotropic_place(axis).map(|v| v / self.range_mm));
         PairCovariance { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Correlation::new(self.smoothness) }
     }
 
-    /// Maps a place into the plane in which the field is isotropic; the map preserves areas.
+    /// Maps a place to coordinates in which the field is isotropic: shortened along the anisotropy and extended across
+    /// it, with the same area.
     fn isotropic_place(&self, at: [f64; 2]) -> [f64; 2] {
         if self.anisotropy.stretch == 1.0 {
             return at;
@@ -109,7 +115,8 @@ impl Field {
         [along / root, across * root]
     }
 
-    /// Checks that standard deviation, range and anisotropy are possible.
+    /// Checks that the standard deviation and the range are finite and above 0, that the direction of the anisotropy is
+    /// a unit vector, and that its stretch is at least 1.
     ///
     /// # Errors
     /// Returns [`ModelError::Hyperparameter`] or [`ModelError::Anisotropy`] with the wrong value.
@@ -143,12 +150,14 @@ impl PairCovariance {
         self.variance_mm2 * self.curve.at(u * u + v * v)
     }
 
-    /// Writes the covariances of one place with others into `into`.
+    /// Computes the covariance of the field at the place `at` with that at each of `places`, in mm^2, and writes it to
+    /// `into`.
     pub(super) fn column(&self, at: [f64; 2], places: &[[f64; 2]], into: &mut [f64]) {
         into.iter_mut().zip(places).for_each(|(into, place)| *into = self.covariance_mm2(at, *place));
     }
 
-    /// Returns the covariances of some places, a row each, with others, a column each.
+    /// Returns the matrix of the covariances of the field at two sets of places, in mm^2: one row for each place of
+    /// `rows`, one column for each place of `columns`.
     pub(super) fn cross_covariance(&self, rows: &[[f64; 2]], columns: &[[f64; 2]]) -> Mat<f64> {
         let mut across = Mat::zeros(rows.len(), columns.len());
         columns.iter().enumerate().for_each(|(c, at)| self.column(*at, rows, across.col_as_slice_mut(c)));

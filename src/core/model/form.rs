@@ -138,10 +138,12 @@ const FEW_LOW_FACTOR: f64 = 0.75;
 const MAX_LOCKED_SHARE: f64 = 1e-13;
 
 impl Form {
-    /// Fits the model to the deviations of a registration, over x and y of the model frame, and returns the form.
+    /// Estimates the form of a part from the deviations of a registered measurement, and its figures with their
+    /// uncertainties. The form is given at the measured points.
     ///
     /// # Errors
-    /// Too few points, or points from which the form cannot be estimated.
+    /// Returns an error if there are too few points, if the points do not determine the motions of the part, or if a
+    /// number in `inputs` is invalid.
     pub fn estimate(registration: &Registration, inputs: &ModelInputs) -> Result<Self, ModelError> {
         let seen = FittedModel::fit(registration, inputs, true)?;
         let posterior = seen.posterior(inputs);
@@ -178,11 +180,11 @@ impl Form {
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
-    /// Estimates the form at given places of the part, touched or not, and its figures over all these places.
+    /// Estimates the form at given places of the part, touched or not, and the figures over all these places.
     ///
-    /// The places are points of the nominal surface with their normals, in the model frame. Only
-    /// [`ModelInputs::probe_noise_mm`] separates form that is narrower than the spacing of the points from the noise of
-    /// the probe. The width of such form is unknown, so it has an independent value at every place.
+    /// `places` are points of the nominal surface with their normals, in the model frame. Form that is narrower than
+    /// the spacing of the touches cannot be distinguished from the noise of the probe by the touches alone: this needs
+    /// [`ModelInputs::probe_noise_mm`]. Such form gets an independent random value at every place.
     ///
     /// # Errors
     /// Those of [`Form::estimate`].
@@ -194,8 +196,8 @@ impl Form {
         Self::estimate_with(registration, inputs, places, true)
     }
 
-    /// Estimates the form as [`Form::estimate_at`] does. If `is_whole` is false, it omits slopes, ISO figures and the
-    /// budget. These take most of the computing time if few points were touched.
+    /// Estimates the form as [`Form::estimate_at`] does. If `is_whole` is false, the result has no slopes, no ISO
+    /// figures and no budget; this saves most of the computing time if few points were touched.
     pub(super) fn estimate_with(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -244,8 +246,14 @@ struct FittedModel {
 }
 
 impl FittedModel {
-    /// Builds the field hypotheses in rounds. Each round finds points that no field explains and leaves them out. If
-    /// `at_points` is true, the noise can be autocorrelated along the path of the points.
+    /// Computes the field hypotheses over the points of a registration, and finds the points that no field explains.
+    /// This is repeated without these points, up to three times.
+    ///
+    /// If `at_points` is true, the noise of successive points can be correlated (autocorrelation along the path of the
+    /// probe).
+    ///
+    /// # Errors
+    /// Those of [`Self::from_fitted_points`]; also if the prior in `inputs` is invalid.
     fn fit(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
         /// Number of rounds. Each round estimates the hyperparameters again. Once the tallest points of a defect are
         /// left out, its flanks stand out too.
@@ -276,12 +284,15 @@ impl FittedModel {
         Ok(Self { is_chance: by_chance > MIN_PROBABILITY, ..seen })
     }
 
+    /// Returns the posterior of the field over the points in the model, with the priors in `inputs`.
     fn posterior(&self, inputs: &ModelInputs) -> Posterior<'_> {
         Posterior::new(&self.fields, &self.observed, inputs.prior.as_ref(), noise_prior(inputs))
     }
 
-    /// Evaluates the samples at the places, in the frame of the registration; if `is_between` is true, also between the
-    /// places. Each sample contains the motion that fits it best to the observations.
+    /// Evaluates samples of the field at `places`, in the frame of the registration. `effects` has the motions of the
+    /// part at these places. To each sample, the motion is added that fits the sample best to the observed deviations.
+    ///
+    /// If `is_between` is true, the samples are also evaluated between the places ([`IntermediateNodes`]).
     fn evaluate_samples(
         &self,
         draws: PosteriorSamples,
@@ -302,7 +313,8 @@ impl FittedModel {
         SampledForms::evaluate(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
-    /// Returns the points whose residual from the field is too large for noise, as indices of all used points.
+    /// Finds the outliers of the field: the points whose residual from the most probable field is too large for noise.
+    /// Returns their indices among all used points; none if there are fewer than 40 points.
     fn find_unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
         /// Minimum number of points: with fewer, the usual residual is unknown.
         const MIN_POINTS: usize = 40;
@@ -324,14 +336,16 @@ impl FittedModel {
         self.indices_of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
     }
 
-    /// Converts indices of the points in the model to indices of all used points.
+    /// Converts indices among the points in the model to indices among all used points.
     fn indices_of_all(&self, chosen: &[usize]) -> Vec<usize> {
         chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
-    /// Adds the points `apart`, which no field explains, to the samples. Each has its measured deviation minus a sample
-    /// of the noise of a touch. If the places of the samples are measured points, the points are inserted in the order
-    /// of the points. Otherwise each point replaces the nearest place.
+    /// Adds the points `apart` to the sampled forms. These are indices of used points that no field explains; at them,
+    /// each sample is the measured deviation minus random noise of a touch.
+    ///
+    /// If the places of `drawn` are measured points, the points are inserted in the order of measurement. Otherwise
+    /// each point replaces the nearest place.
     fn with_unexplained_points(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.indices_of_all(&drawn.chosen);
@@ -351,8 +365,10 @@ impl FittedModel {
         if at_points { drawn.joined_with(found) } else { drawn.replaced_by(&found) }
     }
 
-    /// Returns samples of the form at points that no field explains: the measured deviation minus effects and noise of
-    /// each given sample. The result has one row for each point, one column for each sample.
+    /// Returns samples of the form at the used points with the indices `points`, which no field explains: for each
+    /// sample of `drawn`, the measured deviation minus the random effects of this sample and minus random noise.
+    ///
+    /// The result has one row for each point, one column for each sample.
     fn samples_at_points(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
         let of_probe = |mm: f64| noise_prior(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
@@ -385,8 +401,15 @@ impl FittedModel {
         found.without_ground_in(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
 
-    /// Builds the hypotheses over the points that the pose was fitted to. The other points are far from the surface,
-    /// and no field describes them.
+    /// Computes the field hypotheses over those points of a registration that its pose was fitted to. The other points
+    /// that belong to the part are far from its surface; no field describes them, and they count as unexplained.
+    ///
+    /// If `at_points` is true, the noise of successive points can be correlated (autocorrelation along the path of the
+    /// probe).
+    ///
+    /// # Errors
+    /// Returns an error if there are too few points, if the points do not determine the motions, or if a stated
+    /// uncertainty in `inputs` is invalid.
     fn from_fitted_points(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -423,17 +446,20 @@ impl FittedModel {
         })
     }
 
-    /// Computes the slopes of the samples. `drawn` must not yet contain narrow form, which has no measurable slope.
-    /// Returns `None` if the places allow no slopes.
+    /// Computes the slope figures of the sampled forms. `drawn` must not yet contain form that is too narrow to be
+    /// resolved, because such form has no measurable slope. Returns `None` if the places are too few or too far apart
+    /// for slopes.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
         Some(SlopeFigures::from_forms(&slopes, &smooth, (is_form_detected(posterior), inputs)))
     }
 
-    /// Builds the form from the samples, without slopes. `ends` are the figures of the samples for the lower and for
-    /// the upper bounds. `ground_in` has the columns of the effects that are ground into the part, at the places of the
-    /// samples. If `is_whole` is false, ISO figures and budget are omitted.
+    /// Builds the result of the model from the sampled forms, without slopes.
+    ///
+    /// `ends` has the figures of further samples: the first set extends the intervals downwards, the second upwards.
+    /// `ground_in` has one column for each effect of the machine that is ground into the part, one row for each place
+    /// of `drawn`. If `is_whole` is false, ISO figures and budget are omitted.
     fn form(
         &self,
         inputs: &ModelInputs,
@@ -489,16 +515,17 @@ impl FittedModel {
     }
 }
 
-/// Returns true if the points show a form.
+/// Returns true if the points show a form: the logarithm of the likelihood ratio of the best field and no field is
+/// above [`MIN_EVIDENCE`].
 fn is_form_detected(posterior: &Posterior) -> bool {
     posterior.evidence > MIN_EVIDENCE
 }
 
-/// Returns the inputs for the lower bounds of the form. If the estimated noise is consistent with the noise of the
-/// probe, all of it counts as noise of the probe.
+/// Returns `inputs` for the lower bounds of the figures. If the estimated noise is consistent with
+/// [`ModelInputs::probe_noise_mm`], the probe noise is set to unknown, so that no noise counts as form.
 ///
-/// A reference sphere with some twenty touches determines the noise of the probe to 15 %. The excess of the noise over
-/// that value is not necessarily form.
+/// The reason: a reference sphere with some twenty touches determines the noise of the probe to 15 %. A small excess of
+/// the estimated noise over it is not necessarily form.
 fn min_form_inputs(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
     const MAX_EXCESS_SIGMAS: f64 = 2.0;
@@ -512,12 +539,14 @@ fn min_form_inputs(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     }
 }
 
-/// Returns true if the points are too few to separate the form from the noise, and the noise of the probe is unknown.
+/// Returns true if the noise of the probe is unknown and the points have fewer than [`MIN_DEGREES_OF_FREEDOM`] degrees
+/// of freedom: too few to separate the form from the noise.
 fn is_underdetermined(posterior: &Posterior, inputs: &ModelInputs) -> bool {
     posterior.degrees_of_freedom() < MIN_DEGREES_OF_FREEDOM && noise_prior(inputs).is_none()
 }
 
-/// Returns the prior of the noise of the probe; None if it is unknown.
+/// Returns [`ModelInputs::probe_noise_mm`] as the prior of the noise; `None` if its standard deviation is 0, which
+/// means unknown.
 fn noise_prior(inputs: &ModelInputs) -> NoisePrior {
     (inputs.probe_noise_mm[0] > 0.0).then_some(inputs.probe_noise_mm)
 }
@@ -526,7 +555,8 @@ fn mean(of: &[f64]) -> f64 {
     of.iter().sum::<f64>() / of.len().max(1) as f64
 }
 
-/// Returns true if the points follow a path: the median step is at most a few spacings of the points.
+/// Returns true if the places, in their order, follow a path: the median distance between successive places is at most
+/// three times the typical spacing.
 fn is_path(places: &[[f64; 2]]) -> bool {
     const NEAR: f64 = 3.0;
     let apart_mm = |pair: &[[f64; 2]]| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
@@ -543,7 +573,8 @@ fn xy((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
-/// Returns at most [`MAX_PLACES`] of the indices 0 to `of` - 1, evenly spaced.
+/// Returns the indices 0 to `of` - 1; if these are more than [`MAX_PLACES`], only [`MAX_PLACES`] of them, evenly
+/// spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
     let most = of.min(MAX_PLACES);
     (0..most).map(move |k| k * of / most)
@@ -598,11 +629,12 @@ impl Default for ModelInputs {
     }
 }
 
-/// Returns the covariance of the motions as the registration finds them.
+/// Returns the covariance of the motions that a least-squares registration finds, including the error that the form
+/// causes.
 ///
-/// This is the covariance of least squares with correlated deviations: A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (Aitken
-/// 1935). H are the fixed effects, s is the noise, and K is the mean of the covariances of all fields. `alike` has the
-/// columns of the effects that are common to all points; their covariance is added.
+/// With the fixed effects H, it is A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (least squares with correlated errors, Aitken
+/// 1935). K is the covariance of the field, averaged over all hypotheses, and s is the noise. `alike` has one column
+/// for each effect that is common to all points, such as a machine error; the covariance due to these effects is added.
 fn best_fit_covariance(
     observed: &Observations,
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -630,7 +662,7 @@ fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatr
     eigenvectors * DMatrix::from_diagonal(&eigenvalues.map(|value| value.max(0.0).sqrt()))
 }
 
-/// Returns (H'H)^-1 of the effects H.
+/// Returns (H'H)^-1 for the matrix H of effects; the pseudo-inverse if the effects are linearly dependent.
 fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
     let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
     inverse.unwrap_or_else(|_| DMatrix::zeros(effects.ncols(), effects.ncols()))
@@ -670,8 +702,11 @@ struct IntermediateForms {
 }
 
 impl SampledForms {
-    /// Evaluates the samples at the places and adds the motions `moved`. If `is_between` is true, does the same between
-    /// the places.
+    /// Evaluates samples of the field at `places` and adds motions of the part. `effects` has one row for each place,
+    /// one column for each motion; `moved` has the size of each motion, one column for each sample, for both variance
+    /// factors.
+    ///
+    /// If `is_between` is true, does the same between the places ([`IntermediateNodes`]).
     fn evaluate(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
@@ -732,8 +767,9 @@ impl SampledForms {
         }
     }
 
-    /// Replaces the samples with the second variance factor by the samples of the posterior at every place that was not
-    /// touched. Fields with the second factor are nearly unconstrained there.
+    /// Keeps the samples with the second variance factor ([`HypothesisSet`]) only at the places near a point of
+    /// `touched`. At all other places, such samples are nearly unconstrained; there they are replaced by the samples of
+    /// the posterior.
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
@@ -746,9 +782,10 @@ impl SampledForms {
         self
     }
 
-    /// Sets the standard uncertainty of the smooth form at each place. The samples contain motions of the part if there
-    /// are random effects, or if the places are not measured points. Motions are not form, so in both cases the best
-    /// fit of each sample is removed first.
+    /// Computes the standard uncertainty of the smooth form at each place: the standard deviation over the samples.
+    ///
+    /// If there are random effects, or if the places are not measured points, the samples contain motions of the part,
+    /// which are not form. The best fit of each sample is then removed first.
     fn with_smooth_sigma(self, observed: &Observations) -> Self {
         let at_points = !self.chosen.is_empty();
         let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
@@ -758,11 +795,11 @@ impl SampledForms {
         Self { smooth_sigma_mm, ..self }
     }
 
-    /// Adds form that is too narrow to be resolved to the samples, at the measured points and between them.
+    /// Adds form that is too narrow to be resolved to the samples at the measured points and between them.
     ///
-    /// The residuals of a smooth form consist of the noise of the probe and of narrow form. The share of narrow form in
-    /// the variance gives the share of each residual that is added. The uncertainty of the added form follows from the
-    /// noise of the probe and is added as random numbers.
+    /// The residuals of the smooth form are the sum of probe noise and narrow form. Each residual is multiplied by the
+    /// share of narrow form in their variance and added to the sample. The uncertainty of this split is added as random
+    /// numbers.
     fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
@@ -815,9 +852,9 @@ impl SampledForms {
         self
     }
 
-    /// Adds form that is too narrow to be resolved to places that are not measured points, and between them. Its
-    /// variance is that of the noise beyond the noise of the probe, plus that of the waves shorter than those of the
-    /// basis.
+    /// Adds form that is too narrow to be resolved to the samples, for places that are not measured points and between
+    /// them: independent normal random numbers. Their variance is that of the noise beyond the noise of the probe, plus
+    /// that of the waves shorter than the basis functions.
     fn with_narrow_form(mut self, inputs: &ModelInputs) -> Self {
         add_narrow(&mut self.forms, (&self.noise_mm, &self.truncated_mm), inputs, 4);
         self.add_narrow_between(inputs);
@@ -830,12 +867,12 @@ impl SampledForms {
         }
     }
 
-    /// Subtracts the effects that are ground into the part from each sample: each column of `ground_in` times a
-    /// standard normal number.
+    /// Subtracts from each sample a random error of the machine that is ground into the part: the sum of the columns of
+    /// `ground_in`, each times a standard normal random number. Returns the samples unchanged if `ground_in` is `None`.
     ///
-    /// With the columns E and the standard normal numbers t, E t are the errors of the machine. A part that was
-    /// corrected by a measurement has the form f - E t. The next measurement has the same errors, so its deviations are
-    /// d = (f - E t) + E t + e, with the noise e. They do not show t, which is as uncertain as before any measurement.
+    /// The points do not show this error. Let E be the columns and t the normal numbers. A part that was corrected by a
+    /// measurement with the error `E t` has the form `f - E t`. The next measurement has the same error, so its
+    /// deviations are `(f - E t) + E t` plus noise, without t.
     fn without_ground_in(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
         let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
@@ -854,7 +891,8 @@ impl SampledForms {
         self
     }
 
-    /// Joins the rows of both sets of samples, sorted by the index of the measured point.
+    /// Adds the places of `other`, with their samples, to those of `self`. All places are sorted by the index of their
+    /// measured point.
     fn joined_with(self, other: Self) -> Self {
         let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
@@ -878,7 +916,7 @@ impl SampledForms {
         }
     }
 
-    /// Replaces, for each place of `other`, the row of the nearest place by the row of `other`.
+    /// Replaces, for each place of `other`, the samples at the nearest place of `self` by those of `other`.
     fn replaced_by(mut self, other: &Self) -> Self {
         let square = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
         for (r, place) in other.places.iter().enumerate() {
@@ -895,7 +933,8 @@ impl SampledForms {
         self
     }
 
-    /// Subtracts from each sample its own best fit to the places.
+    /// Subtracts from each sample its own least-squares best fit: the motion of the part that explains most of the
+    /// sample at the places.
     fn after_best_fit(mut self) -> Self {
         if self.effects.ncols() == 0 {
             return self;
@@ -932,21 +971,23 @@ impl SampledForms {
         self.places.iter().enumerate().map(of).collect()
     }
 
-    /// Returns the root mean square, over all places, of the standard uncertainty of the smooth form, in mm.
+    /// Returns the root mean square over all places of [`SampledForms::smooth_sigma_mm`], in mm.
     fn rms_smooth_sigma_mm(&self) -> f64 {
         let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
-    /// Returns RMS, PV and PV 99.8 % of each sample over the places alone: RMS of the samples of the posterior, PV and
-    /// PV 99.8 % of the samples with the second variance factor.
+    /// Returns RMS, PV and PV 99.8 % of each sample over the places alone, in mm. RMS is that of the samples of the
+    /// posterior; PV and PV 99.8 % are those of the samples with the second variance factor ([`HypothesisSet`]).
     fn figures_at_places(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// Returns the figures with their intervals. `least` and `most` are figures of samples that extend the intervals
-    /// downwards and upwards. If `is_seen` is false, no form is detectable, and only upper bounds are given.
+    /// Returns RMS, PV and PV 99.8 % with their credible intervals. `least` and `most` have these three figures for
+    /// each of further samples; they extend the intervals downwards and upwards.
+    ///
+    /// If `is_seen` is false, no form was detected, and the lower ends of the intervals are 0.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
@@ -961,7 +1002,9 @@ impl SampledForms {
         FormFigures { rms: interval(0), pv: interval(1), pv_998: interval(2) }
     }
 
-    /// Returns for each sample: RMS and PV over the places, and PV 99.8 % over the places and the nodes `between` them.
+    /// Computes three figures of each sample, in mm: RMS and PV over the places, and PV 99.8 % over the places and the
+    /// nodes between them. `forms` and `between` have the samples at the places and at these nodes, one column for each
+    /// sample.
     fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
         let rows = forms.nrows();
         let mut is_touched = vec![true; rows];
@@ -990,8 +1033,9 @@ fn min_and_max(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// Adds narrow form (too narrow to be resolved) to every place of each sample, as independent normal numbers. `stream`
-/// is the seed of these numbers.
+/// Adds form that is too narrow to be resolved to every place of each sample, as independent normal random numbers.
+/// `scatter_mm` and `narrow_mm` are, for each sample, the standard deviations of the noise and of the waves shorter
+/// than the basis functions. `stream` is the seed of the random numbers.
 fn add_narrow(
     forms: &mut [DMatrix<f64>; 2],
     (scatter_mm, narrow_mm): (&[f64], &[Vec<f64>; 2]),
@@ -1011,23 +1055,26 @@ fn add_narrow(
     }
 }
 
-/// Returns a sample of the noise of the probe, and the standard deviation of the form that is too narrow to be
-/// resolved. `scatter_mm` is the total noise, `narrow_mm` the standard deviation of short waves. If the noise of the
-/// probe is unknown, all noise counts as noise of the probe.
+/// Splits the noise of a sample into probe noise and form that is too narrow to be resolved. Returns both standard
+/// deviations in mm; the second includes `narrow_mm`.
+///
+/// `scatter_mm` is the standard deviation of the noise, `narrow_mm` that of the waves shorter than the basis functions.
+/// The probe noise is drawn at random from [`ModelInputs::probe_noise_mm`], at most `scatter_mm`. If it is unknown, it
+/// is all of `scatter_mm`.
 fn split_noise(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut NormalGenerator) -> [f64; 2] {
     let Some([probe_mm, probe_u]) = noise_prior(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
     [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
 
-/// Subtracts from each form its own best fit.
+/// Subtracts from each column of `forms` its least-squares best fit by the columns of `effects`.
 fn without_best_fit(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
     let base = orthonormal_base(effects.clone());
     forms -= &base * base.tr_mul(&forms);
     forms
 }
 
-/// Returns the standard deviation of each row.
+/// Returns the standard deviation of each row of `forms`: that of the samples at one place, in mm.
 fn row_sigmas_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
@@ -1037,15 +1084,18 @@ impl Interval {
     pub const PROBABILITIES: [f64; 15] =
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
 
-    /// Returns the standard uncertainty: the width of the 95 % interval over that of a standard normal variable.
+    /// Returns the standard uncertainty in mm: the width of the 95 % interval divided by 3.92, which is its width in
+    /// standard deviations for a normal distribution.
     pub fn standard_uncertainty_mm(&self) -> f64 {
         const WIDTH: f64 = 2.0 * 1.96;
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Builds the interval of a figure from equally probable values. Below the median, each quantile is the smaller of
-    /// the quantiles of `values` and of `lower`. Above the median, it is the largest of the quantiles of `values` and
-    /// of each set in `higher`. If `has_low` is false, the quantiles below the median are 0.
+    /// Builds the credible interval of a figure from its equally probable `values`.
+    ///
+    /// Below the median, a quantile is the smaller of the quantiles of `values` and of `lower`, if this is not empty.
+    /// Above the median, it is the largest of the quantiles of `values` and of each set in `higher`. If `has_low` is
+    /// false, the quantiles below the median are 0.
     pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1055,7 +1105,7 @@ impl Interval {
         Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
     }
 
-    /// Builds the interval as [`Interval::from_samples`] does, and multiplies the quantiles below the median by
+    /// Builds the interval as [`Interval::from_samples`] does, with the quantiles below the median multiplied by
     /// `low_factor`.
     fn with_low_factor(
         mut values: Vec<f64>,
@@ -1104,6 +1154,8 @@ pub(super) struct FreeMotions {
 }
 
 impl FreeMotions {
+    /// Finds the motions that the registration was free to make: the directions in which the covariance of its pose is
+    /// not 0. `points` are the points used in the model.
     pub(super) fn from_registration(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
         let n = points.clone().count() as f64;
         let centre = Point::from(points.clone().fold(Vector::zeros(), |sum, p| sum + p.coords) / n);
@@ -1117,7 +1169,8 @@ impl FreeMotions {
         Self { centre, size_mm, free }
     }
 
-    /// Returns the observations of the used points, with the motions as fixed effects.
+    /// Returns the observations at the given points: places and deviations, with the free motions as fixed effects and
+    /// without random effects.
     pub(super) fn observed(&self, used: &[&Deviation]) -> Observations {
         let places = used.iter().map(|d| [d.point.x, d.point.y]).collect();
         let deviations_mm = used.iter().map(|d| d.deviation_mm).collect();
@@ -1125,10 +1178,12 @@ impl FreeMotions {
         Observations { fixed_effects, ..Observations::without_effects(places, deviations_mm) }
     }
 
-    /// Returns the effects of machine and datum on all points together, about their centroid.
+    /// Returns the random effects of the machine, its probe, the temperature and the fixture, which are common to all
+    /// points. Rotations of the fixture are about the centroid of the points.
     ///
     /// # Errors
-    /// [`ModelError::StatedUncertainty`] if a stated uncertainty is not valid.
+    /// Returns [`ModelError::StatedUncertainty`] if a stated standard uncertainty is negative, not a number or too
+    /// large.
     pub(super) fn machine_effects(
         &self,
         registration: &Registration,
@@ -1143,7 +1198,8 @@ impl FreeMotions {
         Ok(MachineEffects::new(inputs.machine, of_others, datum, self.centre, model_from_machine))
     }
 
-    /// Returns the change of the distance of each point from the surface for a unit of each motion.
+    /// Returns the Jacobian of the deviations: one row for each point with its normal, one column for each free motion.
+    /// An element is the change of the distance of the point from the surface, in mm, for a unit of the motion.
     pub(super) fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let rows: Vec<[f64; 6]> = points
             .map(|(point, normal)| {
@@ -1154,7 +1210,8 @@ impl FreeMotions {
         DMatrix::from_fn(rows.len(), 6, |r, c| rows[r][c]) * &self.free
     }
 
-    /// Converts the covariance of the free motions to that of the twist about the origin.
+    /// Converts the covariance of the free motions about the centroid to the covariance of a
+    /// [`Twist`](crate::geometry::Twist) about the origin.
     fn to_twist(&self, covariance: &DMatrix<f64>) -> Matrix6<f64> {
         let whole = &self.free * covariance * self.free.transpose();
         let whole = Matrix6::from_fn(|r, c| whole[(r, c)]);
@@ -1164,8 +1221,8 @@ impl FreeMotions {
     }
 }
 
-/// Returns the matrix that converts a twist about the origin to the shift of the point `centre` and the rotation about
-/// it. The rotation is in mm at the distance `size_mm`.
+/// Returns the matrix that converts a twist about the origin to a motion about the point `centre`: the shift of
+/// `centre`, and the rotation about it times `size_mm`, which makes it a length in mm.
 fn motion_about(centre: Point, size_mm: f64) -> Matrix6<f64> {
     let mut about = Matrix6::identity();
     // v + omega x c

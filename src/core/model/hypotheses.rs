@@ -128,17 +128,20 @@ pub(super) struct FieldHypothesis {
     pub(super) prior: Vec<f64>,
 }
 
-/// Returns all variance ratios, in ascending order.
+/// Returns the variance ratios of field to noise for which every node is evaluated: [`VARIANCE_RATIOS`] values in equal
+/// steps of their logarithm, in ascending order.
 pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
     let [least, most] = VARIANCE_RATIO_LIMITS.map(f64::ln);
     (0..VARIANCE_RATIOS).map(move |k| (least + (most - least) * k as f64 / (VARIANCE_RATIOS - 1) as f64).exp())
 }
 
 impl FieldHypotheses {
-    /// Solves the eigenproblem of every node over the points.
+    /// Prepares all field hypotheses for the observed points: solves one eigenproblem for each node, a smoothness with
+    /// a range. `kind` is the anisotropy of the field and the autocorrelation of the noise. Deviations are not used.
     ///
     /// # Errors
-    /// Inconsistent shapes, numbers that are not finite, too few points, or linearly dependent fixed effects.
+    /// Returns an error if the numbers of rows differ, if a number is not finite, if there are not more points than
+    /// fixed effects, or if the fixed effects are linearly dependent.
     pub(super) fn over(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
         let mut fields = Self::without_nodes(observed, kind)?;
         // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
@@ -153,8 +156,9 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// Returns the ranges in equal steps of their logarithm, from the shortest that the points and the basis resolve to
-    /// more than the size of the part.
+    /// Returns the ranges of the nodes, in mm: [`RANGES`] values in equal steps of their logarithm. The shortest is the
+    /// one that the spacing of the points and the basis resolve; the longest is [`MAX_RANGE_SIZES`] sizes of the part,
+    /// but at least 1.5 times the shortest.
     fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
         let least_mm = (MIN_RANGE_SPACINGS * spacing_mm(&self.places))
             .max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
@@ -163,6 +167,8 @@ impl FieldHypotheses {
         (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
     }
 
+    /// Prepares what all nodes have in common: the basis functions at the points, whitened and without the fixed
+    /// effects. The errors are those of [`Self::over`].
     fn without_nodes(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
         observed.check()?;
         let places = observed.places.clone();
@@ -195,8 +201,9 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// Computes the basis functions phi at the points, whitened and without the part that the best fit removes (R W
-    /// phi): one row for each point. Also returns the removed part Q'W phi.
+    /// Computes the basis functions at the points, with one coordinate for each point. They are whitened, and the part
+    /// that a best fit of the fixed effects removes is subtracted. Also returns this removed part, as Q'W phi in the
+    /// notation of the module.
     fn individual_points(&self) -> (Reduced, Mat<f64>) {
         let mut rows = self.rows_of(0..self.places.len());
         let (n, p) = self.base.shape();
@@ -206,8 +213,11 @@ impl FieldHypotheses {
         (Reduced { rows, pivots: None }, taken)
     }
 
-    /// Computes the products of the whitened basis functions over all points, without the part that the best fit
-    /// removes, and factorizes them until the remaining variance is negligible. Also returns the removed part Q'W phi.
+    /// Computes the basis functions at the points, reduced to few coordinates. For this, the products of all pairs of
+    /// whitened basis functions, summed over the points, are factorized (pivoted Cholesky) until the remaining variance
+    /// is negligible. The part that a best fit of the fixed effects removes is subtracted first.
+    ///
+    /// Also returns this removed part, as Q'W phi in the notation of the module.
     fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
         let (p, count) = (self.base.ncols(), self.basis.len());
         let of = |points: Range<usize>| {
@@ -222,8 +232,8 @@ impl FieldHypotheses {
         (pivoted_cholesky(&products), taken)
     }
 
-    /// Sums the matrices that `of` returns for each block of points, in parallel. `shapes` are the shapes of these
-    /// matrices.
+    /// Calls `of` with the indices of each block of points, in parallel, and adds up the matrices that it returns.
+    /// `shapes` are the numbers of rows and columns of these matrices.
     ///
     /// The blocks are added in their order, so that the sum has the same bits on any number of threads.
     fn sum_over_blocks<const N: usize>(
@@ -241,8 +251,8 @@ impl FieldHypotheses {
         sums
     }
 
-    /// Computes the whitened basis functions W phi at the points with the given indices: one row for each point, one
-    /// column for each basis function.
+    /// Evaluates the whitened basis functions at the points with the indices `points`. Returns one row for each point,
+    /// one column for each basis function. Whitening makes the noise of successive points independent.
     fn rows_of(&self, points: Range<usize>) -> Mat<f64> {
         let first = points.start;
         let before = first.saturating_sub(1);
@@ -259,8 +269,11 @@ impl FieldHypotheses {
         rows
     }
 
-    /// Whitens columns that have one row for each point, and removes the best fit from them (R W times the columns).
-    /// Returns the result in the coordinates of [`Reduced`], and the products of all pairs of the resulting columns.
+    /// Converts columns of point values, such as deviations, to the coordinates of [`Reduced`]. The columns are first
+    /// whitened, and their best fit by the fixed effects is subtracted.
+    ///
+    /// Returns the coordinates, one column for each given column, and the products of all pairs of the columns after
+    /// this subtraction.
     pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
         let mut columns = whitened(&self.whitening, columns);
         let taken = &self.base * self.base.tr_mul(&columns);
@@ -281,7 +294,8 @@ impl FieldHypotheses {
         (coordinates, products)
     }
 
-    /// Solves the eigenproblem of a node. Returns None if the best fit leaves no variance of the field.
+    /// Solves the eigenproblem of one node: a field with the given smoothness and range. Returns `None` if nothing of
+    /// such a field remains at the points after the best fit, or if the eigenproblem has no solution.
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
         let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
         let least = MIN_SIGMA_SHARE * strengths.iter().copied().fold(0.0, f64::max);
@@ -329,8 +343,9 @@ impl FieldHypotheses {
         })
     }
 
-    /// Converts coordinates to coefficients of the basis functions for a node: D C' times the coordinates, with C the
-    /// rows of [`Reduced`] and D the standard deviations of the node.
+    /// Multiplies coordinates of the points by D C'. C has the basis functions in these coordinates
+    /// ([`Reduced::rows`]), and D the standard deviations of the coefficients in `node`. Returns one row for each basis
+    /// function, one column for each column of `coordinates`.
     pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
@@ -344,8 +359,9 @@ impl FieldHypotheses {
         coefficients
     }
 
-    /// Converts coefficients of the basis functions to coordinates for a node: C D times the coefficients, with C the
-    /// rows of [`Reduced`] and D the standard deviations of the node.
+    /// Multiplies coefficients, in units of their standard deviations D in `node`, by C D. C has the basis functions in
+    /// the coordinates of the points ([`Reduced::rows`]). Returns the coordinates, one column for each column of
+    /// `coefficients`.
     pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
@@ -357,13 +373,15 @@ impl FieldHypotheses {
         self.base.ncols()
     }
 
-    /// Projects columns that have one row for each point onto the fixed effects: returns Q'W times the columns.
+    /// Projects columns of point values onto the space of the fixed effects. Returns Q'W times the columns: W whitens
+    /// them, and Q is an orthonormal base of the whitened fixed effects.
     pub(super) fn project_onto_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
-    /// Returns the rows C D, which convert the coefficients of a node to coordinates, followed by the rows Q'W phi D,
-    /// which are the part that the best fit removes.
+    /// Returns the matrix that gives the observed coordinates for coefficients in units of their standard deviations D
+    /// in `node`. The first rows are C D, the coordinates of [`Reduced`]. One row for each fixed effect follows: Q'W
+    /// phi D, the part of the basis functions that the best fit removes.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.removed_by_fit.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
@@ -372,8 +390,8 @@ impl FieldHypotheses {
         })
     }
 
-    /// Sums each basis function over the points with the given weights: one row for each column of weights, one column
-    /// for each basis function.
+    /// Returns the weighted sums of the basis functions over the points: one row for each column of `weights`, one
+    /// column for each basis function. `weights` has one row for each point.
     pub(super) fn sums(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
         let of = |points: Range<usize>| {
             let weights = Mat::from_fn(weights.ncols(), points.len(), |r, c| weights[(points.start + c, r)]);
@@ -383,7 +401,8 @@ impl FieldHypotheses {
         DMatrix::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)])
     }
 
-    /// Evaluates the field with these coefficients at the points.
+    /// Evaluates the field with the given coefficients of the basis functions at every point. Returns one value in mm
+    /// for each point.
     pub(super) fn evaluate_at_points(&self, coefficients: &[f64]) -> Vec<f64> {
         let column = Mat::from_fn(coefficients.len(), 1, |r, _| coefficients[r]);
         let of = |places: &[[f64; 2]]| (self.basis.at(places) * &column).col_as_slice(0).to_vec();
@@ -391,11 +410,13 @@ impl FieldHypotheses {
     }
 }
 
-/// Returns the logarithm of the prior J / (1 + J) of every variance ratio.
+/// Returns the logarithm of the prior probability of each variance ratio tau for one node, up to a constant. The prior
+/// is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior).
 ///
-/// J^2 is the Fisher information on ln tau with the noise unknown: (sum q^2 - (sum q)^2 / (n - p)) / 2 with q = l tau /
-/// (1 + l tau). A field that cannot be distinguished from noise has no information. The prior saturates once the points
-/// determine about one coefficient. `free` is n - p.
+/// `values` are the eigenvalues of the node, `narrow` is the variance of waves shorter than the basis functions,
+/// `scale` the factor of [`FieldHypothesis::scale`], and `free` the degrees of freedom n - p. With l = scale
+/// (eigenvalue + narrow) and q = l tau / (1 + l tau), J^2 is (sum q^2 - (sum q)^2 / (n - p)) / 2. A field that cannot
+/// be distinguished from noise has J = 0.
 fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);
@@ -413,7 +434,7 @@ fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     variance_ratios().map(of).collect()
 }
 
-/// Adds the lower triangle of the product of the transposed `rows` and `rows` to `products`.
+/// Adds rows' rows, the product of the transpose of `rows` and `rows`, to the lower triangle of `products`.
 fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     triangular::matmul(
         products.as_mut(),
@@ -428,8 +449,8 @@ fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     );
 }
 
-/// Returns the pivoted Cholesky factor of a matrix that is given by its lower triangle, up to the last pivot above
-/// [`MIN_PIVOT_SHARE`] of the largest.
+/// Computes the pivoted Cholesky factor of a symmetric matrix. Only the lower triangle of `products` is used. The
+/// factor ends before the first pivot of at most [`MIN_PIVOT_SHARE`] of the largest diagonal element.
 fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let count = products.nrows();
     let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
@@ -460,8 +481,11 @@ fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     Reduced { rows: Mat::from_fn(rows.len(), count, |r, c| rows[r][c]), pivots: Some(pivots) }
 }
 
-/// Returns the whitening: for each point the factor of its own row, and the factor of the row before, which is
-/// subtracted. The whitened noise is independent and has the same variance. `drift` is the noise autocorrelation.
+/// Returns the coefficients that make autocorrelated noise independent, with the same variance: for each point the
+/// factor of its own row, and the factor of the row before, which is subtracted.
+///
+/// `path` is the position of each point in steps of the path; empty if there is none. `points` is the number of points,
+/// `drift` the noise autocorrelation over one step.
 fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     if drift == 0.0 || path.is_empty() {
         return vec![[1.0, 0.0]; points];
@@ -474,6 +498,7 @@ fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     (0..points).map(of).collect()
 }
 
+/// Applies the coefficients of [`whitening`] to columns with one row for each point.
 fn whitened(whitening: &[[f64; 2]], columns: &DMatrix<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(columns.nrows(), columns.ncols(), |r, c| {
         let [own, last] = whitening[r];

@@ -57,8 +57,11 @@ struct PlaceBlock {
     across: Vec<Vec<f64>>,
 }
 
-/// Joins places with their effects: the fixed effects, followed by the random effects. All effects have the same prior
-/// variance, so the random effects are scaled down to a variance of 1.
+/// Joins each place with its row of effects: the fixed effects, then the random effects. The random effects are divided
+/// by the prior standard deviation of the fixed effects, so that both have the same prior variance afterwards.
+///
+/// # Errors
+/// Returns [`ModelError::Shape`] if the numbers of rows differ, or [`ModelError::NotFinite`] if a number is not finite.
 fn joined(
     places: &[[f64; 2]],
     fixed_effects: &DMatrix<f64>,
@@ -84,13 +87,14 @@ fn joined(
 }
 
 impl IncrementalPosterior {
-    /// Creates the prior at `places`, before any point is observed.
+    /// Creates a model that predicts the deviation at `places`, before any point is observed.
     ///
-    /// The effects have a row per place: the deviation there per unit of each fixed effect, and per standard
-    /// uncertainty of each random effect.
+    /// Both matrices of effects have one row for each place. An element is the deviation at the place, in mm, for one
+    /// unit of a fixed effect or for one standard uncertainty of a random effect.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows differ, a number is not finite, or a hyperparameter is not above 0.
+    /// Returns an error if the numbers of rows differ, if a number is not finite, or if a hyperparameter is out of
+    /// range.
     pub fn at_places(
         places: &[[f64; 2]],
         fixed_effects: &DMatrix<f64>,
@@ -118,11 +122,12 @@ impl IncrementalPosterior {
         Ok(growing)
     }
 
-    /// Conditions the model on further points.
+    /// Adds observed points to the model and updates the predictions at all places.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows or columns differ or a number is not finite. No point is added in these
-    /// cases.
+    /// Returns an error and adds no point if the numbers of rows or columns differ or a number is not finite. Returns
+    /// [`ModelError::NotDefinite`] if the covariance of the points is not positive definite; only some of the points
+    /// are then added.
     pub fn update(&mut self, observed: &Observations) -> Result<(), ModelError> {
         let places = self.places_of(observed)?;
         let known = self.observed_places.len();
@@ -133,12 +138,13 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Conditions the model on a future touch at the place with index `place`. The touch gets the expected deviation:
-    /// this leaves the mean unchanged, and the variance does not depend on the value that the touch will find
-    /// (hallucinated updates, Desautels, Krause and Burdick 2014).
+    /// Adds an imagined touch at the place with the index `place`, with exactly the predicted deviation. The means of
+    /// the predictions do not change. The standard deviations become those after a real touch, because they do not
+    /// depend on the value found (hallucinated updates, Desautels, Krause and Burdick 2014). Panics if there is no such
+    /// place.
     ///
     /// # Errors
-    /// Returns [`ModelError::NotDefinite`] if the new diagonal element of the factor is not finite and above 0.
+    /// Returns [`ModelError::NotDefinite`] if the covariance of the points is no longer positive definite.
     pub fn update_with_expected(&mut self, place: usize) -> Result<(), ModelError> {
         let known = self.observed_places.len();
         self.append_point(self.blocks[place / BLOCK].places[place % BLOCK].clone(), None)?;
@@ -146,19 +152,19 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Returns the prediction at each place, in the given order: mean and standard deviation of field and effects
-    /// together.
+    /// Returns the prediction at each place, in the order of [`Self::at_places`]: mean and standard deviation of the
+    /// sum of field and effects, without the noise of a touch.
     pub fn predictions(&self) -> impl Iterator<Item = Prediction> + '_ {
         let of =
             |(mean_mm, variance): (&f64, &f64)| Prediction { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
         self.blocks.iter().flat_map(move |block| block.mean_mm.iter().zip(&block.variance_mm2).map(of))
     }
 
-    /// Computes the standardized innovation of each point: its deviation minus the predicted mean, divided by the
-    /// predicted standard deviation, which includes the noise of the probe.
+    /// Returns the standardized innovation of each observed point: its deviation minus the predicted mean, divided by
+    /// the predicted standard deviation, which includes the noise of the probe. The points are not added to the model.
     ///
     /// # Errors
-    /// Those of [`Self::update`].
+    /// Returns an error if the numbers of rows or columns differ, or if a number is not finite.
     pub fn standardized_innovations(&self, observed: &Observations) -> Result<Vec<f64>, ModelError> {
         let places = self.places_of(observed)?;
         let of = |(place, deviation_mm): (&Place, &f64)| {
@@ -180,15 +186,17 @@ impl IncrementalPosterior {
         joined(places, fixed_effects, random_effects, &self.hyperparameters)
     }
 
-    /// Returns the prior covariance of two places: that of the field and that of the effects.
+    /// Returns the prior covariance of the deviations at two places, in mm^2: that of the field plus that of the
+    /// effects, without noise.
     fn covariance_mm2(&self, a: &Place, b: &Place) -> f64 {
         let effects: f64 = a.effects.iter().zip(&b.effects).map(|(a, b)| a * b).sum();
         self.pairs.covariance_mm2(a.at, b.at)
             + (FIXED_EFFECT_SIGMAS * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
-    /// Returns L^-1 times the covariances of a place with all observed points, and mean and standard deviation of the
-    /// deviation that a touch there will find.
+    /// Predicts the deviation that a touch at `place` will find. Returns three values: the new row L^-1 k of the
+    /// Cholesky factor L, with the covariances k of the place with all observed points; the mean in mm; and the
+    /// standard deviation in mm, which includes the noise.
     fn predicted(&self, place: &Place) -> (Vec<f64>, f64, f64) {
         let mut l: Vec<f64> = Vec::with_capacity(self.observed_places.len() + 1);
         for (told, lower) in self.observed_places.iter().zip(&self.lower) {
@@ -202,7 +210,12 @@ impl IncrementalPosterior {
         (l, mean_mm, left_mm2.max(noise_mm2).sqrt())
     }
 
-    /// Adds the row of one point to the factor L. If `deviation_mm` is `None`, the point gets the predicted deviation.
+    /// Adds one point to the Cholesky factor, without an update of the predictions. If `deviation_mm` is `None`, the
+    /// point gets the predicted deviation.
+    ///
+    /// # Errors
+    /// Returns [`ModelError::NotDefinite`] if the predicted standard deviation of the point is not a finite number
+    /// above 0.
     fn append_point(&mut self, place: Place, deviation_mm: Option<f64>) -> Result<(), ModelError> {
         let (mut l, mean_mm, d) = self.predicted(&place);
         if !(d.is_finite() && d > 0.0) {
@@ -215,7 +228,7 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Updates mean and variance at all places with the points from index `from` on.
+    /// Updates the mean and the variance at all places with the added points from the index `from` on.
     fn update_places(&mut self, from: usize) {
         let mut blocks = std::mem::take(&mut self.blocks);
         blocks.par_iter_mut().for_each(|block| {

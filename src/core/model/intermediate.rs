@@ -29,8 +29,8 @@ pub(super) struct IntermediateNodes {
 }
 
 impl IntermediateNodes {
-    /// Creates a grid along the axes u and v of the basis `waves`, with the nodes that touched places surround. Returns
-    /// `None` if there is no such node.
+    /// Creates nodes between the touched `places`, on a grid along the axes u and v of the basis `waves`. Only nodes
+    /// that touched places surround are kept. Returns `None` if there is no such node, or if the places lie on a line.
     pub(super) fn new(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
         let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.anisotropy.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
@@ -59,12 +59,12 @@ impl IntermediateNodes {
         Some(Self { grid, nodes, corners, terms })
     }
 
-    /// Interpolates columns with a row per touched place to the nodes: by a fit of polynomials, and by weighted means
-    /// of the residuals of this fit at the nearby touched places.
+    /// Interpolates values from the touched places to the nodes. `columns` has one row for each touched place; the
+    /// result has one row for each node.
     ///
-    /// The polynomials are needed for the motions of a curved part. A best fit removes the motions from samples that
-    /// can be thousands of times larger than the remaining form. The errors of a linear interpolation alone would be
-    /// too large.
+    /// Polynomials are fitted first. The residuals of this fit are interpolated by weighted means of the nearby places.
+    /// Polynomials are needed because the columns can contain motions of a curved part that are thousands of times
+    /// larger than the form. For these, the error of linear interpolation alone would be too large.
     pub(super) fn interpolate(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();
@@ -79,8 +79,10 @@ impl IntermediateNodes {
     }
 }
 
-/// Returns the indices of the three nearest touched places and their weights; `None` if the touched places within
-/// `near_mm` do not surround the place `at`.
+/// Returns the indices of the three touched places nearest to `at`, and their weights for an interpolation: the inverse
+/// squared distances, with the sum 1. If `at` is itself a touched place, this place has the weight 1.
+///
+/// `tree` is the search tree of `places`. Returns `None` if the touched places within `near_mm` do not surround `at`.
 fn surrounding_places(
     at: [f64; 2],
     places: &[[f64; 2]],
@@ -109,7 +111,8 @@ fn surrounding_places(
     Some(([0, 1, 2].map(|k| near[k].0), [0, 1, 2].map(|k| near[k].1.recip() / whole)))
 }
 
-/// Evaluates products of Chebyshev polynomials up to a total degree over a rectangle: a row per place.
+/// Evaluates the products of Chebyshev polynomials of x and y, up to the total degree `degree`, at `places`. The
+/// rectangle from `low` to `high` is their domain. Returns one row for each place, one column for each product.
 fn polynomials(places: &[[f64; 2]], [low, high]: [[f64; 2]; 2], degree: usize) -> DMatrix<f64> {
     let orders: Vec<[usize; 2]> = (0..=degree).flat_map(|a| (0..=degree - a).map(move |b| [a, b])).collect();
     let along = |place: &[f64; 2], axis: usize| {

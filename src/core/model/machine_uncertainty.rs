@@ -76,10 +76,12 @@ pub(super) struct MachineEffects {
 }
 
 impl MachineEffects {
-    /// Creates the effects of machine and fixture. `radius_mm` is the standard uncertainty of the probe's radius from
-    /// its qualification, `temperature` the relative standard uncertainty of all lengths. `datum` has the standard
-    /// uncertainties of the shifts along the axes of the model, in mm, and of the rotations about these axes through
-    /// the centre, in rad.
+    /// Creates the random effects of a measuring machine, its probe, the temperature and the fixture.
+    ///
+    /// `radius_mm` is the standard uncertainty of the radius of the probe from its qualification, and `temperature` the
+    /// relative standard uncertainty of all lengths. `datum` has the standard uncertainties of the position of the part
+    /// in its fixture: three shifts along the axes of the model in mm, and three rotations about these axes through
+    /// `centre` in rad. `model_from_machine` rotates directions from the machine frame to the model frame.
     pub(super) fn new(
         machine: MachineUncertainty,
         [radius_mm, temperature]: [f64; 2],
@@ -96,8 +98,9 @@ impl MachineEffects {
         self.all().into_iter().map(|(source, ..)| source).collect()
     }
 
-    /// Returns the change of each point's deviation from the surface per standard uncertainty of each effect: a row per
-    /// point, a column per effect. Points and normals are in the model frame.
+    /// Returns the sensitivity matrix of the deviations: one row for each point with its normal, one column for each
+    /// effect. An element is the change of the deviation in mm for one standard uncertainty of the effect. Points and
+    /// normals are in the model frame.
     pub(super) fn columns(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let all = self.all();
         let to_machine = self.model_from_machine.transpose();
@@ -106,7 +109,7 @@ impl MachineEffects {
         DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].2 * all[c].1.of_unit(placed[r].0, placed[r].1))
     }
 
-    /// Returns the effects whose standard uncertainty is above 0, each with its source and this uncertainty.
+    /// Returns every effect with a standard uncertainty above 0: its source, the effect, and the standard uncertainty.
     fn all(&self) -> Vec<(UncertaintySource, Effect, f64)> {
         let MachineUncertainty { scale, squareness_rad, probe_mm, .. } = self.machine;
         let radius = (UncertaintySource::Radius, Effect::Radius, self.radius_mm);
@@ -143,8 +146,8 @@ enum Effect {
 }
 
 impl Effect {
-    /// Returns the deviation per unit at a point, in mm. `arm` is its position from the centre, `n` its normal; both
-    /// are in the machine frame.
+    /// Returns the deviation at a point that one unit of the effect causes. `arm` is the vector from the centre to the
+    /// point in mm, `n` the normal at the point; both are in the machine frame.
     fn of_unit(&self, arm: Vector, n: Vector) -> f64 {
         let root = 3.0_f64.sqrt();
         match *self {
@@ -162,8 +165,10 @@ impl Effect {
     }
 }
 
-/// Returns name and value of the first standard uncertainty that is impossible: negative, not a number, or beyond the
-/// limit of any real machine or fixture.
+/// Returns the name and the value of the first standard uncertainty that is negative, not a number, or larger than a
+/// real machine or fixture can have; `None` if all are valid.
+///
+/// `radius_mm`, `temperature` and `datum` are those of [`MachineEffects::new`].
 pub(super) fn invalid_uncertainty(
     machine: &MachineUncertainty,
     [radius_mm, temperature]: [f64; 2],

@@ -38,7 +38,7 @@ impl Correlation {
         }
     }
 
-    /// Returns the correlation at a distance r; `ranges2` is (r / range)^2.
+    /// Returns the correlation of the field at two places with the distance r, from 0 to 1. `ranges2` is (r / range)^2.
     #[inline]
     pub(super) fn at(&self, ranges2: f64) -> f64 {
         let Some(table) = self.table else {
@@ -58,7 +58,8 @@ fn read(table: &'static Table) -> &'static [[f64; 2]] {
     table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(k as f64 / STEPS as f64)).collect())
 }
 
-/// Computes the correlation for nu = 2 and its slope, M' = -x^2 K_1(x) / 2.
+/// Returns the Matern correlation M(x) for nu = 2, and its derivative M'(x) = -x^2 K_1(x) / 2. x is the distance times
+/// sqrt(8 nu) / range, and K_1 a modified Bessel function of the second kind.
 fn exact(x: f64) -> [f64; 2] {
     if x == 0.0 {
         return [1.0, 0.0];
@@ -66,8 +67,8 @@ fn exact(x: f64) -> [f64; 2] {
     [0.5 * x * x * bessel(2.0, x), -0.5 * x * x * bessel(1.0, x)]
 }
 
-/// Computes K_nu(x) by the trapezoidal rule: the integrand is analytic and falls doubly exponentially, so the sum is
-/// exact to rounding.
+/// Computes K_nu(x), the modified Bessel function of the second kind, for x above 0. The trapezoidal rule is exact to
+/// rounding here, because the integrand is analytic and falls doubly exponentially.
 fn bessel(nu: f64, x: f64) -> f64 {
     const STEP: f64 = 0.125;
     let term = |t: f64| (-x * t.cosh()).exp() * (nu * t).cosh();

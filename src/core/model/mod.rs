@@ -93,13 +93,13 @@ pub struct Observations {
 }
 
 impl Observations {
-    /// Returns observations without fixed or random effects.
+    /// Returns observations of the given places and deviations, without fixed effects, random effects and a path.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let [effects, stated] = [0, 0].map(|columns| DMatrix::zeros(places.len(), columns));
         Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path: Vec::new() }
     }
 
-    /// Returns the observations of the chosen points.
+    /// Returns the observations at the points with the indices `chosen`, in this order.
     fn subset(&self, chosen: &[usize]) -> Self {
         Self {
             places: chosen.iter().map(|&k| self.places[k]).collect(),
@@ -110,7 +110,7 @@ impl Observations {
         }
     }
 
-    /// Returns the columns of the fixed effects, followed by those of the random effects.
+    /// Returns one matrix with all effects: the columns of the fixed effects, then those of the random effects.
     fn all_effects(&self) -> DMatrix<f64> {
         let (n, p) = self.fixed_effects.shape();
         DMatrix::from_fn(n, p + self.random_effects.ncols(), |r, c| {
@@ -118,10 +118,12 @@ impl Observations {
         })
     }
 
-    /// Checks the shapes, the number of points and that every number is finite.
+    /// Checks the observations before a fit.
     ///
     /// # Errors
-    /// [`ModelError::Shape`], [`ModelError::TooFewPoints`] or [`ModelError::NotFinite`].
+    /// Returns [`ModelError::Shape`] if the numbers of rows differ or a position on the path is not finite,
+    /// [`ModelError::TooFewPoints`] if there are not more points than fixed effects, and [`ModelError::NotFinite`] for
+    /// the first point with a number that is not finite.
     fn check(&self) -> Result<(), ModelError> {
         let Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path } = self;
         let (points, columns) = (places.len(), effects.ncols());
@@ -147,24 +149,27 @@ impl Observations {
     }
 }
 
-/// Returns an orthonormal base of the space that the columns span.
+/// Returns orthonormal columns that span the same space as `columns` (the matrix Q of the QR decomposition).
 fn orthonormal_base(columns: DMatrix<f64>) -> DMatrix<f64> {
     if columns.ncols() > 0 { columns.qr().q() } else { columns }
 }
 
-/// Returns the typical spacing of the points, in mm: the square root of the area of their bounding rectangle divided by
-/// their number.
+/// Returns the typical spacing of the places, in mm: the square root of the area per place, with the area of the
+/// bounding rectangle of all places.
 fn spacing_mm(places: &[[f64; 2]]) -> f64 {
     let [low, high] = bounds(places.iter().copied());
     ((high[0] - low[0]) * (high[1] - low[1]) / places.len() as f64).sqrt()
 }
 
 impl Hyperparameters {
-    /// Estimates the hyperparameters from the observations, as one value each: the geometric mean over the posterior.
+    /// Estimates the hyperparameters from the observations: the geometric means over their posterior distribution.
+    ///
+    /// `priors` is the prior of the range and of the ratio of noise to field. With `None`, a prior from the Fisher
+    /// information is used.
     ///
     /// # Errors
-    /// Inconsistent shapes, numbers that are not finite, too few points, linearly dependent fixed effects, or an
-    /// invalid prior.
+    /// Returns an error if the numbers of rows differ, if a number is not finite, if there are not more points than
+    /// fixed effects, if the fixed effects are linearly dependent, or if the prior is invalid.
     pub fn estimate(observed: &Observations, priors: Option<&Prior>) -> Result<Self, ModelError> {
         if let Some(priors) = priors {
             priors.check()?;
@@ -174,7 +179,8 @@ impl Hyperparameters {
         Ok(posterior::Posterior::new(&fields, observed, priors, None).mean_hyperparameters())
     }
 
-    /// Returns the correlation of the noise of two points that are `steps` steps of the path apart.
+    /// Returns the correlation of the noise of two points that are `steps` steps of the path apart: the noise
+    /// autocorrelation to the power of `steps`.
     fn noise_correlation(&self, steps: f64) -> f64 {
         // A correlation below exp(-36) is below the rounding error of a double, and counts as zero.
         const MAX_STEPS: f64 = 36.0;
@@ -185,10 +191,12 @@ impl Hyperparameters {
         if power < -MAX_STEPS { 0.0 } else { power.exp() }
     }
 
-    /// Checks that every hyperparameter is within its range.
+    /// Checks that the field is valid, the standard deviation of the noise is finite and above 0, and the noise
+    /// autocorrelation is at least 0 and below 1.
     ///
     /// # Errors
-    /// [`ModelError::Anisotropy`], [`ModelError::Hyperparameter`] or [`ModelError::NoiseAutocorrelation`].
+    /// Returns [`ModelError::Anisotropy`], [`ModelError::Hyperparameter`] or [`ModelError::NoiseAutocorrelation`] with
+    /// the wrong value.
     fn check(&self) -> Result<(), ModelError> {
         let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;

@@ -1,10 +1,10 @@
 //! Maximization of a function of two variables.
 
-/// Maximizes the function `height` of two variables by the simplex method (Nelder and Mead 1965). Returns the best
-/// argument and the value of the function there.
+/// Maximizes the function `height` of two variables by the simplex method (Nelder and Mead 1965). Returns the two
+/// variables at the maximum, and the value of `height` there.
 ///
-/// The corners of the first simplex are `start`, and `start` moved by each of the `steps` along its axis. The search
-/// ends when the simplex is smaller than `near`, or after 120 iterations.
+/// The corners of the first simplex are `start`, and `start` moved by `steps` along each axis. The search ends when
+/// both variables of all corners differ by less than `near`, or after 120 iterations.
 pub(super) fn maximize(
     start: [f64; 2],
     steps: [f64; 2],

@@ -44,8 +44,10 @@ const STRONGER: f64 = 2.0;
 /// of the range and of the noise ratio, except in the search of an anisotropy.
 type Maximum = ([f64; 2], f64);
 
-/// Returns the kinds of noise and field that the points support: one without noise autocorrelation, and one with it.
-/// The latter is `None` if neighbouring points give too little evidence.
+/// Selects the kinds of noise and field to compare: the first without noise autocorrelation, the second with the most
+/// likely one. Each has the most likely anisotropy of the field, or none if there is too little evidence for it.
+///
+/// The second is `None` if the points do not follow a path, or if they give too little evidence for an autocorrelation.
 pub(super) fn candidates(observed: &Observations) -> (NoiseKind, Option<NoiseKind>) {
     let blocks = CompositeLikelihood::new(observed);
     let plain = blocks.find_maximum(NoiseKind::PLAIN, None);
@@ -66,6 +68,8 @@ struct CompositeLikelihood {
 }
 
 impl CompositeLikelihood {
+    /// Selects the points of the composite likelihood: some points all over the part, and blocks of neighbouring
+    /// points.
     fn new(observed: &Observations) -> Self {
         let mut whole: Vec<Vec<usize>> = vec![(0..observed.places.len()).collect()];
         let mut done = Vec::new();
@@ -89,8 +93,11 @@ impl CompositeLikelihood {
         Self { all, distance_mm: spacing_mm(&observed.places), priors, rms_mm: (squares / n).sqrt() }
     }
 
-    /// Computes the log-likelihood of a kind of field with its most probable scale, plus the log prior density. `range`
-    /// is the logarithm of the range in mm, `ratio` the logarithm of the ratio of noise to field.
+    /// Returns the composite log-likelihood of a kind of noise and field, plus its log prior density. The strength of
+    /// the field and of the noise are scaled together to their most probable values.
+    ///
+    /// `range` is the logarithm of the range in mm, `ratio` the logarithm of the ratio of noise to field (standard
+    /// deviations). Returns minus infinity for a range that the points cannot resolve.
     fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
         if range < (MIN_RANGE_SPACINGS * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
@@ -119,6 +126,8 @@ impl CompositeLikelihood {
         known + likelihood + 0.5 * squares - 0.5 * free - free * sigma_mm.ln()
     }
 
+    /// Finds the maximum of [`Self::log_likelihood`] over range and noise ratio, from the maximum `near`, or from the
+    /// best of several start values.
     fn find_maximum(&self, kind: NoiseKind, near: Option<Maximum>) -> Maximum {
         let start = near.unwrap_or_else(|| {
             let starts =
@@ -128,8 +137,9 @@ impl CompositeLikelihood {
         maximize(start.0, [0.3, 0.6], 0.05, |place| self.log_likelihood(kind, place))
     }
 
-    /// Returns the most likely noise autocorrelation; `None` if the log-likelihood exceeds `plain`, the maximum without
-    /// autocorrelation, by too little.
+    /// Finds the most likely noise autocorrelation of an isotropic field, and the maximum of the log-likelihood with
+    /// it. `plain` is the maximum without autocorrelation. Returns `None` if the gain of the log-likelihood over it is
+    /// below [`MIN_AUTOCORRELATION_EVIDENCE`].
     fn most_likely_autocorrelation(&self, plain: Maximum) -> Option<(NoiseKind, Maximum)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
@@ -153,8 +163,9 @@ impl CompositeLikelihood {
         Some((of(best.0), best.1))
     }
 
-    /// Returns the most likely anisotropy of the field; `None` if the log-likelihood exceeds `without`, the maximum for
-    /// an isotropic field, by too little.
+    /// Finds the most likely anisotropy of the field for the noise of `kind`. `without` is the maximum of the
+    /// log-likelihood for an isotropic field. Returns `None` if the gain over it is at most
+    /// [`MIN_ANISOTROPY_EVIDENCE`].
     fn most_likely_anisotropy(&self, kind: NoiseKind, without: Maximum) -> Option<Anisotropy> {
         // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
         // logarithm of the stretch are polar coordinates of the search plane.
@@ -175,7 +186,8 @@ fn higher(a: Maximum, b: Maximum) -> Maximum {
     if b.1 > a.1 { b } else { a }
 }
 
-/// Returns at most [`SPREAD`] of the points, with both large and small distances between them.
+/// Returns at most [`SPREAD`] of the points, spread over the whole measurement, with both large and small distances
+/// between them. Random effects are left out.
 fn spread(observed: &Observations) -> Observations {
     let n = observed.places.len();
     // Steps of the golden section cover the whole sequence evenly, without a repeating pattern.
@@ -186,6 +198,7 @@ fn spread(observed: &Observations) -> Observations {
     Observations { random_effects: DMatrix::zeros(chosen.len(), 0), ..observed.subset(&chosen) }
 }
 
+/// Returns the observations of the points `block`, with a plane of its own as fixed effects and without random effects.
 fn with_plane(observed: &Observations, block: &[usize]) -> Observations {
     let some = observed.subset(block);
     let middle = [0, 1].map(|axis| some.places.iter().map(|place| place[axis]).sum::<f64>() / block.len() as f64);

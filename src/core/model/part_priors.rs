@@ -50,26 +50,29 @@ pub struct PartFit {
 }
 
 impl PartPriors {
-    /// Returns the statistics of passes with or without a correction; `None` if there is no such part.
+    /// Returns the statistics of earlier parts after passes with a correction (`is_corrected`) or without one; `None`
+    /// if there is no such part yet.
     pub fn fit(&self, is_corrected: bool) -> Option<PartFit> {
         if is_corrected { self.with_correction } else { self.without_correction }
     }
 
-    /// Adds the hyperparameters of a further part, after a pass with or without a correction.
+    /// Adds the hyperparameters of a further part to the statistics. `is_corrected` is true if the pass before its
+    /// measurement was ground with a correction.
     pub fn update(&mut self, is_corrected: bool, hyperparameters: &Hyperparameters) {
         let lesson = if is_corrected { &mut self.with_correction } else { &mut self.without_correction };
         *lesson = Some(PartFit::updated(*lesson, hyperparameters));
     }
 
-    /// Returns the pooled statistics of other machines. Each machine counts as one part, because this machine can
-    /// differ from the others as much as they differ from each other.
+    /// Pools the statistics of other machines, as a start for a machine without own parts. Each machine counts as one
+    /// part, because the new machine can differ from the others as much as they differ from each other.
     #[must_use]
     pub fn pooled(machines: &[Self]) -> Self {
         let of = |is_corrected| PartFit::pooled(machines.iter().filter_map(|of| of.fit(is_corrected)));
         Self { without_correction: of(false), with_correction: of(true) }
     }
 
-    /// Returns true if every number is possible. Use it for values that were read from a file.
+    /// Returns true if every number is in its range: medians finite and above 0, factors finite and at least 1, and
+    /// from 1 to twenty parts. Use it for values that were read from a file.
     pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
         let is_sound = |lesson: PartFit| {
@@ -80,7 +83,8 @@ impl PartPriors {
 }
 
 impl PartFit {
-    /// Returns the statistics `before` with a further part added. Without `before`, they contain this part alone.
+    /// Returns the statistics `before` with a further part added; with `None`, the statistics of this part alone. From
+    /// twenty parts on, later parts gradually replace earlier ones.
     pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
@@ -101,7 +105,8 @@ impl PartFit {
         }
     }
 
-    /// Returns the statistics over several machines, each counted as one part; `None` if there is no machine.
+    /// Pools the statistics of several machines, at most twenty, with each machine counted as one part. Returns `None`
+    /// if there is no machine.
     fn pooled(machines: impl Iterator<Item = Self>) -> Option<Self> {
         let machines: Vec<Self> = machines.take(MAX_PARTS as usize).collect();
         let n = machines.len() as f64;
@@ -119,7 +124,8 @@ impl PartFit {
         })
     }
 
-    /// Returns the prior of the next part, by the formula of the module.
+    /// Returns the prior of the field of the next part. Its medians are those of the earlier parts. Its factors cover
+    /// the differences between parts, and are wider while there are few parts. They are at least 2.
     pub fn prior(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {

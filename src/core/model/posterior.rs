@@ -28,10 +28,11 @@ const LOWER_BOUND_VARIANCE_FACTOR: f64 = 1.0 / 4.0;
 /// logarithm). Used for the pose and for the hyperparameters.
 const STRONGER: f64 = 3.0;
 
-/// Returns the hypotheses for the kind of noise that has the higher likelihood.
+/// Selects between the two kinds of noise, without and with autocorrelation, by their marginal likelihood. Returns the
+/// field hypotheses of the more likely kind.
 ///
-/// A likelihood of neighbouring points alone mistakes waves across the path for noise autocorrelation along it.
-/// Therefore both kinds are compared by all points and all fields.
+/// The likelihood of neighbouring points alone ([`candidates`]) can mistake waves across the path for autocorrelation
+/// along it. Therefore both kinds are compared by all points.
 ///
 /// # Errors
 /// Those of [`FieldHypotheses::over`].
@@ -92,7 +93,8 @@ impl HypothesisSet {
         }
     }
 
-    /// Returns the two factors by which the variance of a field of this smoothness is multiplied in the samples.
+    /// Returns the two factors that multiply the variance of a field of this smoothness in the samples: 1 for the
+    /// samples of the posterior itself, and a second factor for the samples that bound the extremes.
     fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
@@ -115,6 +117,9 @@ pub(super) struct PosteriorSamples {
 }
 
 impl<'f> Posterior<'f> {
+    /// Computes the posterior probabilities of all nodes and variance ratios from the deviations. `priors` is the prior
+    /// of range and noise ratio; with `None`, that of the nodes is used. `probe` is the prior of the noise of the
+    /// probe.
     pub(super) fn new(
         fields: &'f FieldHypotheses,
         observed: &'f Observations,
@@ -163,8 +168,8 @@ impl<'f> Posterior<'f> {
         Self { densities, evidence: best - none, ..posterior }
     }
 
-    /// Returns the logarithm of the likelihood of the deviations, averaged over all nodes and variance ratios by their
-    /// prior.
+    /// Returns the logarithm of the marginal likelihood of the deviations: the likelihood, averaged over all nodes and
+    /// variance ratios with their prior probabilities.
     fn log_likelihood(&self) -> f64 {
         let sum = |of: &mut dyn Iterator<Item = f64>| {
             let all: Vec<f64> = of.collect();
@@ -175,7 +180,8 @@ impl<'f> Posterior<'f> {
         sum(&mut self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
     }
 
-    /// Returns the likelihood of the noise for a node and a variance ratio.
+    /// Returns the likelihood of the standard deviation of the noise, given the node with the index `node` and the
+    /// variance ratio `tau` of field to noise.
     fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
         let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
             (&self.fields.hypotheses[node], &self.projected[node]);
@@ -195,36 +201,38 @@ impl<'f> Posterior<'f> {
         NoiseLikelihood::new(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
-    /// Returns the index of the most probable node, and its variance ratio; `None` if there is no node.
+    /// Finds the most probable hypothesis. Returns the index of its node and its variance ratio; `None` if there is no
+    /// node.
     fn most_probable(&self) -> Option<(usize, f64)> {
         let all = self.probabilities(HypothesisSet::All);
         all.into_iter().max_by(|a, b| a.2.total_cmp(&b.2)).map(|(node, tau, _)| (node, tau))
     }
 
-    /// Returns the most probable node and variance ratio, with the most probable noise for them, in mm; `None` if there
-    /// is no node.
+    /// Finds the most probable hypothesis. Returns its node, its variance ratio, and the most probable standard
+    /// deviation of the noise for them, in mm; `None` if there is no node.
     pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
         let (number, tau) = self.most_probable()?;
         Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
     }
 
-    /// Returns the probability that the field is a rough one.
+    /// Returns the posterior probability that the field is rough ([`Smoothness::Exponential`]).
     pub(super) fn rough_probability(&self) -> f64 {
         let is = |of: &(usize, f64, f64)| HypothesisSet::Rough.contains(self.fields.hypotheses[of.0].smoothness);
         self.probabilities(HypothesisSet::All).iter().filter(|of| is(of)).map(|of| of.2).sum()
     }
 
-    /// Returns the degrees of freedom of the residuals.
+    /// Returns the degrees of freedom of the residuals: the number of points minus the number of fixed effects.
     pub(super) fn degrees_of_freedom(&self) -> f64 {
         self.fields.degrees_of_freedom
     }
 
-    /// Returns the root mean square of the residuals after the fit of the fixed effects.
+    /// Returns the root mean square of the deviations after a least-squares fit of the fixed effects, in mm.
     fn rms_mm(&self) -> f64 {
         (self.squares / self.observed.places.len() as f64).max(0.0).sqrt()
     }
 
-    /// Returns (node, variance ratio, probability) for the fields of a set. The probabilities sum to 1.
+    /// Returns the posterior probabilities of the hypotheses in the set `which`, normalised to the sum 1: for each, the
+    /// index of the node, the variance ratio, and the probability. Negligible ones are left out.
     fn probabilities(&self, which: HypothesisSet) -> Vec<(usize, f64, f64)> {
         let chosen =
             || self.densities.iter().enumerate().filter(|of| which.contains(self.fields.hypotheses[of.0].smoothness));
@@ -237,7 +245,8 @@ impl<'f> Posterior<'f> {
         some.into_iter().map(|(node, tau, weight)| (node, tau, weight / whole)).collect()
     }
 
-    /// Returns the hyperparameters of one node and variance ratio.
+    /// Returns the hyperparameters of the hypothesis with the node `node` and the variance ratio `tau`, with the most
+    /// probable noise for it.
     fn hyperparameters(&self, node: usize, tau: f64) -> Hyperparameters {
         let FieldHypothesis { smoothness, range_mm, scale, .. } = &self.fields.hypotheses[node];
         // If every deviation is zero, the noise is zero too: a positive minimum keeps the hyperparameters valid.
@@ -251,18 +260,19 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// Returns a weight, at most 1, for a field whose standard deviation exceeds the RMS of the residuals. The points
-    /// would show almost nothing of a field that is much stronger.
+    /// Returns a weight for a field with these hyperparameters: 1 if its standard deviation is at most the RMS of the
+    /// residuals, and the less, the more it exceeds the RMS. The points would show almost nothing of a field that is
+    /// much stronger.
     fn strength_weight(&self, hyperparameters: &Hyperparameters) -> f64 {
         let beyond =
             (hyperparameters.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         (-0.5 * beyond * beyond).exp()
     }
 
-    /// Returns the hyperparameters of each node at its most probable variance ratio, with their relative probabilities.
+    /// Returns hyperparameters with their relative probabilities: one entry for each node, at its most probable
+    /// variance ratio. The most probable entry comes first and has the weight 1.
     ///
-    /// Only nodes of the smoothnesses for which `is_of` is true are included. The most probable node comes first, with
-    /// weight 1.
+    /// Only nodes are included for whose smoothness `is_of` returns true.
     pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
             let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
@@ -280,10 +290,10 @@ impl<'f> Posterior<'f> {
         all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
     }
 
-    /// Returns the hyperparameters as one value each: the geometric means over the nodes that have the same smoothness
-    /// as the most probable node.
+    /// Returns single values of the hyperparameters: the geometric means over the nodes, weighted with their
+    /// probabilities. Only nodes with the smoothness of the most probable node are included.
     ///
-    /// Rough fields are not included, because their variance cannot be separated from the noise.
+    /// Rough fields are left out, because their variance cannot be separated from the noise.
     pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
         let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Exponential);
         let Some((first, _)) = likely.first().copied() else {
@@ -304,7 +314,8 @@ impl<'f> Posterior<'f> {
         Hyperparameters { field, noise_sigma_mm: mean(|of| of.noise_sigma_mm), ..first }
     }
 
-    /// Draws `count` samples from the fields of a set. The same seed gives the same samples.
+    /// Draws `count` samples from the posterior, with fields of the set `which`: coefficients of the basis functions,
+    /// noise, and random effects. The same `seed` gives the same samples. If the set has no field, the result is empty.
     pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
         let probabilities = self.probabilities(which);
         // Equal steps through the cumulative probability: the count of each field is within one of its expected value.
@@ -348,11 +359,11 @@ impl<'f> Posterior<'f> {
         draws
     }
 
-    /// Draws samples for one node: z = sigma z0 + D C' U (w - sigma V'z0) / sqrt l. The sample sigma z0 of the prior is
-    /// corrected so that its projections V'z on the eigenvectors are w, which is drawn from the posterior.
+    /// Draws samples from the posterior for the node with the index `number`. `chosen` has an entry for each sample:
+    /// the node, the variance ratio, and the number of the sample, which selects its stream of random numbers.
     ///
-    /// `chosen` has the node, the variance ratio and the number of each sample. D are the standard deviations of the
-    /// node, and C are the rows of the coordinates.
+    /// A sample z0 of the prior is drawn first. It is then corrected so that its projections on the eigenvectors of the
+    /// node have values drawn from the posterior (Matheron's rule). `which` selects the variance factors.
     fn samples_of(
         &self,
         number: usize,
@@ -409,8 +420,8 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// Returns the posterior mean for the most probable node and variance ratio: coefficients of the basis functions,
-    /// and random effects in standard uncertainties.
+    /// Returns the posterior mean for the most probable hypothesis: the coefficients of the basis functions, and the
+    /// random effects in units of their standard uncertainties. All are 0 if there is no hypothesis.
     pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
         let mut waves = vec![0.0; self.fields.basis.len()];
         let Some((number, tau)) = self.most_probable() else {
@@ -431,11 +442,12 @@ impl<'f> Posterior<'f> {
         (waves, stated)
     }
 
-    /// Returns the means over all fields of A K A', and of the variance of the noise in mm^2.
+    /// Averages two quantities over all hypotheses: the covariance of the given weighted sums of the field, and the
+    /// variance of the noise, both in mm^2. `sums` has one row for each sum, one column for each basis function
+    /// ([`FieldHypotheses::sums`]).
     ///
-    /// A are the given `sums`: one row for each sum, one column for each basis function. K is the covariance of the
-    /// coefficients of the cosines. The variance of the noise includes the waves shorter than those of the basis.
-    /// Fields that are stronger than the residuals have less weight.
+    /// The covariance is that of the cosines alone, without the polynomials. The variance of the noise includes the
+    /// waves shorter than the basis functions. A field that is stronger than the residuals has less weight.
     pub(super) fn mean_covariance(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
@@ -481,6 +493,8 @@ struct NoiseLikelihood {
 }
 
 impl NoiseLikelihood {
+    /// Prepares the likelihood. `products` are the products a'K0^-1 b of all pairs of the deviations and the random
+    /// effects, in this order; `logs` is the logarithm of the determinant of K0, and `free` the degrees of freedom.
     fn new(products: &DMatrix<f64>, logs: f64, free: f64, probe: NoisePrior) -> Self {
         let stated = products.nrows() - 1;
         let (by_stated, axes) = if stated == 0 {
@@ -501,7 +515,8 @@ impl NoiseLikelihood {
         }
     }
 
-    /// Returns the logarithm of the density of ln s at `log_mm`, including the prior of the noise of the probe.
+    /// Returns the logarithm of the density of ln s at ln s = `log_mm`, up to a constant. s is the standard deviation
+    /// of the noise in mm; the prior of the noise of the probe is included.
     fn density(&self, log_mm: f64) -> f64 {
         let s2 = (2.0 * log_mm).exp();
         let mut value = 2.0 * self.degrees_of_freedom * log_mm + self.logs;
@@ -516,8 +531,8 @@ impl NoiseLikelihood {
         -0.5 * (value + below * below)
     }
 
-    /// Evaluates the density in equal steps of ln s that cover all of the distribution. Returns the first ln s, the
-    /// step, and the logarithm of the density at each step.
+    /// Evaluates the density of ln s on a grid that covers all of the distribution. Returns the first ln s, the step,
+    /// and the logarithm of the density at each step. s is the standard deviation of the noise in mm.
     fn steps(&self) -> (f64, f64, Vec<f64>) {
         const COARSE: usize = 24;
         const FINE: usize = 41;
@@ -558,8 +573,8 @@ impl NoiseLikelihood {
         self.random_effect_terms.is_empty() && self.probe.is_none()
     }
 
-    /// Returns the logarithm of the likelihood with s integrated out, without the constants that are the same for every
-    /// field.
+    /// Returns the log marginal likelihood: the likelihood with the standard deviation s of the noise integrated out.
+    /// Constants that are the same for every field are left out.
     fn log_marginal(&self) -> f64 {
         if self.is_closed_form() {
             return -0.5 * (self.logs + self.degrees_of_freedom * self.squares.ln());
@@ -569,7 +584,7 @@ impl NoiseLikelihood {
         top + (step * densities.iter().map(|of| (of - top).exp()).sum::<f64>()).ln()
     }
 
-    /// Returns the most probable s, in mm.
+    /// Returns the most probable standard deviation of the noise, in mm.
     fn mode_mm(&self) -> f64 {
         if self.is_closed_form() {
             return (self.squares / self.degrees_of_freedom).sqrt();
@@ -579,6 +594,7 @@ impl NoiseLikelihood {
         (first + step * best as f64).exp()
     }
 
+    /// Draws a random standard deviation of the noise, in mm, from its posterior.
     fn sample_mm(&self, normals: &mut NormalGenerator) -> f64 {
         if self.is_closed_form() {
             // Chi-squared: for few degrees of freedom a sum of squared normal numbers, which is exact; otherwise the
@@ -603,12 +619,15 @@ impl NoiseLikelihood {
         (first + step * (at.unwrap_or(0) as f64 + normals.uniform() - 0.5)).exp()
     }
 
-    /// Returns the most probable random effects for the noise `scatter_mm`, each in units of its standard uncertainty.
+    /// Returns the most probable random effects, each in units of its standard uncertainty, if the standard deviation
+    /// of the noise is `scatter_mm`.
     fn random_effects_mode(&self, scatter_mm: f64) -> DVector<f64> {
         let along = self.random_effect_terms.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
         &self.axes * DVector::from_iterator(self.random_effect_terms.len(), along)
     }
 
+    /// Draws random effects from their posterior, each in units of its standard uncertainty, for a noise with the
+    /// standard deviation `scatter_mm`.
     fn sample_random_effects(&self, scatter_mm: f64, normals: &mut NormalGenerator) -> DVector<f64> {
         let scatter2 = scatter_mm * scatter_mm;
         let spread = self.random_effect_terms.iter().map(|[u, _]| (1.0 + u / scatter2).sqrt().recip() * normals.next());

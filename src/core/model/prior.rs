@@ -17,8 +17,8 @@ const UNKNOWN_PART_FACTORS: [f64; 2] = [6.0, 20.0];
 const DISSIMILAR_SHARE: f64 = 0.2;
 
 impl Prior {
-    /// Returns the prior for any part of this size: the range is a third of the size, the noise a twentieth of the
-    /// field, each with a factor of its own.
+    /// Returns a wide prior for a part of which only the size is known: the median of the range is a third of
+    /// `size_mm`, that of the noise is a twentieth of the field.
     pub fn for_size(size_mm: f64) -> Self {
         Self { range_mm: [size_mm / 3.0, UNKNOWN_PART_FACTORS[0]], noise_ratio: [0.05, UNKNOWN_PART_FACTORS[1]] }
     }
@@ -26,7 +26,7 @@ impl Prior {
     /// Checks that each median is finite and above 0, and each factor finite and above 1.
     ///
     /// # Errors
-    /// Returns [`ModelError::Prior`] with the wrong values.
+    /// Returns [`ModelError::Prior`] with the name, the median and the factor of the first wrong hyperparameter.
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, [median, factor]) in [("range", self.range_mm), ("ratio of noise to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
@@ -36,10 +36,12 @@ impl Prior {
         Ok(())
     }
 
-    /// Returns the logarithm of the prior density of range and ratio, up to a constant. It is a mixture: a small share
-    /// of parts resembles no earlier part, and differs as much as parts of which nothing is known (Schmidli and others
-    /// 2014). Beyond one factor, the density of either component falls only exponentially in the logarithm (Huber
-    /// 1964).
+    /// Returns the logarithm of the prior density, up to a constant. `range_mm` is the range of the field, `ratio` the
+    /// ratio of noise to field.
+    ///
+    /// The density is a mixture of this prior and of a wide one with a small weight, for parts that resemble no earlier
+    /// part (robust prior, Schmidli and others 2014). Beyond one factor from the median, both fall only exponentially
+    /// in the logarithm (Huber 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, median: f64, factor: f64| {
             let off = ((value / median).ln() / factor.ln()).abs();

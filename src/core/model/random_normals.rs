@@ -8,7 +8,8 @@ pub(super) struct NormalGenerator {
 }
 
 impl NormalGenerator {
-    /// Creates the stream with the number `stream` of a seed. The same seed and number give the same random numbers.
+    /// Creates a generator of standard normal numbers. Each number `stream` gives an independent sequence for the same
+    /// `seed`; the same seed and stream give the same sequence.
     pub(super) fn new(seed: u64, stream: u64) -> Self {
         let mut mixed = Self { state: seed, spare: None };
         let state = mixed.bits() ^ stream.wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17);
@@ -16,6 +17,7 @@ impl NormalGenerator {
         mixed
     }
 
+    /// Returns the next random number of the standard normal distribution.
     pub(super) fn next(&mut self) -> f64 {
         if let Some(spare) = self.spare.take() {
             return spare;

@@ -75,11 +75,11 @@ const STEP: f64 = 0.1;
 const MIN_DEGREES_OF_FREEDOM: f64 = 2.0;
 
 impl Sessions {
-    /// Joins observed points with the number of the session of each.
+    /// Joins observed points with sessions. `of` has the session number of each point.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows or of sessions differ from that of the points, or a number is not
-    /// finite.
+    /// Returns an error if the numbers of rows or of session numbers differ from the number of points, if there are not
+    /// more points than fixed effects, or if a number is not finite.
     pub fn new(observed: Observations, of: Vec<u32>) -> Result<Self, ModelError> {
         observed.check()?;
         if of.len() != observed.places.len() {
@@ -88,12 +88,12 @@ impl Sessions {
         Ok(Self { observed, session_numbers: of })
     }
 
-    /// Joins the used points of several registrations. Each registration comes with the session number of every
-    /// measured point. The motions that a registration was free to make are its own fixed effects. Outliers are left
-    /// out: only points with [`PointStatus::Inlier`] count.
+    /// Joins the inliers ([`PointStatus::Inlier`]) of several registrations. Each registration comes with the session
+    /// number of every measured point, outliers included. The motions that a registration was free to make become fixed
+    /// effects of its points alone.
     ///
     /// # Errors
-    /// Those of [`Sessions::new`]; also if a registration has no used point.
+    /// Those of [`Sessions::new`]; also if a registration has no inlier.
     pub fn from_registrations(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
         let (mut parts, mut of) = (Vec::new(), Vec::new());
         for (registration, sessions) in registrations {
@@ -112,16 +112,18 @@ impl Sessions {
         Self::new(joined(&parts), of)
     }
 
-    /// Returns the deviation at each used point, in mm, one registration after another.
+    /// Returns the deviation of each point, in mm, in the order of the points: one registration after another, without
+    /// outliers.
     pub fn deviations_mm(&self) -> &[f64] {
         &self.observed.deviations_mm
     }
 
-    /// Estimates the field common to all sessions and the field of a single session by restricted likelihood and
-    /// `priors`.
+    /// Estimates two fields and the noise by restricted likelihood: the field that all sessions have in common, and the
+    /// additional field of each single session. `priors` is the prior of the common field.
     ///
     /// # Errors
-    /// Returns an error if there are fewer than two sessions; otherwise those of [`DensePosterior::fit`].
+    /// Returns an error if there are fewer than two sessions or the prior is invalid; otherwise those of
+    /// [`DensePosterior::fit`].
     pub fn between_session_variance(&self, priors: &Prior) -> Result<BetweenSessionVariance, ModelError> {
         priors.check()?;
         let mut numbers = self.session_numbers.clone();
@@ -150,9 +152,9 @@ impl Sessions {
         })
     }
 
-    /// Searches the most probable hyperparameters from the best of several start values, in turns over those of the
-    /// common field and over those of the session's field. Returns the arguments of [`Self::scaled`] at the maximum,
-    /// and its value there.
+    /// Searches the most probable hyperparameters. It starts from the best of several start values, and varies in turns
+    /// those of the common field and those of the field of a session. Returns the two pairs of arguments of
+    /// [`Self::scaled`] at the maximum, and the log density there.
     fn search_maximum(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
@@ -178,11 +180,12 @@ impl Sessions {
         best
     }
 
-    /// Returns the hyperparameters at their most probable common scale, the session's field, and the logarithm of their
-    /// probability density.
+    /// Returns the hyperparameters of the common field, the field of a session, and the logarithm of their posterior
+    /// density. The strengths of both fields and of the noise are scaled together to their most probable values.
     ///
-    /// The arguments are logarithms: range and noise of the common field, then strength and range of the session's
-    /// field. Noise and strength are in units of the strength of the common field.
+    /// All arguments are logarithms. `range` is the range of the common field and `ratio` the noise; `share` is the
+    /// strength and `own_range` the range of the field of a session. Ranges are in mm; `ratio` and `share` are relative
+    /// to the strength of the common field.
     fn scaled(
         &self,
         [[range, ratio], [share, own_range]]: [[f64; 2]; 2],
@@ -210,6 +213,7 @@ impl Sessions {
         ))
     }
 
+    /// Fits the model with the field `own` as an additional covariance between points of the same session.
     fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
         let own = own.pair_covariance();
@@ -221,7 +225,7 @@ impl Sessions {
         })
     }
 
-    /// Returns at most `most` of the points, evenly spaced in the order of measurement.
+    /// Returns at most `most` of the points with their sessions, evenly spaced in the order of measurement.
     fn thinned(&self, most: usize) -> Self {
         let n = self.session_numbers.len();
         let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
@@ -232,7 +236,8 @@ impl Sessions {
     }
 }
 
-/// Joins the points of all parts in their order; each part has fixed effects of its own.
+/// Joins the observations of several registrations, one after another. The fixed effects of each registration become
+/// separate columns, with 0 at the points of the others. Random effects and paths are left out.
 fn joined(parts: &[Observations]) -> Observations {
     let rows = parts.iter().map(|part| part.places.len()).sum();
     let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.fixed_effects.ncols()).sum());
@@ -247,11 +252,12 @@ fn joined(parts: &[Observations]) -> Observations {
 }
 
 impl BetweenSessionVariance {
-    /// Predicts the deviations of unseen sessions at the places of `unseen`, after the best fit of `unseen` itself. The
-    /// prediction uses the places and the session of each. It does not use the deviations of `unseen`, and it treats
-    /// every session as new, even if its number is that of a known session.
+    /// Predicts the deviations that the sessions of `unseen` will find at their places, from the points `known`. Only
+    /// the places, the fixed effects and the grouping into sessions of `unseen` are used, not its deviations. Each of
+    /// its sessions counts as new, even if it has the number of a known session.
     ///
-    /// The cost is cubic in the number of points. If there are more than 1,500 known points, 1,500 of them are used.
+    /// The predictions are those after the best fit of `unseen` itself. The cost is cubic in the number of points. If
+    /// there are more than 1,500 known points, 1,500 of them are used.
     ///
     /// # Errors
     /// Those of [`DensePosterior::fit`].
@@ -284,15 +290,16 @@ impl BetweenSessionVariance {
 }
 
 impl PredictionInterval {
-    /// Returns the half width of the 95 % prediction interval about the mean, in mm. It uses Student's t, because an
-    /// uncertainty that is estimated from few sessions is uncertain itself.
+    /// Returns half the width of the 95 % prediction interval, in mm: the standard uncertainty times the quantile of
+    /// Student's t, because an uncertainty that is estimated from few sessions is uncertain itself.
     pub fn half_width_mm(&self) -> f64 {
         self.sigma_mm * student_t_quantile(self.degrees_of_freedom)
     }
 }
 
-/// Returns the 97.5 % quantile of Student's t by an asymptotic expansion (Fisher and Cornish 1960). Its error is within
-/// 2 % at 2 degrees of freedom, within 0.4 % at 3, and vanishes for many.
+/// Returns the 97.5 % quantile of Student's t distribution with `degrees` degrees of freedom, at least 2, by an
+/// asymptotic expansion (Fisher and Cornish 1960). Its error is at most 2 % at 2 degrees of freedom, 0.4 % at 3, and
+/// less for more.
 fn student_t_quantile(degrees: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
     // Terms in powers of 1 / degrees: each is z times a polynomial in z^2, the highest power first.
@@ -319,19 +326,21 @@ impl BestFitBasis {
         Self { q: orthonormal_base(effects.clone()) }
     }
 
+    /// Subtracts from `values`, one for each point, their least-squares best fit by the effects.
     fn after_best_fit(&self, values: &[f64]) -> Vec<f64> {
         let taken = self.q.tr_mul(&nalgebra::DVector::from_column_slice(values));
         let fitted = &self.q * taken;
         values.iter().zip(fitted.iter()).map(|(value, fitted)| value - fitted).collect()
     }
 
-    /// Returns the share of the variance at a point that remains after the best fit, if the points are independent.
+    /// Returns the share of the variance at the point with the index `point` that remains after the best fit, for
+    /// independent noise: 1 minus its leverage.
     fn remaining_share(&self, point: usize) -> f64 {
         1.0 - self.q.row(point).norm_squared()
     }
 
-    /// Returns the variance of each point after the best fit: the diagonal of P V P. V is the given covariance, and P
-    /// is 1 - Q Q'.
+    /// Returns the variance of each point after the best fit, for values with the given covariance: the diagonal of P V
+    /// P. V is `covariance` and P the projection that removes the effects.
     fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
         let (n, p) = self.q.shape();
         let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);

@@ -110,8 +110,8 @@ const INNOVATION_QUANTILE: f64 = 3.09;
 /// accepted and another pass can help.
 const GIVE_UP_LIMITS: (f64, usize) = (1.0 / 6.0, 120);
 
-/// Returns the indices of at most `most` targets that lie as far apart as possible: each is the target farthest from
-/// all chosen before it.
+/// Chooses at most `most` targets that lie far apart from each other (farthest-point sampling). Returns their indices:
+/// the first is target 0, and each next one is the target farthest from all chosen before it.
 pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     let mut chosen: Vec<usize> = Vec::new();
     let mut apart_mm = vec![f64::INFINITY; targets.len()];
@@ -126,10 +126,14 @@ pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     chosen
 }
 
-/// Decides whether the touches so far are enough, and returns the targets to touch next if not.
+/// Decides whether the touches so far are enough. Returns the form estimated from them, the reason of the decision, and
+/// the targets to touch next; these are empty if the measurement ends.
+///
+/// `registration` has the deviations of the touches, `so_far` assigns them to the targets. `purpose` has the limits of
+/// the figures and the accuracy that a correction needs. `seed` selects the random targets among the next ones.
 ///
 /// # Errors
-/// Those of [`Form::estimate_at`].
+/// Those of [`Form::estimate_at`]; also if the covariance of the touches is not positive definite.
 pub fn decide(
     registration: &Registration,
     inputs: &ModelInputs,
@@ -177,8 +181,8 @@ pub fn decide(
     Ok(StoppingDecision { form, next, reason: why })
 }
 
-/// Returns the reason that follows from the figures and from the uncertainty of the form. `count` is the number of
-/// touches so far, `pattern` the number of targets.
+/// Returns the reason to end or to continue that follows from the figures of the form, their limits in `purpose`, and
+/// the uncertainty of the form. `count` is the number of touches so far, `pattern` the number of all targets.
 fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
@@ -213,8 +217,13 @@ struct ExpectedTouches {
 }
 
 impl ExpectedTouches {
-    /// Conditions the model on all batches before the last, computes the standardized innovations of the last batch,
-    /// and then conditions the model on that batch too.
+    /// Builds the posterior of the touches so far, with the hyperparameters of `form`. The touches of the last batch
+    /// are compared with the prediction from all earlier batches (standardized innovations), and then added to the
+    /// posterior too.
+    ///
+    /// # Errors
+    /// Returns an error if a stated uncertainty in `inputs` is invalid, if a number is not finite, or if the covariance
+    /// of the touches is not positive definite.
     fn new(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -250,7 +259,8 @@ impl ExpectedTouches {
         Ok(Self { posterior: growing, last_innovations: of_targets.into_iter().zip(off).collect(), outliers })
     }
 
-    /// Returns true if the innovations of the last batch, without its outliers, are larger than chance explains.
+    /// Returns true if the innovations of the last batch are larger than chance explains: their mean square exceeds the
+    /// 99.9 % quantile of chi-squared, divided by its degrees of freedom. Outliers are left out.
     fn has_large_innovations(&self) -> bool {
         let squares: Vec<f64> =
             self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
@@ -260,12 +270,15 @@ impl ExpectedTouches {
         n > 0.0 && squares.iter().sum::<f64>() / n > (1.0 - ninth + INNOVATION_QUANTILE * ninth.sqrt()).powi(3)
     }
 
+    /// Returns the targets with outliers: first those of large innovations in the last batch, then those that the
+    /// registration found.
     fn all_outliers(&self) -> impl Iterator<Item = usize> + '_ {
         let off = self.last_innovations.iter().filter(|(_, z)| z.abs() >= OUTLIER_SIGMAS).map(|(target, _)| *target);
         off.chain(self.outliers.iter().copied())
     }
 
-    /// Returns the untried neighbours of those outliers that have too few tried neighbours.
+    /// Returns the untried neighbours of outliers, without duplicates. Outliers with at least [`MIN_TRIED_NEIGHBOURS`]
+    /// tried neighbours are skipped.
     fn untried_neighbours(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.all_outliers() {
@@ -279,14 +292,22 @@ impl ExpectedTouches {
         around
     }
 
-    /// Returns true if two neighbouring targets are both outliers. A particle of dust causes only a single outlier.
+    /// Returns true if two neighbouring targets are both outliers of the registration. This indicates a narrow feature
+    /// of the part; a particle of dust causes only one outlier.
     fn has_feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
-    /// Chooses the targets to touch next: the targets `around` first, then random targets, then those with the largest
-    /// weighted variance.
+    /// Chooses the targets to touch next. Returns the indices of `wanted` targets that are not tried yet: more if
+    /// `around` has more, and fewer if no more are left.
+    ///
+    /// First come the targets `around` (neighbours of outliers), then random targets with `seed`, then those with the
+    /// largest posterior variance, weighted as in [`Self::max_variance_target`]. For the variance, every target chosen
+    /// before counts as touched.
+    ///
+    /// # Errors
+    /// Returns [`ModelError::NotDefinite`] if the covariance of the touches is not positive definite.
     fn choose_next(
         &mut self,
         so_far: &PartialMeasurement,
@@ -318,8 +339,9 @@ impl ExpectedTouches {
         Ok(chosen)
     }
 
-    /// Returns the open target with the largest weighted variance; `None` if no target is open. The weight is 2 where
-    /// the maximum or the minimum of the form can lie, otherwise 1.
+    /// Returns the index of the target with the largest posterior variance times a weight. Only targets that are true
+    /// in `open` count; `None` if there is none. The weight is 2 where the maximum or the minimum of the form can lie,
+    /// otherwise 1.
     fn max_variance_target(&self, open: &[bool]) -> Option<usize> {
         let known: Vec<Prediction> = self.posterior.predictions().collect();
         let surely =
@@ -336,7 +358,8 @@ impl ExpectedTouches {
     }
 }
 
-/// Returns the indices of the [`NEIGHBOURS`] other targets that are nearest to the target `of`.
+/// Returns the indices of the [`NEIGHBOURS`] targets nearest to the target with the index `of`, in any order, without
+/// this target itself; of all others if there are fewer.
 fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     let apart = |k: usize| (targets[k].0 - targets[of].0).norm_squared();
     let mut others: Vec<usize> = (0..targets.len()).filter(|&k| k != of).collect();
@@ -348,8 +371,8 @@ fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     others
 }
 
-/// Sorts targets into a short tour: it starts at the smallest x and always goes to the nearest remaining target. Then
-/// crossings are removed (2-opt).
+/// Sorts the targets with the indices `chosen` into a short tour. The tour starts at the target with the smallest x and
+/// always goes to the nearest remaining target; then crossings are removed (2-opt).
 pub fn short_tour(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize> {
     let apart = |a: usize, b: usize| (targets[a].0 - targets[b].0).norm();
     let mut open = chosen;

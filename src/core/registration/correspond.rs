@@ -37,7 +37,8 @@ pub(crate) struct Correspondence {
 }
 
 impl Correspondence {
-    /// Returns the status of the point.
+    /// Returns `Inlier` if the point is in the fit. Otherwise returns `OffPart` if its projection is beyond the edge of
+    /// the nominal surface, else `Outlier`.
     pub(crate) fn status(&self) -> PointStatus {
         match self.in_fit {
             true => PointStatus::Inlier,
@@ -46,7 +47,8 @@ impl Correspondence {
         }
     }
 
-    /// Returns true if the projection is beyond the edge. The surface is unknown there, however near the point is.
+    /// Returns true if the projection of the point is beyond the edge of the nominal surface. The surface is unknown
+    /// there, however near the point is.
     pub(crate) fn is_off_part(&self) -> bool {
         self.beyond_steps > EDGE_TOLERANCE_STEPS
     }
@@ -55,11 +57,12 @@ impl Correspondence {
         Self { facet: FacetIndex::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
 }
 
-/// Projects all points under a pose and returns the sums of the linear problem at the projections.
+/// Projects all `measured` points under the pose `cmm_from_model`, and returns the normal equations of the next
+/// least-squares step of the pose, see [`Sums`].
 ///
-/// Threads share the work in chunks. The sums of the chunks are added in order, so the result does not depend on the
-/// number of threads. It does not depend on the vector instructions of the machine either; these are selected at run
-/// time.
+/// Updates the facet, the distance and the edge distance of each entry of `correspondences`. Only points with `in_fit`
+/// enter the sums. Threads share the points in chunks, and the sums of the chunks are added in order. So the result
+/// depends neither on the number of threads nor on the vector instructions of the machine.
 pub(crate) fn correspond(
     surface: &OffsetSurface,
     residual: &ResidualModel,
@@ -89,6 +92,7 @@ impl pulp::NullaryFnOnce for Chunk<'_> {
     type Output = Sums;
 
     // Inlined into the caller that uses the vector instructions: a called function would be compiled without them.
+    /// Projects the points of the chunk and returns their sums for the normal equations.
     #[inline(always)]
     fn call(self) -> Sums {
         self.projection_pass.sum_chunk(self.points, self.correspondences)
@@ -104,8 +108,9 @@ struct ProjectionPass<'a> {
 }
 
 impl ProjectionPass<'_> {
-    /// Returns the sums of one chunk of points. Processes four points together if they stay on their facets or move to
-    /// new facets together, and single points otherwise.
+    /// Projects one chunk of points, updates `correspondences`, and returns the sums of the chunk for the normal
+    /// equations. Projects four points together if they stay on their facets or move to new facets together, and single
+    /// points otherwise.
     #[inline(always)]
     fn sum_chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
@@ -145,8 +150,9 @@ impl ProjectionPass<'_> {
         sums
     }
 
-    /// Returns the last facets of four points. If these are not known, returns the facets extrapolated from the eight
-    /// points before; `None` if there is no extrapolation.
+    /// Returns a start facet for each of four points: the facet of its last projection. If one of these is unknown,
+    /// extrapolates from `recent`, the facets of the eight points before. Returns `None` if
+    /// [`OffsetSurface::extrapolate_x4`] gives no extrapolation.
     #[inline(always)]
     fn start(
         &self,
@@ -161,8 +167,8 @@ impl ProjectionPass<'_> {
         self.surface.extrapolate_x4(&recent[0], &recent[1])
     }
 
-    /// Projects four points together if they are on the part and near the facets `places`. Otherwise returns false and
-    /// changes no correspondence and no sum.
+    /// Projects four points together, each from its start facet in `places`, and adds the points in the fit to `sums`.
+    /// Returns false and changes nothing if one of the points is beyond the edge or too far from its start facet.
     #[inline(always)]
     fn project_x4(
         &self,
@@ -188,6 +194,8 @@ impl ProjectionPass<'_> {
         true
     }
 
+    /// Projects one point, updates its `correspondence`, and adds it to `sums` if it is in the fit. The search starts
+    /// at the facet of its last projection, or at the facet `last` if that is unknown. Sets `last` to the facet found.
     #[inline]
     fn project_one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut FacetIndex, sums: &mut Sums) {
         let p = self.model_from_cmm.transform_point(point); // g^-1 Y
@@ -205,8 +213,9 @@ impl ProjectionPass<'_> {
     }
 }
 
-/// Returns the distance of a point's projection beyond the edge, in steps of the sampling. Outside the outline it is at
-/// least one, because the outline can end the part before the nominal points end.
+/// Returns the distance of `foot`, the projection of the point `p`, beyond the edge of the surface; 0 on the part. The
+/// unit is the step of the nominal sampling. If the contact point of `p` lies outside the outline, returns at least 1,
+/// because the outline can end the part before the nominal points end.
 pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProjection) -> f32 {
     let is_outside = surface.nominal().outline().is_some_and(|outline| {
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
@@ -216,7 +225,7 @@ pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProje
     if is_outside { steps.max(1.0) } else { steps }
 }
 
-/// Returns four points transformed by a pose.
+/// Returns the four points `w`, one per lane, transformed by a pose.
 #[inline(always)]
 fn transform_x4(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     let (r, t) = (&pose.rotation, &pose.translation_mm);
@@ -243,15 +252,16 @@ pub(crate) trait ProjectionReporter: Sync {
     /// Initial value of an item.
     const BLANK: Self::Item;
 
-    /// Returns the reported items of four points. Inlined, so that it is compiled with the caller's vector
-    /// instructions.
+    /// Converts four measured points and their final projections `at` to the four items to report. Inlined, so that it
+    /// is compiled with the caller's vector instructions.
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Self::Item; LANES];
 }
 
 /// Groups of four points per task of [`report_projections`].
 const GROUPS_PER_TASK: usize = 8;
 
-/// Projects all points once more and returns one reported item per point, in the order of the points.
+/// Projects all points once more under the final pose `cmm_from_model`. Returns the item that `report` makes from each
+/// point, in the order of the points.
 pub(crate) fn report_projections<R: ProjectionReporter>(
     surface: &OffsetSurface,
     measured: &[Point],
@@ -298,6 +308,7 @@ struct FinalBlock<'a, R> {
 impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
     type Output = [[R::Item; LANES]; GROUPS_PER_TASK];
 
+    /// Returns the items to report for the points of the block, in groups of four.
     #[inline(always)]
     fn call(self) -> Self::Output {
         let mut items = [[R::BLANK; LANES]; GROUPS_PER_TASK];
@@ -309,8 +320,8 @@ impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
 }
 
 impl<R: ProjectionReporter> FinalPass<'_, R> {
-    /// Returns the reported items of four points from the index `first` on. Beyond the last point the last point is
-    /// repeated.
+    /// Returns the items to report for the four points from the index `first` on. Past the end of the list it repeats
+    /// the last point.
     #[inline(always)]
     fn report_group(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
@@ -332,7 +343,7 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
         )
     }
 
-    /// Returns the projections of four points, searched one by one.
+    /// Projects four points one by one, each from the facet of its last projection. Returns the projections in lanes.
     #[cold]
     fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> ProjectionX4 {
         let foot = |l: usize| {

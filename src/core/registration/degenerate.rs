@@ -24,8 +24,11 @@ const MAX_EXAMINED: usize = 600;
 /// Width, as a share of the length, above which a cloud is not narrow, however few points it has.
 const MIN_WIDE_RATIO: f64 = 0.2;
 
-/// Rejects points that follow each other along one line, before any pose is tried, unless the directions that they do
-/// not determine are locked.
+/// Rejects points that follow each other along one line, straight or bent. Runs before any pose is tried.
+///
+/// # Errors
+/// Returns [`RegistrationError::Narrow`] if the points follow a line and the two coordinates that a line does not
+/// determine are not both locked: the rotation about it, and the shift across it.
 pub(super) fn check_scan_line(measured: &[Point], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MAX_EXAMINED)).copied().collect();
     let Some(_) = ScanLine::detect(few) else { return Ok(()) };
@@ -46,9 +49,9 @@ struct ScanLine {
 }
 
 impl ScanLine {
-    /// Returns the line that the points follow, or `None` if they spread over an area. The points are visited in the
-    /// order along their longest axis: points that spread over an area go to and fro across it, so that their path is
-    /// long.
+    /// Returns the line, straight or bent, that the points follow; `None` if they spread over an area. Sorts the points
+    /// along their longest principal axis, and compares the length of the path through them with their extent. Points
+    /// that spread over an area go to and fro across the axis, so that their path is long.
     fn detect(mut points: Vec<Point>) -> Option<Self> {
         let (middle, axes) = centroid_and_axes(points.iter().copied());
         let axis: Vector = axes.column(2).into();
@@ -69,8 +72,12 @@ impl ScanLine {
     }
 }
 
-/// Rejects contacts that form a strip too narrow for the distance of its points, unless the directions that it does not
-/// determine are locked.
+/// Rejects inliers whose contact points form a narrow strip: less than 2.5 times as wide as the distance between
+/// neighbouring points, and at most a fifth as wide as long.
+///
+/// # Errors
+/// Returns [`RegistrationError::Narrow`] for such a strip, unless the rotation about it and the shift across it are
+/// both locked.
 pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let used = || deviations.iter().filter(|d| d.status == PointStatus::Inlier);
     let normal = used().map(|d| d.normal).sum::<Vector>();
@@ -107,18 +114,23 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOption
     Ok(())
 }
 
-/// Returns the coordinates of the pose that are nearest to the shift across a line and to the rotation about it.
+/// Returns the two coordinates of the pose that points along a line do not determine. The first is the shift along the
+/// axis nearest to `normal` x `line`, the second is the rotation about the axis nearest to `line`. Both arguments are
+/// unit vectors in the model frame: the direction of the line, and the normal of the surface.
 fn undetermined_coordinates(line: Vector, normal: Vector) -> [Coordinate; 2] {
     const SHIFTS: [Coordinate; 3] = [Coordinate::X, Coordinate::Y, Coordinate::Z];
     const ROTATIONS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
     [SHIFTS[normal.cross(&line).iamax()], ROTATIONS[line.iamax()]]
 }
 
+/// Returns true if `options` lock both coordinates of `needed`.
 fn are_locked(needed: &[Coordinate; 2], options: &RegistrationOptions) -> bool {
     let held = Coordinate::locked_flags(needed);
     held.iter().zip(&options.locked).all(|(needed, locked)| !needed || *locked)
 }
 
+/// Returns the error for a cloud that is only `width_mm` wide, with `distance_mm` from point to point. `hold` are the
+/// two coordinates that must be locked to accept it.
 fn narrow_error(width_mm: f64, distance_mm: f64, hold: [Coordinate; 2]) -> RegistrationError {
     RegistrationError::Narrow { width_mm, distance_mm, min_width_mm: MIN_WIDTH_SPACINGS * distance_mm, to_lock: hold }
 }
@@ -134,6 +146,7 @@ fn centroid_and_axes(points: impl Iterator<Item = Point> + Clone) -> (Point, Mat
     (middle, Matrix3::from_columns(&order.map(|k| eigenvectors.column(k).into_owned())))
 }
 
+/// Sorts `values` and returns their median, the upper one of two middle values; 0 if there are no values.
 fn median(values: &mut [f64]) -> f64 {
     values.sort_unstable_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)

@@ -44,7 +44,8 @@ pub(super) struct StatusCounts {
 }
 
 impl StatusCounts {
-    /// Counts the points on all threads: with many points, memory access takes most of the time.
+    /// Counts the points of each status. Runs on all threads, because with many points memory access takes most of the
+    /// time.
     pub(super) fn count(deviations: &[Deviation]) -> Self {
         let of_one = |d: &Deviation| Self {
             outliers: usize::from(d.status == PointStatus::Outlier),

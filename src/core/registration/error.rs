@@ -29,7 +29,7 @@ pub enum RegistrationError {
         to_lock[0].name(), to_lock[1].name()
     )]
     Narrow { width_mm: f64, distance_mm: f64, min_width_mm: f64, to_lock: [Coordinate; 2] },
-    #[error("measured point {} is not finite; remove it or correct it", index + 1)]
+    #[error("measured point {} has a coordinate that is not a finite number; remove or correct the point", index + 1)]
     NotFinite { index: usize },
     #[error(
         "measured point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others, too \
@@ -44,8 +44,8 @@ pub enum RegistrationError {
     #[error("all {points} measured points lie on one line; measure points off the line")]
     Collinear { points: usize },
     #[error(
-        "{doubled} of {points} examined points repeat another point exactly; check whether a file was joined to \
-         itself, and remove the repeats"
+        "{doubled} of {points} examined points repeat another point exactly, limit 1 %; check whether a file was \
+         joined to itself, and remove the repeats"
     )]
     Repeated { doubled: usize, points: usize },
     #[error(
@@ -59,8 +59,8 @@ pub enum RegistrationError {
     )]
     TooFewUsed { used: usize, points: usize },
     #[error(
-        "no minimum within {iterations} iterations; the objective is {objective_mm2:.3e} mm^2; allow more \
-         iterations, or give a start pose"
+        "the fit does not converge within {iterations} iterations; its sum of squared distances is still \
+         {objective_mm2:.3e} mm^2; check that the cloud belongs to the part, and give a start pose"
     )]
     NotConverged { iterations: usize, objective_mm2: f64 },
     #[error("the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; {remedy}")]
@@ -76,8 +76,8 @@ pub enum RegistrationError {
     )]
     WrongSide { rms_mm: f64, other_rms_mm: f64 },
     #[error(
-        "no free direction of the pose is observable; give the complete pose, unlock a direction, or give a surface \
-         with more curvature"
+        "the points and the surface determine no free direction of the pose; give a start pose, \
+         measure more of the surface, or unlock a direction"
     )]
     Undetermined,
 }

@@ -29,8 +29,9 @@ const MIN_HEIGHT_SHARE: f64 = 0.1;
 /// measured from the surface. It is larger because a neighbour on a hump is above the surface too.
 const MIN_SURFACE_HEIGHT_SHARE: f64 = 0.25;
 
-/// Changes outliers that a neighbour confirms into inliers, and adds them to the number of inliers, the objective, RMS
-/// and PV.
+/// Changes each outlier into an inlier if a near neighbour deviates to the same side of the surface: the deviation is
+/// then form of the part, not a faulty touch. Adds these points to the number of inliers, the objective, RMS and PV of
+/// `verdict`. `outlier_sigmas` is the limit for an outlier in robust standard deviations.
 pub(super) fn count_confirmed_outliers(
     deviations: &mut [Deviation],
     verdict: &mut RegistrationQuality,
@@ -59,8 +60,8 @@ pub(super) fn count_confirmed_outliers(
     verdict.rms_mm = (verdict.objective_mm2 / verdict.inliers as f64).sqrt();
 }
 
-/// Returns the number of points on the part that were excluded from the fit although most of their neighbours were
-/// fitted.
+/// Returns the number of points on the part that are not in the fit although more than half of their eight nearest
+/// neighbours are.
 pub(super) fn count_contradicted(deviations: &[Deviation]) -> usize {
     let around = NeighbourIndex::new(deviations, 0.0);
     let is_left = |k: &usize| !deviations[around.indices[*k]].in_fit;
@@ -87,6 +88,8 @@ struct NeighbourIndex {
 }
 
 impl NeighbourIndex {
+    /// Indexes the points on the part by their projections onto the surface. The limit for an outlier is
+    /// `outlier_sigmas` times the robust standard deviation of the deviations.
     fn new(deviations: &[Deviation], outlier_sigmas: f64) -> Self {
         let on_part = |k: &usize| deviations[*k].status != PointStatus::OffPart;
         let of: Vec<usize> = (0..deviations.len()).filter(on_part).collect();
@@ -105,7 +108,9 @@ impl NeighbourIndex {
         }
     }
 
-    /// Returns true if the point deviates from the level around it and no neighbour deviates in the same way.
+    /// Returns true if the measured point with index `k` deviates from the median of its neighbours by more than half
+    /// the limit for an outlier, and no near neighbour deviates to the same side. Also returns true if the point is off
+    /// the part or has no neighbours.
     fn is_isolated(&self, k: usize) -> bool {
         let Ok(own) = self.indices.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self

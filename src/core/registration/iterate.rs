@@ -86,14 +86,15 @@ struct BallStep {
 }
 
 impl Problem<'_> {
-    /// Descends from a pose to the nearest minimum of the objective. The objective of the accepted steps never rises,
-    /// eq. (14).
+    /// Minimises the objective from the pose `start` by ball-constrained Gauss-Newton steps (a trust-region method), to
+    /// the nearest minimum. A step that raises the objective is undone, eq. (14) of the paper.
     ///
-    /// At the end the correspondences and the sums belong to the returned pose. `known` holds the sums at `start` if
-    /// they are already computed. The steps are appended to `trace`.
+    /// `known` are the sums at `start`, `None` if they are not yet computed. Appends one entry per step to `trace`. At
+    /// the end `correspondences` and the sums belong to the returned pose. If the steps run out before the minimum,
+    /// `converged` of the result is false.
     ///
     /// # Errors
-    /// Fewer points in the fit than free coordinates.
+    /// Returns [`RegistrationError::TooFewUsed`] if fewer points are in the fit than coordinates of the pose are free.
     pub(crate) fn descend(
         &self,
         start: Pose,
@@ -141,14 +142,18 @@ impl Problem<'_> {
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
-    /// Projects all points under a pose and sums the linear problem there.
+    /// Projects all points under a pose, updates `correspondences`, and returns the pose with the normal equations of
+    /// the step from it.
     fn linearize_at(&self, pose: Pose, correspondences: &mut [Correspondence]) -> LinearizedPose {
         let scaling = self.scaling_at(&pose);
         LinearizedPose { pose, scaling, sums: self.project_all(correspondences, &pose, &scaling) }
     }
 
-    /// Returns the best step of the linear problem within the ball, along the free directions that the surface
-    /// determines; eq. (15).
+    /// Returns the least-squares step from the pose `at` whose length in scaled coordinates is at most `ball_radius`,
+    /// eq. (15) of the paper. Directions that are locked, or that the surface does not determine, do not change.
+    ///
+    /// # Errors
+    /// Returns [`RegistrationError::TooFewUsed`] if fewer points are in the fit than coordinates of the pose are free.
     fn step_within(&self, ball_radius: f64, at: &LinearizedPose) -> Result<BallStep, RegistrationError> {
         let sums = &at.sums;
         if sums.points < self.locked.iter().filter(|locked| !**locked).count() {
@@ -163,8 +168,9 @@ impl Problem<'_> {
         Ok(BallStep { scaled: m, length: m.norm(), predicted_decrease_mm2: 2.0 * m.dot(&right), rank })
     }
 
-    /// Returns true if a step is too small to be tried. The first step of a registration is tried if it moves any
-    /// point.
+    /// Returns true if the pose counts as the minimum, so that `step` is not tried. This is so if the step is zero
+    /// except for rounding, if the objective is 0, or if the predicted decrease of the objective is negligible. The
+    /// last rule does not apply to the first step of a registration (`is_first`).
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
         let little =
             !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
@@ -177,13 +183,15 @@ impl Problem<'_> {
         Scaling { centre: pose.inverse().transform_point(&self.centroid), size_mm: self.size_mm }
     }
 
-    /// Projects all points under a pose and returns the sums of the linear problem.
+    /// Projects all points under a pose, updates `correspondences`, and returns the normal equations of the step from
+    /// this pose.
     pub(crate) fn project_all(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
         correspond(&self.surface, &self.residual, self.measured, correspondences, pose, scaling)
     }
 }
 
-/// Returns the projector onto the scaled steps that leave the locked coordinates of the twist at zero.
+/// Returns the orthogonal projector onto the steps, in scaled coordinates, that leave the `locked` coordinates of the
+/// twist at zero. `locked` is in the order x, y, z, rx, ry, rz.
 pub(crate) fn free_projector(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
     let to_twist = scaling.to_twist();
     let mut projector = Matrix6::identity();

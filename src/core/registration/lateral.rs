@@ -37,6 +37,8 @@ pub struct MapLimits {
 }
 
 impl Default for MapLimits {
+    /// Returns the default limits: coverage factor 2, an error of the map of 10 % of the rms, and a lateral error of 1
+    /// mm.
     fn default() -> Self {
         Self { coverage_factor: 2.0, max_error_share: 0.1, max_lateral_mm: 1.0 }
     }
@@ -53,12 +55,16 @@ pub struct LateralError {
     pub error_mm: f64,
 }
 
-/// Returns the effect of a pose's lateral uncertainty on a map of its deviations. `covariance` is that of the twist.
-/// The covariance of the verdict gives the repeatability of the pose. The covariance of [`crate::model::Form`] also
-/// includes the effect of form on the pose.
+/// Returns the lateral error of the pose of `found`, and the error that it causes in a map of the deviations. Lateral
+/// means along the surface: a map in this pose has the right shape at a displaced place.
 ///
-/// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p. The covariance of this motion is
-/// J C J^T with J = [1, -p^], projected onto the tangent plane; its largest eigenvalue counts.
+/// `covariance` is that of the twist [v; omega] of the pose, in mm and radians. The covariance in `found.quality` gives
+/// the repeatability of the pose. The covariance of [`crate::model::Form`] also includes the effect of form error on
+/// the pose. `coverage_factor` multiplies the standard uncertainty.
+///
+/// Equation: for the twist [v; omega] of covariance C a point p moves by v + omega x p. The covariance of this motion
+/// is J C J^T with J = [1, -p^], where p^ is the cross-product matrix of p. It is projected onto the tangent plane; the
+/// square root of its largest eigenvalue is the lateral uncertainty.
 pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_factor: f64) -> LateralError {
     let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier).collect();
     let lateral_mm = used.iter().map(|d| lateral_sigma(covariance, d)).fold(0.0, f64::max);
@@ -66,9 +72,10 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
 }
 
-/// Returns the reason, for people, why a registration does not allow a map; `None` if it does.
+/// Returns a message that explains why no map may be made from the registration `found`; `None` if a map is allowed.
 ///
-/// The module documentation gives the criterion.
+/// A map is not allowed if its lateral error exceeds `limits.max_lateral_mm`, or if the error that this causes exceeds
+/// `limits.max_error_share` of the rms deviation. `covariance` is that of the twist, as for [`lateral_error`].
 pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
     let rms_mm = found.quality.rms_mm;
@@ -95,7 +102,8 @@ pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &Ma
     ))
 }
 
-/// Returns the standard uncertainty of a point along the surface, in mm, in the direction in which it is largest.
+/// Returns the standard uncertainty of a point along the surface, in mm, in the tangent direction in which it is
+/// largest. `c` is the covariance of the twist of the pose.
 fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     let hat = deviation.point.coords.cross_matrix();
     let block = |i: usize, j: usize| -> Matrix3<f64> { c.fixed_view::<3, 3>(i, j).into_owned() };
@@ -107,7 +115,8 @@ fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     (0.5 * (seen + seen.transpose())).symmetric_eigenvalues().max().max(0.0).sqrt()
 }
 
-/// Returns the 95 % quantile of the slopes between neighbouring patches; 0 if there are no neighbours.
+/// Groups the deviations into patches of about nine points, and returns the slope between neighbouring patches in mm
+/// per mm: the 95 % quantile over all pairs. Returns 0 if there are no neighbouring patches.
 fn slope(used: &[&Deviation]) -> f64 {
     let n = used.len() as f64;
     let middle = used.iter().map(|d| d.point.coords).sum::<Vector>() / n;

@@ -18,7 +18,8 @@ pub(crate) struct Scaling {
 }
 
 impl Scaling {
-    /// Returns the twist in the model frame, in mm and radians, of scaled coordinates about the centre.
+    /// Converts scaled coordinates of a step to a twist in the model frame, in mm and radians. Scaled coordinates are a
+    /// translation in units of `size_mm`, and a rotation about `centre` in radians.
     pub(crate) fn twist(&self, scaled: &Vector6<f64>) -> Twist {
         let omega: Vector = scaled.fixed_rows::<3>(3).into();
         let shift: Vector = scaled.fixed_rows::<3>(0) * self.size_mm;
@@ -26,7 +27,8 @@ impl Scaling {
         Twist::new(v.x, v.y, v.z, omega.x, omega.y, omega.z)
     }
 
-    /// Returns the 6x6 matrix that maps scaled coordinates about the centre to a twist in the model frame.
+    /// Returns the 6x6 matrix that maps scaled coordinates of a step to a twist in the model frame, see
+    /// [`Self::twist`].
     pub(crate) fn to_twist(self) -> Matrix6<f64> {
         Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|k| {
             let mut unit = Vector6::zeros();
@@ -35,8 +37,8 @@ impl Scaling {
         }))
     }
 
-    /// Returns the row of A for a point and its normal, eq. (12): the decrease of the distance with each coordinate of
-    /// the step.
+    /// Returns the row of the Jacobian A for the point `p` with the unit normal at its projection, eq. (12) of the
+    /// paper: the decrease of the distance of the point with each scaled coordinate of the step.
     #[inline]
     pub(crate) fn row(&self, p: &Point, normal: &Vector) -> [f64; 6] {
         let arm = (p - self.centre).cross(normal);
@@ -46,7 +48,7 @@ impl Scaling {
 }
 
 impl Scaling {
-    /// Returns the rows of four points, one point per lane.
+    /// Returns the rows of the Jacobian A for four points, one point per lane, see [`Self::row`].
     #[inline(always)]
     pub(crate) fn four_rows(&self, p: &Vector3x4, normal: &Vector3x4) -> [F64x4; 6] {
         let centre = [F64x4::splat(self.centre.x), F64x4::splat(self.centre.y), F64x4::splat(self.centre.z)];
@@ -71,8 +73,9 @@ impl FourSums {
         Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
     }
 
-    /// Adds four points. A point with weight 0 and loss 0 changes no sum; `used` is the number of points that are in
-    /// the fit.
+    /// Adds four points, one per lane: their rows of the Jacobian A, their distances in mm, their weights, and their
+    /// contributions to the objective. `used` is the number of these points that are in the fit; the others must have
+    /// weight 0 and loss 0.
     #[inline(always)]
     pub(crate) fn add(&mut self, row: &[F64x4; 6], distance: F64x4, weight: F64x4, loss_mm2: F64x4, used: usize) {
         let mut k = 0;
@@ -88,7 +91,7 @@ impl FourSums {
         self.points += used;
     }
 
-    /// Adds the four sums, in their order, to `sums`.
+    /// Adds the sums of the four lanes to `sums`, in the order of the lanes.
     pub(crate) fn add_to(&self, sums: &mut Sums) {
         for l in 0..LANES {
             for (a, b) in sums.gram.iter_mut().zip(&self.gram) {
@@ -121,7 +124,8 @@ impl Sums {
         Self { gram: [0.0; 21], right: [0.0; 6], objective_mm2: 0.0, points: 0 }
     }
 
-    /// Adds one point with its row of A, its distance, its weight and its contribution to the objective.
+    /// Adds one point in the fit: its row of the Jacobian A, its distance in mm, its weight, and its contribution
+    /// `loss_mm2` to the objective.
     #[inline]
     pub(crate) fn add(&mut self, row: &[f64; 6], distance: f64, weight: f64, loss_mm2: f64) {
         let mut k = 0;
@@ -137,7 +141,8 @@ impl Sums {
         self.points += 1;
     }
 
-    /// Adds other sums. Callers merge in a fixed order, so that the result does not depend on the number of threads.
+    /// Returns these sums plus `other`. Callers merge in a fixed order, so that the result does not depend on the
+    /// number of threads.
     pub(crate) fn merge(mut self, other: &Self) -> Self {
         for (a, b) in self.gram.iter_mut().zip(&other.gram) {
             *a += b;
@@ -150,7 +155,8 @@ impl Sums {
         self
     }
 
-    /// Returns A^T W A.
+    /// Returns the matrix A^T W A of the normal equations. A has one row per point, and W is diagonal with the weights
+    /// of the points.
     pub(crate) fn gram(&self) -> Matrix6<f64> {
         Matrix6::from_fn(|i, j| {
             let (i, j) = (i.max(j), i.min(j));
@@ -158,7 +164,8 @@ impl Sums {
         })
     }
 
-    /// Returns A^T W b.
+    /// Returns the right side A^T W b of the normal equations, where b are the distances of the points in mm; eq. (13)
+    /// of the paper.
     pub(crate) fn right(&self) -> Vector6<f64> {
         Vector6::from(self.right)
     }

@@ -55,14 +55,17 @@ pub use robust_loss::Loss;
 pub(crate) use robust_loss::robust_median_and_sigma;
 use start::{InitialPose, detect_mirror_image, free_rms, initial_pose, mirrored_rms};
 
-/// Registers measured points to a nominal surface and returns the pose, the deviations and the verdict.
+/// Registers measured points to a nominal surface. Returns the pose, the deviation of each point, and the quality of
+/// the fit.
 ///
 /// Shapes: measured points in any order, at least one more than there are free directions; one deviation per point, in
 /// the same order. Frames: the points are in the CMM frame, the surface in the model frame. The pose maps the model
 /// frame to the CMM frame. Units: millimetres. Equations: (3), (7) to (15) of the paper.
 ///
 /// # Errors
-/// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
+/// Returns an error if the points are too few, repeated, on one line, not finite or of the wrong size, or if the probe
+/// radius is wrong for the surface. Returns an error if the points do not determine the pose, fit only as a mirror
+/// image or worse than the rms limit, or if the iteration does not converge.
 pub fn register(
     nominal: &Nominal,
     measured: &[Point],
@@ -78,7 +81,11 @@ pub fn register(
     Ok(registration)
 }
 
-/// Estimates the pose without checking how well it fits.
+/// Estimates the pose and the deviations. Does not check whether the points fit well enough; [`check_fit`] does that.
+///
+/// # Errors
+/// Returns an error if the probe does not fit into a concave place, if the given side is wrong, if too few points lie
+/// on the part, if no direction of the pose is determined, or if the iteration does not converge.
 fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.side() {
         part.check_fold(options, side)?;
@@ -97,7 +104,7 @@ fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result
     build_registration(part, &problem, descent, correspondences, trace, &initial, options)
 }
 
-/// Replaces an error by [`RegistrationError::Mirrored`] if only the mirrored cloud fits.
+/// Returns [`RegistrationError::Mirrored`] in place of `error` if only the mirrored cloud fits.
 ///
 /// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
 fn explain_by_mirror_image(
@@ -116,7 +123,12 @@ fn explain_by_mirror_image(
     }
 }
 
-/// Converts the result of the iteration to the reported registration.
+/// Builds the reported registration from `descent`, the last descent of the iteration: quality, deviations, coverage
+/// and trace.
+///
+/// # Errors
+/// Returns [`crate::surface::SurfaceError::OffsetFolds`] if the offset surface folds at a facet that a point projects
+/// to.
 fn build_registration(
     part: &Part,
     problem: &Problem,
@@ -143,8 +155,8 @@ fn build_registration(
 /// Difference of two distances that is only rounding, in mm.
 const ROUNDING_MM: f64 = 1e-12;
 
-/// Returns the trace with the reported state as its last entry. An entry is appended if the last step was undone, or if
-/// the number of points or the objective differs from that of the last accepted step.
+/// Returns `trace` with the reported state as its last entry. Appends an entry with step 0 if the last step was undone,
+/// or if the number of points or the objective of `verdict` differs from that of the last accepted step.
 fn with_final_state(
     mut trace: Vec<Iteration>,
     verdict: &RegistrationQuality,
@@ -165,10 +177,11 @@ fn with_final_state(
     trace
 }
 
-/// Rejects a fit that shows another part or a mirror image.
+/// Rejects a fit that is too poor to be this part, or that leaves the pose undetermined across a strip.
 ///
 /// # Errors
-/// A strip that is too narrow, a mirror image, or an rms above the limit.
+/// Returns [`RegistrationError::Narrow`] for a strip of points that is too narrow, [`RegistrationError::Mirrored`] if
+/// the mirrored cloud fits much better, and [`RegistrationError::DoesNotFit`] if the rms exceeds its limit.
 fn check_fit(
     part: &Part,
     found: &Registration,

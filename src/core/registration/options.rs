@@ -49,7 +49,7 @@ pub enum ProbeSide {
 }
 
 impl ProbeSide {
-    /// Returns the side, or `None` for [`ProbeSide::Auto`].
+    /// Returns the side that was chosen; `None` for [`ProbeSide::Auto`], which leaves the choice to the registration.
     pub fn side(self) -> Option<Side> {
         match self {
             Self::Auto => None,
@@ -83,13 +83,13 @@ pub enum Coordinate {
 }
 
 impl Coordinate {
-    /// Returns the name of the coordinate in recipes and commands.
+    /// Returns the name of the coordinate in recipes and commands, such as `x` or `rz`.
     pub fn name(self) -> &'static str {
         ["x", "y", "z", "rx", "ry", "rz"][self as usize]
     }
 
-    /// Returns one flag for each of x, y, z, rx, ry, rz, true if it is among `coordinates`; the form of
-    /// [`RegistrationOptions::locked`].
+    /// Returns six flags in the order x, y, z, rx, ry, rz. A flag is true if its coordinate is in `coordinates`. This
+    /// is the form of [`RegistrationOptions::locked`].
     pub fn locked_flags(coordinates: &[Self]) -> [bool; 6] {
         [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))
     }
@@ -126,7 +126,7 @@ pub struct RegistrationOptions {
 }
 
 impl RegistrationOptions {
-    /// Returns the defaults for a probe radius in millimetres.
+    /// Returns the default options for a probe radius in millimetres.
     pub fn new(probe_radius_mm: f64) -> Self {
         Self {
             probe_radius_mm,

@@ -29,11 +29,12 @@ pub(super) struct Part<'a> {
 }
 
 impl<'a> Part<'a> {
-    /// Checks the input before any computation and returns the part with its sizes.
+    /// Checks the input before any pose is tried. Returns the nominal surface with the probe offset, and the centre and
+    /// size of the cloud.
     ///
     /// # Errors
-    /// A fully locked pose without a start pose, too few, non-finite, collinear or repeated points, a cloud of the
-    /// wrong size, and a probe radius outside its limits.
+    /// Returns an error for a fully locked pose without a start pose, for too few, non-finite, collinear or repeated
+    /// points, for a cloud of the wrong size, and for a probe radius outside its limits.
     pub(super) fn new(
         nominal: &'a Nominal,
         measured: &[Point],
@@ -77,6 +78,7 @@ impl<'a> Part<'a> {
         Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: least_share })
     }
 
+    /// Returns the offset surface on the given side, with the distance model and the facet lookup of `options`.
     pub(super) fn surface(&self, options: &RegistrationOptions, side: Side) -> OffsetSurface<'a> {
         let lookup = if options.method == Method::SubtractRadius { Lookup::AlongZ } else { Lookup::ContainingFacet };
         OffsetSurface::new(self.nominal, self.offset_mm, side)
@@ -86,6 +88,9 @@ impl<'a> Part<'a> {
     }
 
     /// Rejects a probe ball that does not fit into a concave place of the surface.
+    ///
+    /// # Errors
+    /// Returns [`crate::surface::SurfaceError::OffsetFolds`] with the worst place.
     pub(super) fn check_fold(&self, options: &RegistrationOptions, side: Side) -> Result<(), RegistrationError> {
         match self.surface(options, side).find_fold() {
             Some(fold) => Err(fold.into()),
@@ -93,6 +98,8 @@ impl<'a> Part<'a> {
         }
     }
 
+    /// Returns the input and the stopping rules of the iteration for `measured` points on the given side. The loss is
+    /// the square of the distance.
     pub(super) fn problem<'b>(&self, measured: &'b [Point], options: &RegistrationOptions, side: Side) -> Problem<'b>
     where
         'a: 'b,
@@ -111,6 +118,8 @@ impl<'a> Part<'a> {
         }
     }
 
+    /// Returns the largest accepted rms deviation in mm: the value of `options`, or 0.2 mm plus 1e-4 of the rms size of
+    /// the cloud.
     pub(super) fn rms_limit_mm(&self, options: &RegistrationOptions) -> f64 {
         options.rms_limit_mm.unwrap_or(0.2 + 1e-4 * self.size_mm)
     }
@@ -140,7 +149,8 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     Ok(())
 }
 
-/// Replaces an error of the size by an error that names a single distant point, if this point causes it.
+/// Explains an `error` about the size of the cloud. Returns an error that names one point far from all others, measured
+/// or nominal, if there is such a point. Otherwise returns `error` unchanged.
 fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
     if let Some((index, distance_mm)) = find_far_off(measured) {
         return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };
@@ -152,10 +162,14 @@ fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: Registrati
     }
 }
 
+/// Rejects two clouds if the measured rms size is less than 0.06 times or more than 3 times the nominal rms size.
+///
+/// # Errors
+/// Returns [`RegistrationError::Size`] with a remedy that names the likely wrong unit.
 fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationError> {
     let ratio = measured_mm / nominal_mm;
     let remedy = match ratio {
-        r if !(r > 0.0 && r.is_finite()) => "a size must be above 0",
+        r if !(r > 0.0 && r.is_finite()) => "both sizes must be above 0: check whether all points of a file are equal",
         r if r > 500.0 => {
             "check whether the nominal points are in metres or the measured points in micrometres; give both in \
              millimetres"

@@ -99,7 +99,8 @@ fn point_warnings(found: &Registration) -> Vec<String> {
     doubts
 }
 
-/// Estimates how many points off the part lie in a gap: they have points on the part in every direction.
+/// Estimates how many of the `off_part` points lie over a gap of the nominal surface, not outside its edge. A point
+/// lies over a gap if there are points on the part in all eight sectors of the xy plane around it.
 fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;
@@ -124,8 +125,10 @@ fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
 }
 
 impl Registration {
-    /// Returns the reason, for people, why these points allow no verdict; `None` if they do. They do not if too many of
-    /// them contradict their neighbours, since then it is unknown which of the two groups is the part.
+    /// Returns a message that explains why these points allow no verdict; `None` if they allow one.
+    ///
+    /// They allow none if more than 10 % of the points on the part contradict their neighbours: they were excluded from
+    /// the fit although most of their neighbours were fitted. It is then unknown which of the two groups is the part.
     pub fn unjudgeable_reason(&self) -> Option<String> {
         /// Maximum number of contradicting points, as a share of the points on the part.
         const MAX_CONTRADICTED_SHARE: f64 = 0.1;
@@ -148,15 +151,16 @@ impl Registration {
         let with = figures(&mut on_part.iter().map(|d| d.deviation_mm));
         let without = figures(&mut on_part.iter().filter(|d| d.in_fit).map(|d| d.deviation_mm));
         Some(format!(
-            "{contradicted} of {} points ({:.0} %) contradict their neighbours, so no verdict is possible: with them \
-             {with}, without them {without}; clean the part, check the probe, and measure again",
+            "{contradicted} of {} points ({:.0} %) contradict their neighbours, limit 10 %, so no verdict is possible: \
+             with them {with}, without them {without}; clean the part, check the probe, and measure again",
             on_part.len(),
             100.0 * contradicted as f64 / on_part.len() as f64,
         ))
     }
 }
 
-/// Warns that the nominal points have noise of their own, if it contributes noticeably to the deviations.
+/// Returns a warning if the noise of the nominal points exceeds both 0.1 µm and 10 % of the rms deviation; otherwise
+/// `None`.
 fn nominal_noise_warning(part: &Part, found: &Registration) -> Option<String> {
     /// Limits for the warning; both must be exceeded. A file with four digits of a millimetre has a noise of 0.03 um.
     const MIN_NOISE_MM: f64 = 1e-4;
@@ -171,7 +175,8 @@ fn nominal_noise_warning(part: &Part, found: &Registration) -> Option<String> {
     })
 }
 
-/// Returns a warning that names the rejected points and gives the figures that include them; `None` if there are none.
+/// Returns a warning that names the first outliers and gives RMS and PV with all outliers; `None` if there are no
+/// outliers.
 fn outlier_warning(found: &Registration) -> Option<String> {
     let FiguresWithOutliers { outliers: points, rms_mm, pv_mm, description: places } = found.figures_with_outliers()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
@@ -183,7 +188,8 @@ fn outlier_warning(found: &Registration) -> Option<String> {
     ))
 }
 
-/// Returns a warning about another probe radius that fits the points much better; `None` if there is no such radius.
+/// Returns a warning if the points fit another probe radius, or no radius (contact points), much better than the given
+/// radius; otherwise `None`.
 pub(super) fn radius_warning(
     part: &Part,
     found: &Registration,
@@ -224,8 +230,8 @@ pub(super) fn radius_warning(
     })
 }
 
-/// Registers a sample of the points with another radius, in mm. A negative radius is a ball on the other side of the
-/// surface. Zero means contact points.
+/// Registers `sample`, some of the points, with another probe radius in mm. A negative radius is a ball on the other
+/// side of the surface. A magnitude below 0.1 mm means contact points. Returns `None` if the registration fails.
 fn refit_with_radius(
     part: &Part,
     found: &Registration,
@@ -245,14 +251,16 @@ fn refit_with_radius(
     super::fit(&part, sample, &options).ok()
 }
 
-/// Returns true if another radius fits so much better that form error cannot explain the difference.
+/// Returns true if `other_rms_mm`, the rms with another radius, is so much smaller than `rms_mm` that form error cannot
+/// explain the difference.
 fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
     let taken2 = rms_mm * rms_mm - other_rms_mm * other_rms_mm;
     other_rms_mm <= MAX_RMS_SHARE * rms_mm && taken2 >= (MIN_RMS_PER_SIZE * part.size_mm).powi(2)
 }
 
-/// Returns true if another radius is worth a fit. In the linear model it must remove enough of the rms, and the noise
-/// must leave it well determined.
+/// Returns true if it is worth fitting another radius. The linear estimate of the radius must promise a much smaller
+/// rms, and must be more than five of its standard uncertainties from the given radius. Returns false for contact
+/// points, locked coordinates or too few points.
 fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationOptions) -> bool {
     /// Margin of this test over the final test. The model is linear and a wrong radius is far off, so this test is less
     /// strict.
@@ -272,8 +280,12 @@ fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationO
     })
 }
 
-/// Estimates the radius repeatedly, each time from a new registration, until it no longer changes, and returns it in
-/// mm. A negative radius means a ball on the other side of the surface. Returns `None` if a fit fails.
+/// Estimates the probe radius iteratively, and returns it in mm. Starts at `first_mm`. Each round registers the points
+/// with the last radius by `refit`, and corrects the radius by [`Registration::estimate_radius`]. Ends when the change
+/// is below 1 % of `given_mm`, or after five rounds.
+///
+/// A negative radius means a ball on the other side of the surface. Returns `None` if a registration fails or gives no
+/// estimate.
 fn converged_radius_mm(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
     const MAX_ITERATIONS: usize = 5;
     let mut radius_mm = first_mm;

@@ -67,7 +67,8 @@ pub struct WeakDirection {
     pub sigma_mm: Option<f64>,
 }
 
-/// Returns the quality of a registration at the end of an iteration; the coverage is still 0.
+/// Returns the quality of the pose that `descent` found: figures, covariance, weak directions and warnings.
+/// `iterations` is the number of steps. The coverage is 0; the caller sets it.
 pub(crate) fn assess_quality(
     problem: &Problem,
     descent: &Descent,
@@ -127,6 +128,7 @@ struct DistanceSummary {
 impl DistanceSummary {
     const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
 
+    /// Returns number, sum of squares, minimum and maximum of the distances of the points in the fit.
     fn summarize(correspondences: &[Correspondence]) -> Self {
         let add = |sum: Self, d: f64| Self {
             used: sum.used + 1,
@@ -146,7 +148,8 @@ impl DistanceSummary {
     }
 }
 
-/// Returns warnings about ambiguities that the figures do not show: the side, other poses, and a flat part.
+/// Returns warnings about doubts that the figures do not show: the side of the probe is assumed, other poses fit as
+/// well, or the deviations are as large as the relief of the part.
 fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
     if !initial.side_known {
@@ -157,7 +160,7 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     }
     if !alternatives.is_empty() {
         warnings.push(format!(
-            "{} other {} as well: the part is symmetric, or too little of it was measured",
+            "{} other {} as well: the part is symmetric, or too little of it was measured; give a start pose",
             alternatives.len(),
             if alternatives.len() == 1 { "pose fits about" } else { "poses fit about" },
         ));
@@ -165,7 +168,8 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     let relief_mm = problem.surface.nominal().relief_mm();
     if rms_mm > 0.5 * relief_mm {
         warnings.push(format!(
-            "the deviations, {} rms, are as large as the relief of the part, {} rms: its shape does not confirm the pose",
+            "the deviations, {} rms, exceed half of the distances of the part from a plane, {} rms: the shape does not \
+             confirm the pose; check it against the fixture",
             format_length(rms_mm),
             format_length(relief_mm),
         ));
@@ -173,7 +177,8 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     warnings
 }
 
-/// Returns s^2 (A^T A)^-1 over the determined directions, in scaled coordinates.
+/// Returns the covariance of the pose in scaled coordinates, `variance` (A^T A)^-1, where A is the Jacobian of the
+/// distances. Includes only the first `rank` directions of `spectrum`, which the surface determines.
 fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6<f64> {
     (0..rank)
         .map(|k| {
@@ -183,7 +188,8 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
         .sum()
 }
 
-/// Returns descriptions of the motions that change no distance.
+/// Describes the motions of the part that change no distance: shifts along a direction, and rotations about an axis.
+/// The columns of `basis` are motions in scaled coordinates; they span `count` dimensions.
 fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Scaling) -> Vec<WeakDirection> {
     if count == 0 {
         return Vec::new();
@@ -223,7 +229,8 @@ fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scali
         .collect()
 }
 
-/// Returns an orthonormal basis of the pure shifts within a span of scaled motions.
+/// Returns an orthonormal basis of the motions in `span` that are perpendicular to `rotations`: shifts without
+/// rotation. The columns of `span` are motions in scaled coordinates.
 fn pure_shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
     let mut basis: Vec<Vector6<f64>> = rotations.to_vec();
     let mut found = Vec::new();
@@ -243,7 +250,8 @@ fn pure_shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f
     found
 }
 
-/// Returns the point that rotations about three independent axes leave fixed.
+/// Returns the point, in the model frame, that three `rotations` about independent axes leave fixed. Each rotation is a
+/// motion in scaled coordinates.
 fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     let (mut gram, mut right) = (nalgebra::Matrix3::zeros(), Vector::zeros());
     for r in rotations {
@@ -256,11 +264,13 @@ fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     scaling.centre + gram.lu().solve(&right).unwrap_or_default()
 }
 
+/// Splits a motion in scaled coordinates into the shift of the centre in mm and the rotation in radians.
 fn shift_and_rotation(scaled: &Vector6<f64>, scaling: &Scaling) -> (Vector, Vector) {
     let v: Vector = scaled.fixed_rows::<3>(0) * scaling.size_mm;
     (v, scaled.fixed_rows::<3>(3).into())
 }
 
+/// Describes the axis of a rotation, given in scaled coordinates: its direction and a point on it, in the model frame.
 fn axis_name(rotation: &Vector6<f64>, scaling: &Scaling) -> String {
     let (v, omega) = shift_and_rotation(rotation, scaling);
     let through = scaling.centre + omega.cross(&v) / omega.norm_squared();
@@ -268,6 +278,8 @@ fn axis_name(rotation: &Vector6<f64>, scaling: &Scaling) -> String {
     format!("rotation about {name} through ({:.3}, {:.3}, {:.3}) mm", through.x, through.y, through.z)
 }
 
+/// Returns "x", "y" or "z" for a vector along an axis, and otherwise the components of its unit vector. The sign makes
+/// the largest component positive.
 fn direction_name(v: &Vector) -> String {
     for (k, name) in ["x", "y", "z"].into_iter().enumerate() {
         if v[k].abs() > 0.9999 * v.norm() {
@@ -278,9 +290,9 @@ fn direction_name(v: &Vector) -> String {
     format!("({:.3}, {:.3}, {:.3})", u.x, u.y, u.z)
 }
 
-/// Returns descriptions of the shifts along, and the rotations about, the model's axes that are less certain than a
-/// single point. Rotations are about the centroid of the cloud. Returns nothing if a direction is undetermined
-/// (`some_held`).
+/// Describes the shifts along and rotations about the axes of the model frame whose standard uncertainty at the rim
+/// exceeds `sigma_mm`, the standard deviation of one point. `scaled` is the covariance in scaled coordinates; rotations
+/// are about the centroid of the cloud. Returns nothing if the surface leaves a direction undetermined (`some_held`).
 fn uncertain_directions(
     scaled: &Matrix6<f64>,
     sigma_mm: f64,
@@ -315,7 +327,7 @@ fn uncertain_directions(
     found
 }
 
-/// Formats a length with about two digits, in a suitable unit.
+/// Formats a length with two or three digits, in mm or in µm.
 pub(super) fn format_length(mm: f64) -> String {
     match mm {
         l if l >= 10.0 => format!("{l:.0} mm"),
@@ -327,12 +339,12 @@ pub(super) fn format_length(mm: f64) -> String {
     }
 }
 
-/// Returns the share of the surface that is covered by inliers, from 0 to 1.
+/// Returns the share of the nominal surface that is covered by inliers, from 0 to 1.
 ///
-/// For many points, cubes are counted whose edge is a fifteenth of the surface's rms size, small enough to show a
-/// missing corner. For few points, a place is covered if an inlier is within 1.1 times the spacing that the same number
-/// of points would have if they were spread evenly. So a full pattern leaves no gap, and a line covers only its own
-/// strip.
+/// Many points: divides space into cubes with an edge of a fifteenth of the rms size of the surface, small enough to
+/// show a missing corner. A place is covered if its cube contains an inlier. Few points: a place is covered if an
+/// inlier is within 1.1 times the spacing of the same number of points spread evenly. So a full pattern leaves no gap,
+/// and a line covers only its own strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MAX_POINTS: usize = 50_000;
     // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
@@ -354,7 +366,7 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     sample.iter().filter(|p| cells.is_marked(p)).count() as f64 / sample.len() as f64
 }
 
-/// Returns the share of the `places` that have an inlier within this distance, from 0 to 1.
+/// Returns the share of `places`, from 0 to 1, that have a point of `used` within the distance `within_mm`.
 fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 {
     let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / within_mm).floor() as i64);
     let mut points: HashMap<[i64; 3], Vec<Point>> = HashMap::new();
@@ -385,6 +397,7 @@ impl CoverageCells {
     /// covers the rest.
     const MAX_PER_AXIS: i64 = 256;
 
+    /// Creates unmarked cubes of the edge `edge_mm` that cover the bounding box of `points`.
     fn new(points: &[Point], edge_mm: f64) -> Self {
         let per_mm = 1.0 / edge_mm;
         let (mut low, mut high) = ([i32::MAX; 3], [i32::MIN; 3]);
@@ -399,6 +412,7 @@ impl CoverageCells {
         Self { low, counts, per_mm, marked: vec![false; counts.iter().product()] }
     }
 
+    /// Returns the numbers of the cube of a point along x, y and z; `per_mm` is the inverse of the edge of a cube.
     fn cell(p: &Point, per_mm: f64) -> [i32; 3] {
         [p.x, p.y, p.z].map(|c| (c * per_mm).floor() as i32)
     }
@@ -441,6 +455,8 @@ pub(crate) struct DeviationReporter<'a> {
 }
 
 impl<'a> DeviationReporter<'a> {
+    /// Prepares the conversion: the covariance of the pose in scaled coordinates, and the offset from the probe centre
+    /// to the contact point.
     pub(crate) fn new(
         part: &Part<'a>,
         scaling: &Scaling,
@@ -470,6 +486,7 @@ impl ProjectionReporter for DeviationReporter<'_> {
         in_fit: true,
     };
 
+    /// Returns the deviations of four points, with contact point, standard uncertainty and status.
     #[inline(always)]
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Deviation; LANES] {
         let normal = &at.projections.normal;

@@ -27,11 +27,14 @@ pub(super) struct RadiusEstimate {
 }
 
 impl Registration {
-    /// Returns the estimate of the radius as a seventh unknown of the fit; `None` if the residuals are zero.
+    /// Estimates the correction dr of the probe radius by linear least squares, as a seventh unknown of the fit.
+    /// Returns `None` if the residuals are zero.
     ///
     /// ```text
-    ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
+    ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2,   g = (A^T A)^-1 A^T 1
     /// ```
+    ///
+    /// Here r_i is the deviation of point i, and a_i its row of the Jacobian A.
     pub(super) fn estimate_radius(&self) -> Option<RadiusEstimate> {
         let variance = self.quality.residual_sigma_mm.powi(2);
         let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
@@ -52,12 +55,12 @@ impl Registration {
         (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_share.is_finite()).then_some(told)
     }
 
-    /// Adds the standard uncertainty of the probe radius, in mm, to the covariance of the pose and to the uncertainties
-    /// of the deviations.
+    /// Adds the uncertainty of the probe radius to the covariance of the pose and to the uncertainties of the
+    /// deviations. `radius_sigma_mm` is the standard uncertainty of the radius, in mm. Equation: GUM, 5.1.2, for one
+    /// more input.
     ///
-    /// (A^T A)^-1 is taken from the covariance, so directions that are undetermined or locked do not change. If the
-    /// residuals are zero, the matrix is not available and nothing changes. Equation: GUM, 5.1.2, for one more input. A
-    /// robust loss is treated as squares.
+    /// Directions that are undetermined or locked keep their covariance. Changes nothing if the residuals are zero, or
+    /// if `radius_sigma_mm` is not positive and finite. A robust loss is treated as a square loss.
     pub fn add_radius_uncertainty(&mut self, radius_sigma_mm: f64) {
         let variance = self.quality.residual_sigma_mm.powi(2);
         if !(variance > 0.0 && radius_sigma_mm > 0.0 && radius_sigma_mm.is_finite()) {
@@ -74,8 +77,9 @@ impl Registration {
     }
 }
 
-/// Returns the decrease of a point's distance with each coordinate of the pose's twist. It is the same for every point
-/// on the normal.
+/// Returns the row of the Jacobian for a deviation: the decrease of the distance with each coordinate of the twist of
+/// the pose, in the model frame. The contact point and the probe centre have the same row, because both lie on the
+/// normal.
 fn row(deviation: &Deviation) -> Vector6<f64> {
     let (n, arm) = (deviation.normal, deviation.point.coords.cross(&deviation.normal));
     Vector6::new(n.x, n.y, n.z, arm.x, arm.y, arm.z)

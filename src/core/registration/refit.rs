@@ -11,10 +11,12 @@ use super::options::RegistrationOptions;
 use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
 use super::start::{InitialPose, sample_evenly};
 
-/// Descends, rejects the points that are off the part or outliers, and repeats until nothing changes.
+/// Fits the pose by alternation: minimises the objective, rejects the points that are off the part or outliers, and
+/// repeats until no point changes.
 ///
 /// # Errors
-/// A descent that does not converge, too few points in the fit, and a pose without any determined direction.
+/// Returns an error if the iteration does not converge, if fewer than half of the points are in the fit, or if the
+/// surface determines no free direction of the pose.
 pub(super) fn trim_and_refit(
     problem: &Problem,
     initial: &InitialPose,
@@ -70,7 +72,8 @@ const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 /// all points then need only those near the final pose.
 const COARSE_COUNTS_WITH_FITTED_NORMALS: [usize; 1] = [2048];
 
-/// Sets the start facets of the projections near the points, and fits all normals there at once.
+/// Fits all normals near the points at once, and stores a start facet for the projection of each point in
+/// `correspondences`. Does nothing if the normals of the surface are already known.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
     if !problem.surface.has_lazy_normals() {
         return;
@@ -82,11 +85,11 @@ fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Po
     }
 }
 
-/// Descends with a sample of `count` points, and returns a pose from which all points need only a step or two. The
-/// steps are appended to the trace.
+/// Fits the pose to a sample of `count` points. Returns a pose from which all points need only a step or two. Appends
+/// the steps to `trace`.
 ///
-/// With `screened`, outliers among the sample are rejected first. This is possible only near the minimum; far from it
-/// outliers cannot be distinguished.
+/// If `screened` is given, outliers of the sample are rejected first, by its options. This is possible only near the
+/// minimum; far from it outliers cannot be distinguished.
 fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
@@ -106,8 +109,12 @@ fn descend_coarsely(
     Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
 }
 
-/// Rejects a descent with too few points in the fit, or one in which the surface determines no direction although not
-/// all are locked (`is_held`).
+/// Returns `descent` unchanged if its fit is usable. `points` is the number of all points; `is_held` is true if all
+/// directions of the pose are locked.
+///
+/// # Errors
+/// Returns [`RegistrationError::TooFewUsed`] if fewer than half of the points are in the fit, and
+/// [`RegistrationError::Undetermined`] if the surface determines no direction although not all are locked.
 fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
     if descent.sums.points * 2 < points {
         return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
@@ -118,7 +125,8 @@ fn check_descent(descent: Descent, points: usize, is_held: bool) -> Result<Desce
     Ok(descent)
 }
 
-/// Sets the scale of a robust loss to the robust standard deviation of the current distances, if distances are `known`.
+/// Sets the scale of a robust loss to the robust standard deviation of the current distances. Does nothing if the
+/// distances are not yet `known`, or if `options` select no robust loss.
 fn rescale_loss(problem: &mut Problem, options: &RegistrationOptions, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
@@ -129,6 +137,8 @@ fn rescale_loss(problem: &mut Problem, options: &RegistrationOptions, correspond
 /// Minimum standard deviation of the noise, in mm. No CMM repeats better, and the noise of a file can be rounding only.
 pub(crate) const MIN_SIGMA_MM: f64 = 1e-5;
 
+/// Returns the median of the distances of the points on the part, and their robust standard deviation (from the median
+/// absolute deviation), both in mm. Uses a sample of a large cloud. The second value is at least [`MIN_SIGMA_MM`].
 fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
     // A sample gives the sigma of many points to a percent.
     let stride = correspondences.len().div_ceil(1 << 16);
@@ -137,8 +147,9 @@ fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
     (median, sigma.max(MIN_SIGMA_MM))
 }
 
-/// Projects those points again that are beyond the edge or implausibly far away. Returns the number of points with a
-/// better projection elsewhere.
+/// Searches again, over the whole surface, for the projections of the points that are beyond the edge or far from it:
+/// more than 0.2 mm and more than six robust standard deviations from the median distance. Returns the number of points
+/// for which a better projection was found.
 ///
 /// A walk over the facets ends at the edge of a gap, although the right facet can lie beyond the gap.
 fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
@@ -169,11 +180,13 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
     correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
-/// Selects the points that take part in the fit, and returns the number of points that changed. With `both_ways` a
-/// rejected point can be accepted again. A rejected point can still be form, see [`super::isolated_touches`].
+/// Sets for each point whether it takes part in the fit. Returns the number of points that changed. If `both_ways` is
+/// true, a rejected point can be accepted again.
 ///
-/// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
-/// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.
+/// Rejects points off the part, and outliers: points farther than `options.outlier_sigmas` robust standard deviations
+/// from the median distance that also differ from their neighbours. A smooth form error, however large, is no outlier.
+/// Beyond four times this limit a point is an outlier whatever its neighbours are. A rejected point can still be form,
+/// see [`super::isolated_touches`].
 fn select_fit_points(
     problem: &Problem,
     options: &RegistrationOptions,
@@ -204,10 +217,11 @@ fn select_fit_points(
     changed
 }
 
-/// Returns for each suspect true if its distance differs by more than a limit from the median of eight neighbours.
+/// Returns one flag for each index in `suspects`: true if the distance of this point differs by more than `limit_mm`
+/// from the median distance of its eight nearest neighbours.
 ///
-/// Neighbours nearer than half the mean spacing are twins: repeats of the same place with the same fault. They are left
-/// out. A suspect with only twins around it is isolated.
+/// Ignores neighbours nearer than half the mean spacing: they repeat the same place with the same fault. A suspect that
+/// has only such neighbours is isolated (true).
 fn isolated_flags(
     measured: &[Point],
     correspondences: &[Correspondence],

@@ -39,12 +39,12 @@ pub struct FiguresWithOutliers {
 const MAX_NAMED: usize = 5;
 
 impl Registration {
-    /// Returns the outliers, each with the index of its point.
+    /// Returns the outliers, each with its index in the list of measured points, counted from 0.
     pub fn outliers(&self) -> impl Iterator<Item = (usize, &Deviation)> {
         self.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Outlier)
     }
 
-    /// Returns the figures that include the outliers; `None` if there are no outliers.
+    /// Returns RMS and PV of all points on the part, outliers included; `None` if there are no outliers.
     pub fn figures_with_outliers(&self) -> Option<FiguresWithOutliers> {
         let points = StatusCounts::count(&self.deviations).outliers;
         if points == 0 {

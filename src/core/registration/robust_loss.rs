@@ -28,6 +28,8 @@ pub(crate) struct ScaledLoss {
 const SIGMA_PER_MAD: f64 = 1.482_602_218_505_602;
 
 impl ScaledLoss {
+    /// Creates a loss whose limit is the tuning constant of `loss` times `sigma_mm`, the robust standard deviation of
+    /// the distances.
     pub(crate) fn new(loss: Loss, sigma_mm: f64) -> Self {
         let tuning = match loss {
             Loss::None => f64::INFINITY,
@@ -37,8 +39,8 @@ impl ScaledLoss {
         Self { loss, limit_mm: tuning * sigma_mm }
     }
 
-    /// Returns the weight of a distance, and its contribution to the objective in mm^2. Near zero this is d^2 for every
-    /// loss.
+    /// Returns the weight of a distance (in mm) for iteratively reweighted least squares, and its contribution to the
+    /// objective in mm^2. Near zero the contribution is the squared distance for every loss.
     #[inline]
     pub(crate) fn weigh(&self, distance: f64) -> (f64, f64) {
         let square = distance * distance;
@@ -60,7 +62,8 @@ impl ScaledLoss {
     }
 }
 
-/// Returns the median of the distances, and their robust standard deviation from the median absolute deviation.
+/// Returns the median of the distances, and their robust standard deviation: 1.4826 times the median absolute deviation
+/// (MAD). Returns zeros if there are no distances.
 pub(crate) fn robust_median_and_sigma(distances: impl Iterator<Item = f64>) -> (f64, f64) {
     let mut values: Vec<f64> = distances.collect();
     if values.is_empty() {

@@ -18,8 +18,9 @@ const MAX_RELATIVE_CHANGE: f64 = 0.5;
 /// Maximum number of points that are examined.
 const MAX_EXAMINED: usize = 400;
 
-/// Returns the share of the singular values below which directions come from the sampling; `None` if the part itself
-/// determines all directions.
+/// Returns a limit for singular values, as a share of the root of the sum of their squares: directions below it are
+/// determined only by the node positions of the nominal grid, not by the shape of the part. Returns `None` if there is
+/// no such direction, or if the surface is not a single grid.
 pub(super) fn sampling_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
     let free = free_projector(&problem.locked, &descent.scaling);
     let gram = descent.sums.gram();

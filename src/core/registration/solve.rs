@@ -12,7 +12,8 @@ pub(crate) struct Spectrum {
 }
 
 impl Spectrum {
-    /// Decomposes A^T A = V S^2 V^T.
+    /// Computes the singular values S and the right singular vectors V of the Jacobian A from `gram` = A^T A = V S^2
+    /// V^T, by a symmetric eigendecomposition.
     ///
     /// The columns of A are centred and scaled beforehand. So squaring loses no more than the surface itself leaves
     /// undetermined.
@@ -26,20 +27,22 @@ impl Spectrum {
         }
     }
 
-    /// Returns the number of directions that the surface determines: squared singular values above `whole *
-    /// least_share^2`.
+    /// Returns the number of directions that the surface determines: those with a squared singular value above
+    /// `whole * least_share^2`.
     ///
-    /// `whole` is the sum of the squares before any direction was locked. So the rounding that a lock leaves does not
-    /// count as a direction.
+    /// `whole` is the sum of all squared singular values before any direction was locked. So the rounding that a lock
+    /// leaves does not count as a direction.
     pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
         let limit = whole * least_share * least_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()
     }
 
-    /// Minimises |A m - b| over |m| <= alpha within the leading `rank` directions, and returns m.
+    /// Solves the ball-constrained least-squares problem: returns the m that minimises |A m - b| with |m| <= `alpha`,
+    /// within the first `rank` directions. `right` is A^T b.
     ///
-    /// Equation: m(mu) = sum_k v_k (v_k . A^T b) / (s_k^2 + mu). Here mu = 0 if that m lies in the ball; otherwise mu
-    /// is the root of the secular equation |m(mu)| = alpha (Golub and Van Loan, Matrix Computations, 12.1.2).
+    /// Equation: m(mu) = sum_k v_k (v_k . A^T b) / (s_k^2 + mu), with the singular values s_k and right singular
+    /// vectors v_k of A. Here mu = 0 if that m lies in the ball; otherwise mu is the root of the secular equation
+    /// |m(mu)| = alpha (Golub and Van Loan, Matrix Computations, 12.1.2).
     pub(crate) fn step(&self, right: &Vector6<f64>, rank: usize, alpha: f64) -> Vector6<f64> {
         let along = self.directions.transpose() * right;
         let step = |mu: f64| {
@@ -56,8 +59,9 @@ impl Spectrum {
         step(self.multiplier(&along, rank, alpha))
     }
 
-    /// Solves 1/|m(mu)| = 1/alpha for mu by Newton's method. In this form the function is nearly straight, and the
-    /// iteration rises to the root from below without overshooting.
+    /// Returns the Lagrange multiplier mu of the ball constraint in [`Self::step`]: the root of 1/|m(mu)| = 1/alpha, by
+    /// Newton's method. `along` are the components of A^T b along the singular vectors. In this form the function is
+    /// nearly straight, and the iteration rises to the root from below without overshooting.
     fn multiplier(&self, along: &Vector6<f64>, rank: usize, alpha: f64) -> f64 {
         let mut mu = 0.0;
         for _ in 0..60 {

@@ -45,8 +45,8 @@ pub(crate) struct Candidate {
 }
 
 impl Candidate {
-    /// Orders candidates by fit, the better first. Of two candidates that fit alike, the one with more points on the
-    /// part is first.
+    /// Orders candidates from the best fit to the worst, by the rms times (1 + 4 times the share of points off the
+    /// part).
     fn by_fit(&self, other: &Self) -> std::cmp::Ordering {
         let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part_share);
         badness(self).total_cmp(&badness(other))
@@ -76,10 +76,12 @@ const MIN_SIDE_RATIO: f64 = 2.0;
 /// Maximum difference of the shares of points off the part at which the side with more of them can still fit better.
 const MAX_OFF_PART_EXCESS: f64 = 0.05;
 
-/// Returns the initial pose and the side of the probe.
+/// Returns the initial pose and the side of the probe. A start pose in `options` is kept; otherwise many poses are
+/// tried.
 ///
 /// # Errors
-/// A given side that fits much worse than the other, and a search without any candidate.
+/// Returns [`RegistrationError::WrongSide`] if a given side fits much worse than the other, and
+/// [`RegistrationError::Undetermined`] if the search finds no candidate.
 pub(crate) fn initial_pose(
     part: &Part,
     measured: &[Point],
@@ -92,18 +94,21 @@ pub(crate) fn initial_pose(
     }
 }
 
-/// Returns the rms in mm of the best fit of the mirrored cloud; `None` if no mirrored pose is found.
+/// Returns the rms in mm of the best fit of the mirrored cloud, over all poses with no coordinate locked; `None` if no
+/// pose is found.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
-/// Returns the rms in mm of the best fit of the cloud as measured, with no coordinate locked.
+/// Returns the rms in mm of the best fit of the cloud as measured, over all poses with no coordinate locked; `None` if
+/// no pose is found.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
 }
 
-/// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
+/// Returns the rms of the cloud as measured and the rms of the mirrored cloud, in mm, if only the mirrored cloud fits;
+/// otherwise `None`.
 pub(crate) fn detect_mirror_image(
     part: &Part,
     measured: &[Point],
@@ -119,21 +124,22 @@ pub(crate) fn detect_mirror_image(
     (mirrored_rms_mm < 0.3 * rms_mm).then_some((rms_mm, mirrored_rms_mm))
 }
 
-/// Returns a sample of the points, mirrored in the plane x = 0 of the CMM frame. The choice of the plane does not
-/// matter to a search over all poses.
+/// Returns a sample of the points, mirrored in the plane x = 0 of the CMM frame. Any other plane would do as well,
+/// because the search tries all poses.
 fn mirrored(measured: &[Point]) -> Vec<Point> {
     sample_evenly(measured, 4 * COMPARE_POINTS).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms in mm of the best fit on one side over all poses, with no coordinate locked.
+/// Returns the rms in mm of the best fit on the given side, over all poses with no coordinate locked; `None` if no pose
+/// is found.
 fn searched_rms(part: &Part, points: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let options = RegistrationOptions { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
     search.refine_and_compare(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 
-/// Returns a sample of the points, evenly along their order. The sample is jittered, so that it does not follow one
-/// column of a grid.
+/// Returns a sample of at most `count` points, evenly along their order. Each place in the order is varied a little, so
+/// that the sample does not follow one column of a grid. The variation is the same in each call.
 pub(super) fn sample_evenly(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
     let n = points.len();
     let take = count.min(n);
@@ -151,6 +157,7 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
+    /// Prepares a search, with samples of the points of three sizes.
     fn new(part: &'a Part, measured: &'a [Point], options: &'a RegistrationOptions) -> Self {
         let sample = |count| sample_evenly(measured, count).copied().collect();
         Self {
@@ -163,7 +170,11 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Keeps a given pose and determines the side on which the points fit.
+    /// Returns the given pose unchanged, with the side on which the points fit better. If the fit does not decide,
+    /// takes the side on which most points lie.
+    ///
+    /// # Errors
+    /// Returns [`RegistrationError::WrongSide`] if the options give a side and the other one fits much better.
     fn determine_side(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
         // A given pose can refer to either side.
         let at = |side: Side| {
@@ -191,11 +202,15 @@ impl<'a> Search<'a> {
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
-    /// Tries many poses and returns the best.
+    /// Tries many poses, and returns the best with its side and the other poses that fit about as well.
     ///
     /// The candidates are refined on one side of the surface. On the other side the probe centres lie two radii away, a
     /// small distance compared with the differences between right and wrong poses. Only the best candidates are
     /// compared on both sides.
+    ///
+    /// # Errors
+    /// Returns [`RegistrationError::Undetermined`] if there is no candidate on one of the sides, and
+    /// [`RegistrationError::WrongSide`] if a given side fits much worse than the other.
     fn search(&self) -> Result<InitialPose, RegistrationError> {
         let side = self.options.side.side().unwrap_or_default();
         let candidates = self.candidates(side);
@@ -216,8 +231,12 @@ impl<'a> Search<'a> {
         Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, is_refined: true, alternatives })
     }
 
-    /// Selects the side from the best fits on the two sides. Returns the side, its candidate, and true if the side is
-    /// certain.
+    /// Selects the side of the probe. `normal` and `opposite` are the best fits on the two sides. Returns the side, its
+    /// fit, and true if the side is certain. A given side is kept.
+    ///
+    /// # Errors
+    /// Returns [`RegistrationError::WrongSide`] if the rms on the given side is more than eight times the rms on the
+    /// other side.
     fn choose_side(
         &self,
         normal: Candidate,
@@ -244,15 +263,16 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Returns the pose for one side from the pose for the other: the surface is shifted by two radii along its mean
-    /// normal.
+    /// Converts a pose that fits on the other side to the start pose for `side`. Shifts the surface by two probe radii
+    /// along its mean normal.
     fn move_across(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
         pose * Pose { translation_mm: shift, ..Pose::identity() }
     }
 
-    /// Returns the best of all starts on one side, roughly refined, the best first.
+    /// Returns the most promising poses on one side, roughly refined and with the best first. The start poses are the
+    /// identity, those from principal axes, and those from curvature.
     fn candidates(&self, side: Side) -> Vec<Candidate> {
         let surface = self.part.surface(self.options, side);
         let mut starts = vec![Pose::identity()];
@@ -278,7 +298,7 @@ impl<'a> Search<'a> {
         refined
     }
 
-    /// Refines the best candidates fully on one side. Returns them with the best first, each pose once.
+    /// Refines the best of `candidates` fully on one side. Returns them with the best first, without repeated poses.
     fn refine_and_compare(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
         let best = &candidates[..candidates.len().min(MAX_COMPARED)];
         let mut compared: Vec<Candidate> =
@@ -293,8 +313,8 @@ impl<'a> Search<'a> {
         distinct
     }
 
-    /// Returns the difference of two poses: the rotation in radians plus the shift of the cloud's centroid in units of
-    /// its size.
+    /// Returns the difference of two poses without unit: the rotation in radians, plus the shift of the centroid of the
+    /// cloud divided by the rms size of the cloud.
     fn pose_distance(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inverse() * *b;
         let centre = self.few.iter().map(|p| p.coords).sum::<Vector>() / self.few.len() as f64;
@@ -304,21 +324,21 @@ impl<'a> Search<'a> {
         between.angle_rad() + shift / self.part.size_mm
     }
 
-    /// Returns the distance in mm at which larger distances are truncated in a score.
+    /// Returns the cap for a distance in [`Self::score`], in mm: larger distances count as this one.
     fn truncation_mm(&self) -> f64 {
         0.1 * self.part.size_mm
     }
 
-    /// Returns the root mean square, in mm, of the truncated distances from the part itself. The surface is not
-    /// continued beyond the edge.
+    /// Scores a pose; smaller is better. Returns the root mean square, in mm, of the distances of `points` from the
+    /// part, capped at [`Self::truncation_mm`]. The distance beyond the edge is included.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
         let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Returns the pose with its figures of fit, from the smallest nine tenths of the distances. Outliers in the
-    /// remaining tenth have no influence.
+    /// Returns the pose with its figures of fit to `points`. Only the smallest nine tenths of the distances count, so
+    /// that outliers in the remaining tenth have no influence.
     fn assess_candidate(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
@@ -340,7 +360,8 @@ impl<'a> Search<'a> {
         Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part_share: off_part, side: surface.side() }
     }
 
-    /// Returns the squared distances from the part itself in mm^2. The distance beyond the edge is included.
+    /// Returns the squared distance of each point from the part, in mm^2. Beyond the edge it is the squared distance
+    /// along the normal plus the squared distance beyond the edge.
     fn squared_distances_mm2<'b>(
         &self,
         surface: &'b OffsetSurface,
@@ -355,8 +376,8 @@ impl<'a> Search<'a> {
         })
     }
 
-    /// Descends from a start pose with a loss that ignores gross outliers. The scale of the loss follows the distances
-    /// as they decrease.
+    /// Refines the pose `start` with Tukey's loss, which ignores gross outliers. Each of the `rounds` adapts the scale
+    /// of the loss to the distances and takes at most `iterations` steps. Returns the pose with its figures of fit.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let (middle, size_mm) = centroid_and_size(points);
         let mut problem = Problem {
@@ -384,8 +405,8 @@ impl<'a> Search<'a> {
         self.assess_candidate(&problem.surface, pose, points)
     }
 
-    /// Returns the pose with the smallest rotation from the frame of the file, among the poses that fit as well as the
-    /// best. If the surface does not determine a rotation, only the frame of the file does.
+    /// Returns the pose with the smallest rotation from the model frame to the CMM frame, among the poses that fit as
+    /// well as `best`. If the surface does not determine a rotation, only the coordinates in the file do.
     fn prefer_file_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
         /// Largest ratio of two rms that differ by chance.
         const MAX_RMS_RATIO: f64 = 1.1;
@@ -423,7 +444,8 @@ impl<'a> Search<'a> {
             .unwrap_or(best)
     }
 
-    /// Returns the poses that fit nearly as well as the best one and differ clearly from it.
+    /// Returns the poses in `all` that fit nearly as well as `best` (less than 1.5 times its rms) and differ clearly
+    /// from it.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
@@ -436,8 +458,8 @@ impl<'a> Search<'a> {
             .collect()
     }
 
-    /// Returns poses that lay the principal axes of the two clouds on each other: both faces, in steps of 15 degrees
-    /// about the shortest axis.
+    /// Returns 48 start poses that align the principal axes of the nominal points and of the measured points: the
+    /// shortest axis in both directions, and in each 24 rotations about it in steps of 15°.
     fn by_principal_axes(&self, side: Side) -> Vec<Pose> {
         const STEPS_PER_TURN: usize = 24;
         let frame = |points: &[Point]| {
@@ -464,8 +486,8 @@ impl<'a> Search<'a> {
         starts
     }
 
-    /// Returns poses that map features of the measured points to features of the offset surface with similar
-    /// curvatures.
+    /// Returns start poses from curvature. Each maps a place of the measured cloud to a place of the offset surface
+    /// with similar principal curvatures.
     fn by_curvature(&self, side: Side) -> Vec<Pose> {
         let on_nominal = self.part.nominal.features();
         if on_nominal.len() < MATCHES_PER_FEATURE {
@@ -479,15 +501,15 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Excludes the points beyond the edge from the fit. If at least half of the points are beyond it, the pose is too far
-/// off and no point is excluded.
+/// Excludes the points beyond the edge from the fit, and includes all others. If at least half of the points are beyond
+/// the edge, the pose is too far off and all points are included.
 fn exclude_off_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
     correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
 }
 
-/// Returns a sample of the features in the better half by the difference of their two curvatures. With a large
+/// Selects about 24 features from the half with the largest difference of the two principal curvatures. With a large
 /// difference the principal directions are certain.
 fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
@@ -496,8 +518,8 @@ fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature
     features.into_iter().step_by(stride).collect()
 }
 
-/// Returns the poses that map a measured feature to the features of the surface with the most similar curvatures, each
-/// with both matches of the principal directions.
+/// Returns poses that map the 36 features of `offset` with the most similar principal curvatures to the feature
+/// `measured`. Each match gives two poses, because a principal direction has no sign.
 fn poses_by_feature(measured: &CurvatureFeature, offset: &[CurvatureFeature]) -> Vec<Pose> {
     let unlike = |f: &CurvatureFeature| {
         (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
@@ -523,6 +545,8 @@ struct Frame {
 }
 
 impl Frame {
+    /// Creates a right-handed frame whose x axis is `first` and whose z axis is `normal`; both are unit vectors
+    /// perpendicular to each other.
     fn new(origin: Point, normal: Vector, first: Vector) -> Self {
         let second = normal.cross(&first);
         Self { origin, axes: nalgebra::Matrix3::from_columns(&[first, second, normal]) }

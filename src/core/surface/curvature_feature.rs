@@ -20,12 +20,12 @@ pub(crate) struct CurvatureFeature {
 }
 
 impl CurvatureFeature {
-    /// Returns the difference of the principal curvatures.
+    /// Returns the difference of the principal curvatures in 1/mm, at least 0.
     pub(crate) fn anisotropy(&self) -> f64 {
         self.curvatures[1] - self.curvatures[0]
     }
 
-    /// Returns the same feature for the opposite direction of the normal.
+    /// Returns the same feature with the opposite normal. The principal curvatures change sign and order.
     pub(crate) fn flipped(&self) -> Self {
         Self {
             point: self.point,
@@ -35,10 +35,11 @@ impl CurvatureFeature {
         }
     }
 
-    /// Returns the feature of the offset surface at this place, with its normal towards `side`; `None` if the offset
-    /// surface folds there.
+    /// Returns the feature of the offset surface at this place, with the normal towards `side`. `radius_mm` is the
+    /// offset r. Returns `None` if the offset surface folds there.
     ///
-    /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions do not change.
+    /// Equation: a normal curvature k towards the side of the offset becomes k / (1 - r k); the principal directions do
+    /// not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
         let seen = if side == Side::Normal { *self } else { self.flipped() };
         let room = seen.curvatures.map(|k| 1.0 - radius_mm * k);
@@ -53,10 +54,11 @@ impl CurvatureFeature {
 /// Number of nearest points that a local fit uses, including the point itself.
 const NEIGHBOURS: u32 = 25;
 
-/// Fits the curvature at each of some scattered points; uses their normals if these are known.
+/// Fits the principal curvatures at each point to its 24 nearest neighbours. Uses `normals`, one per point, if they are
+/// given. Omits points whose neighbours do not form a surface.
 ///
-/// A second fit excludes the neighbours that contradict the first, so that an outlier spoils only itself and not the
-/// places around it. Points whose neighbours do not form a surface are omitted.
+/// A second fit excludes the neighbours that contradict the first. So an outlier spoils only its own feature and not
+/// the features around it.
 pub(crate) fn fit_features(points: &[Point], normals: Option<&[Vector]>) -> Vec<CurvatureFeature> {
     let tree = PointTree::new(points.iter().copied());
     (0..points.len())
@@ -70,6 +72,8 @@ pub(crate) fn fit_features(points: &[Point], normals: Option<&[Vector]>) -> Vec<
         .collect()
 }
 
+/// Fits the principal curvatures at the point `at` to the points `around` it. `known` is the normal, if it is given.
+/// Returns `None` if there are fewer than nine neighbours, or if the fit is not finite.
 fn fit_feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<CurvatureFeature> {
     if around.len() < 9 {
         return None;

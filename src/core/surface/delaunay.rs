@@ -35,10 +35,11 @@ const TWINS: f64 = 1e-4;
 /// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
 const MAX_COORDINATE: f64 = 3.2e60;
 
-/// Triangulates scattered points in the plane of a map, and removes the needles at the hull and the bridges over holes.
+/// Triangulates scattered points in the plane of the projector `map` (Delaunay). Then removes flat triangles at the
+/// convex hull and triangles that bridge holes.
 ///
-/// Shapes: returns the points in an order in which neighbours in the plane are mostly neighbours in memory, and
-/// triangles whose corners index these points, counter-clockwise in the plane.
+/// Shapes: returns the points in a new order, in which neighbours in the plane are mostly neighbours in memory, and the
+/// triangles. Their corners index the returned points, counter-clockwise in the plane.
 ///
 /// # Errors
 /// Returns an error if a coordinate is not finite or too large, if two points coincide or nearly coincide in the plane,
@@ -76,8 +77,8 @@ pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Poin
     Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
-/// Returns the keys and the indices of the places, sorted along a Z-curve. Places with equal keys are sorted by u, then
-/// by v.
+/// Sorts places (u, v) of the plane along a Z-curve (Morton order). Returns for each its key on the curve and its index
+/// in `places`. Places with equal keys are sorted by u, then by v.
 pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
@@ -98,7 +99,7 @@ pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     along
 }
 
-/// Returns the bits with a zero inserted before each of them.
+/// Spreads 32 bits to the even positions of 64 bits, with zeros between them, as a Morton key requires.
 fn spread_bits(bits: u32) -> u64 {
     let mut bits = u64::from(bits);
     bits = (bits | bits << 16) & 0x0000_FFFF_0000_FFFF;
@@ -108,12 +109,14 @@ fn spread_bits(bits: u32) -> u64 {
     (bits | bits << 1) & 0x5555_5555_5555_5555
 }
 
-/// Returns 0 for a coordinate closer to zero than 1e-40, whose products would underflow, and for -0; returns other
+/// Returns 0 for -0 and for a coordinate closer to zero than 1e-40, whose products would underflow. Returns other
 /// coordinates unchanged.
 fn flushed_to_zero(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
 
+/// Returns the error that names two points with the same place in the plane. The caller knows that there are such
+/// points.
 fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     let mut order: Vec<usize> = (0..places.len()).collect();
     let key = |i: usize| (places[i][0], places[i][1]);
@@ -130,6 +133,7 @@ struct EdgeLengths {
 }
 
 impl EdgeLengths {
+    /// Computes the edge lengths of all triangles in the plane, in mm.
     fn new(t: &Triangles, places: &[[f64; 2]]) -> Self {
         let of = |corners: &[u32; 3]| {
             let [a, b, c] = squared_lengths(corners, places);
@@ -140,8 +144,8 @@ impl EdgeLengths {
     }
 }
 
-/// Returns two points that are so near to each other that the surface between them consists of rounding errors; `None`
-/// if there are none.
+/// Returns two points nearer to each other than 1e-4 times the usual edge length: the surface between them would
+/// consist of rounding errors. Returns `None` if there are none.
 fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
     let least = TWINS * lengths.median_max_edge;
     let facet = lengths.min_edge.par_iter().position_first(|shortest| *shortest < least)?;
@@ -151,6 +155,8 @@ fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]
     Some([corners[(across + 1) % 3], corners[(across + 2) % 3]])
 }
 
+/// Removes the triangles that bridge holes, and then, from the border inwards, the needles: border triangles much
+/// flatter than their border edge is long.
 fn without_bridges_and_needles(mut t: Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Triangles {
     let mut dropped = vec![false; t.corners.len()];
     let mut open: Vec<u32> = Vec::new();
@@ -167,6 +173,8 @@ fn without_bridges_and_needles(mut t: Triangles, lengths: &EdgeLengths, places: 
     compact(t, &dropped)
 }
 
+/// Marks a triangle as removed and makes its edges border edges. Appends its neighbours to `open`, because they are at
+/// the border now.
 fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Vec<u32>) {
     dropped[facet as usize] = true;
     for neighbour in t.neighbours[facet as usize] {
@@ -179,7 +187,7 @@ fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Ve
     t.neighbours[facet as usize] = [BORDER; 3];
 }
 
-/// Returns the squared length of the edge opposite to each corner.
+/// Returns the squared lengths of the three edges of a triangle; entry k is the edge opposite to corner k.
 fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     let at = corners.map(|c| places[c as usize]);
     [(1, 2), (2, 0), (0, 1)].map(|(a, b): (usize, usize)| {
@@ -188,7 +196,8 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     })
 }
 
-/// Returns the triangles with edges far longer than usual around their corners.
+/// Returns the triangles whose longest edge is more than six times the usual edge length around their corners, see
+/// [`usual_lengths`].
 fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
@@ -207,10 +216,10 @@ fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
         .collect()
 }
 
-/// Returns the usual edge length at the corners of the triangles `suspects`. At a corner it is the lower quartile of
-/// the longest edges of the triangles there, because at the rim of a hole half of these triangles can be bridges.
+/// Returns the usual edge length at each corner of the triangles `suspects`, by vertex. It is the lower quartile of the
+/// longest edges of the triangles that meet there, because at the rim of a hole half of these triangles can be bridges.
 ///
-/// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller compares
+/// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller must compare
 /// with the largest value of the three corners. A stray point would justify its own bridges. Therefore the value of a
 /// corner is limited to the second largest value of its neighbours.
 fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> HashMap<u32, f64> {
@@ -233,7 +242,7 @@ fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> Hash
     neighbours.iter().map(confirmed).collect()
 }
 
-/// Returns for each of these vertices the triangles that meet there.
+/// Returns a map from each vertex in `vertices` to the triangles that meet there.
 fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u32, Vec<u32>> {
     let mut is_wanted = vec![false; t.corners.par_iter().flatten_iter().max().map_or(0, |most| *most as usize + 1)];
     vertices.for_each(|c| is_wanted[c as usize] = true);
@@ -247,6 +256,7 @@ fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u
     of
 }
 
+/// Returns true if a triangle has a border edge and its height over this edge is less than 0.05 of the edge length.
 fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {
     let [a, b, c] = t.corners[facet as usize].map(|c| places[c as usize]);
     let double_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
@@ -254,6 +264,7 @@ fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {
     (0..3).any(|k| t.neighbours[facet as usize][k] == BORDER && double_area < NEEDLE * squared[k])
 }
 
+/// Removes the triangles whose flag in `dropped` is true, and renumbers the others in their order.
 fn compact(t: Triangles, dropped: &[bool]) -> Triangles {
     if !dropped.contains(&true) {
         return t;
@@ -275,7 +286,7 @@ fn compact(t: Triangles, dropped: &[bool]) -> Triangles {
     }
 }
 
-/// Returns the median of the values.
+/// Returns the median of the values, the upper one of two middle values. There must be at least one value.
 fn median(values: &[f64]) -> f64 {
     const SAMPLE: usize = 1024;
     let middle = values.len() / 2;

@@ -7,9 +7,9 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum SurfaceError {
-    #[error("the nominal surface has {points} points and needs at least {min_points}; give a denser nominal")]
+    #[error("the nominal surface has {points} points and needs at least {min_points}; give more nominal points")]
     TooFewPoints { points: usize, min_points: usize },
-    #[error("nominal point {} is not finite; remove it or correct it", index + 1)]
+    #[error("nominal point {} has a coordinate that is not a finite number; remove or correct the point", index + 1)]
     NotFinite { index: usize },
     #[error(
         "nominal point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others; remove it or correct it",
@@ -62,7 +62,10 @@ pub enum SurfaceError {
         at[0], at[1], at[2]
     )]
     Orientation { at: [f64; 3] },
-    #[error("the grid has {columns} x {rows} nodes, and {points} points are given; give one point for each node")]
+    #[error(
+        "the grid has {columns} x {rows} nodes, and {points} points are given; give one point for each node, and at \
+         least 3 nodes along each axis"
+    )]
     GridSize { columns: usize, rows: usize, points: usize },
     #[error("a patch list is empty; give at least one patch")]
     NoPatches,

@@ -60,16 +60,18 @@ impl Side {
 
 /// Triangles for a point location; counter-clockwise as seen from the side of the normals.
 pub(crate) trait Facets: Sync {
-    /// Returns the three corners of a facet.
+    /// Returns the three corners of a facet, as indices of vertices.
     fn corners(&self, facet: u32) -> [u32; 3];
 
-    /// Returns the next facet on the way to a point with these barycentric weights; `None` if the surface ends there.
+    /// Returns the next facet on the way to a point. `weights` are the barycentric weights of the point in `facet`.
+    /// Returns `None` if the surface ends on the way, or if the way leads to no other facet.
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
 
-    /// Returns true if the surface ends at the edge of a facet that is opposite to this corner.
+    /// Returns true if the surface ends at one edge of a facet: the edge opposite to the corner with the number
+    /// `corner` (0 to 2).
     fn ends_at(&self, facet: u32, corner: usize) -> bool;
 
-    /// Returns a facet from which to start the search for a point.
+    /// Returns a facet from which to start the search for the projection of `p`.
     fn start(&self, p: &Point) -> u32;
 }
 
@@ -89,6 +91,8 @@ pub(crate) struct Facet<T> {
 }
 
 impl<T: Real> Facet<T> {
+    /// Creates a facet from its corners on the offset surface. `sign` is +1 if the probe is on the side of the normals,
+    /// otherwise -1.
     #[inline(always)]
     pub(crate) fn new([a, b, c]: [Corner<T>; 3], sign: T) -> Self {
         let turned = cross(&minus(&b.0, &a.0), &minus(&c.0, &a.0));
@@ -101,20 +105,20 @@ impl<T: Real> Facet<T> {
         }
     }
 
-    /// Returns the vector from a corner to a point.
+    /// Returns the vector from a corner (number 0 to 2) to the point `p`.
     #[inline(always)]
     pub(crate) fn vector_from_corner(&self, corner: usize, p: &[T; 3]) -> [T; 3] {
         minus(p, &self.corners[corner])
     }
 
-    /// Returns the edge from one corner to another.
+    /// Returns the vector along the edge from one corner to another (numbers 0 to 2).
     #[inline(always)]
     pub(crate) fn edge(&self, from: usize, to: usize) -> [T; 3] {
         minus(&self.corners[to], &self.corners[from])
     }
 
-    /// Returns the barycentric weights of the projection of a point onto the plane of the flat facet. `w` is the vector
-    /// from the first corner to the point.
+    /// Returns the barycentric weights of a point projected onto the plane of the flat facet. `w` is the vector from
+    /// corner 0 to the point.
     #[inline(always)]
     pub(crate) fn weights(&self, w: &[T; 3]) -> [T; 3] {
         let (e1, e2) = (self.edge(0, 1), self.edge(0, 2));
@@ -124,25 +128,27 @@ impl<T: Real> Facet<T> {
         [T::splat(1.0) - b1 - b2, b1, b2]
     }
 
-    /// Returns the unit normal of the flat facet, towards the probe's side; eq. (1).
+    /// Returns the unit normal of the flat facet, towards the side of the probe; eq. (1) of the paper.
     #[inline(always)]
     pub(crate) fn flat_normal(&self) -> [T; 3] {
         times(&self.area_normal, self.sign / self.area_normal_squared.sqrt())
     }
 
-    /// Returns the point of the flat facet with these weights.
+    /// Returns the point of the flat facet with the barycentric weights `b`.
     #[inline(always)]
     pub(crate) fn point(&self, b: &[T; 3]) -> [T; 3] {
         weighted(&self.corners, b)
     }
 
-    /// Returns the unit normal of the curved surface at these weights.
+    /// Returns the unit normal of the curved surface at the barycentric weights `b`: the normalised weighted mean of
+    /// the corner normals.
     #[inline(always)]
     pub(crate) fn normal(&self, b: &[T; 3]) -> [T; 3] {
         T::unit(&weighted(&self.normals, b))
     }
 
-    /// Returns the height of the curved surface above the flat facet at these weights, positive on the probe's side.
+    /// Returns the height of the curved surface above the flat facet at the barycentric weights `b`, in mm. It is
+    /// positive on the side of the probe.
     #[inline(always)]
     pub(crate) fn height(&self, b: &[T; 3]) -> T {
         let zero = T::splat(0.0);
@@ -157,16 +163,16 @@ impl<T: Real> Facet<T> {
         along + T::splat(0.5) * total * b[0] * b[1] * b[2]
     }
 
-    /// Returns the flat distance of a point, eq. (2), and the flat normal. `w` is the vector from the first corner to
-    /// the point.
+    /// Returns the distance of a point from the plane of the flat facet, eq. (2) of the paper, and the unit normal of
+    /// this plane. `w` is the vector from corner 0 to the point.
     #[inline(always)]
     pub(crate) fn flat_distance(&self, w: &[T; 3]) -> (T, [T; 3]) {
         let flat = self.flat_normal();
         (dot(w, &flat), flat)
     }
 
-    /// Returns the curved distance of a point and the normal at its projection. `w` is the vector from the first corner
-    /// to the point; `b` are the barycentric weights of the projection.
+    /// Returns the distance of a point from the curved surface, and the unit normal of the surface at the projection.
+    /// `w` is the vector from corner 0 to the point; `b` are the barycentric weights of the projection.
     #[inline(always)]
     pub(crate) fn curved_distance(&self, w: &[T; 3], b: &[T; 3]) -> (T, [T; 3]) {
         let (flat_mm, flat) = self.flat_distance(w);
@@ -175,20 +181,22 @@ impl<T: Real> Facet<T> {
     }
 }
 
+/// Returns the sum of three vectors `v`, each multiplied by its weight in `b`.
 #[inline(always)]
 fn weighted<T: Real>(v: &[[T; 3]; 3], b: &[T; 3]) -> [T; 3] {
     let at = |k: usize| v[0][k] * b[0] + v[1][k] * b[1] + v[2][k] * b[2];
     [at(0), at(1), at(2)]
 }
 
-/// Moves a vertex onto the offset surface, eq. (3), and turns its normal to the probe's side.
+/// Moves a vertex along its normal onto the offset surface, eq. (3) of the paper. Returns the point, and the unit
+/// normal towards the side of the probe. `sign` is +1 if this is the side of the normals, otherwise -1.
 #[inline(always)]
 pub(crate) fn offset_corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius_mm: T) -> Corner<T> {
     let normal = times(&normal, sign);
     ([point[0] + normal[0] * radius_mm, point[1] + normal[1] * radius_mm, point[2] + normal[2] * radius_mm], normal)
 }
 
-/// Packs four vertices into lanes; returns their points and their normals.
+/// Packs four vertices into lanes. Returns their points and their normals.
 ///
 /// Every vector is built from registers. If it were built through an array in memory, it would wait for four narrow
 /// stores.
@@ -202,7 +210,7 @@ pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3
     (points_x4(&[a.point, b.point, c.point, d.point]), normal)
 }
 
-/// Packs four points into lanes.
+/// Packs the coordinates of four points into lanes, one point per lane.
 #[inline(always)]
 pub(crate) fn points_x4(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;

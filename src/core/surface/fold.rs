@@ -23,8 +23,8 @@ const STEP: usize = 2;
 const PROBE_ENLARGEMENT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
-    /// Returns the worst place where the offset surface folds as an error; `None` if it does not fold. All facets of a
-    /// grid are checked, and up to [`MAX_CHECKED_FACETS`] facets of a mesh.
+    /// Returns an error that names the most concave place where the offset surface folds; `None` if no fold is found.
+    /// Checks all facets of a grid, and up to [`MAX_CHECKED_FACETS`] facets of a mesh.
     pub(crate) fn find_fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
@@ -33,8 +33,9 @@ impl OffsetSurface<'_> {
         self.worst_fold(patches.iter().flat_map(|patch| self.folded_facets(patch).into_iter().map(move |f| (patch, f))))
     }
 
-    /// Returns the worst place where the offset surface folds as an error, among these facets of a mesh; `None` if
-    /// there is none. [`OffsetSurface::find_fold`] checks a whole grid.
+    /// Returns an error that names the most concave place where the offset surface folds among the facets `touched`;
+    /// `None` if none of them folds. Checks only facets of meshes, because [`OffsetSurface::find_fold`] checks a whole
+    /// grid.
     pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = FacetIndex>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
         let is_mesh = |patch: &Patch| matches!(patch.topology, Topology::Mesh(_));
@@ -47,7 +48,7 @@ impl OffsetSurface<'_> {
         self.worst_fold(there.into_iter())
     }
 
-    /// Returns the error for the worst of some folded facets; `None` if there are none.
+    /// Returns an error that names the most concave of the facets in `folded`; `None` if there are none.
     fn worst_fold<'a>(&self, folded: impl Iterator<Item = (&'a Patch, u32)>) -> Option<SurfaceError> {
         let worst = folded.map(|(p, f)| (self.min_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -55,7 +56,8 @@ impl OffsetSurface<'_> {
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
-    /// Returns the folded facets of a patch, among those that are checked.
+    /// Returns the facets of a patch at which the offset surface folds. Checks all facets of a grid, and a sample of
+    /// the facets of a mesh.
     fn folded_facets(&self, patch: &Patch) -> Vec<u32> {
         match &patch.topology {
             Topology::Grid(grid) => {
@@ -81,7 +83,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the facets that are [`STEP`] nodes wide along a row of nodes.
+    /// Returns the work for the first check of a grid: facets [`STEP`] nodes wide along the row of nodes with the
+    /// number `row`, and the enlarged offset.
     fn wide_row<'a>(&self, grid: &GridTopology, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
@@ -92,8 +95,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns true if the offset reverses a facet or makes it flat: E + r B (see [`Self::fundamental_forms`]) is not
-    /// positive definite.
+    /// Returns true if the offset reverses a facet or makes it flat: the matrix E + r B is not positive definite. E and
+    /// B are the fundamental forms, see [`Self::fundamental_forms`], and r is the probe radius.
     #[inline]
     fn is_folded(&self, patch: &Patch, corners: [u32; 3]) -> bool {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
@@ -102,8 +105,9 @@ impl OffsetSurface<'_> {
         is_not_positive_definite(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
-    /// Returns the smallest normal curvature of a facet in 1/mm, negative if the facet is concave as seen from the
-    /// probe's side. It is the smallest eigenvalue of E^-1 B (see [`Self::fundamental_forms`]).
+    /// Returns the smallest normal curvature of a facet in 1/mm. It is negative if the facet is concave as seen from
+    /// the side of the probe. It is the smallest eigenvalue of E^-1 B, where E and B are the fundamental forms, see
+    /// [`Self::fundamental_forms`].
     fn min_curvature(&self, patch: &Patch, facet: u32) -> f64 {
         let ([e, f, g], [l, m, k]) = self.fundamental_forms(patch, patch.corners(facet));
         let det = e * g - f * f;
@@ -112,11 +116,12 @@ impl OffsetSurface<'_> {
         mean - (mean * mean - gauss).max(0.0).sqrt()
     }
 
-    /// Returns the first and the second fundamental form, E and B, over two edges of a facet, as seen from the probe's
-    /// side. Each is given by its entries 11, 12 and 22.
+    /// Returns the first and the second fundamental form, E and B, of a facet with the corners a, b and c. The basis
+    /// are the edges e_1 = b - a and e_2 = c - a; the normals point to the side of the probe. Each form is given by its
+    /// entries 11, 12 and 22.
     ///
     /// Along an edge e the normal changes by dn = K e. With E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j,
-    /// K is E^-1 B. The offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
+    /// K is E^-1 B. The offset by r has the first form E + 2 r B + O(r^2). It is singular where E + r B is.
     #[inline]
     fn fundamental_forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
         let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
@@ -138,7 +143,7 @@ struct WideRow<'a> {
 impl pulp::NullaryFnOnce for WideRow<'_> {
     type Output = bool;
 
-    /// Returns true if the offset by `reach` folds any of the facets; facets at holes do not count.
+    /// Returns true if the offset by `reach` folds any facet of the row. Facets at holes do not count.
     #[inline(always)]
     fn call(self) -> bool {
         let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);
@@ -164,7 +169,9 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 }
 
 impl WideRow<'_> {
-    /// Returns true if E + r B is not positive definite for any of four facets; see [`is_not_positive_definite`].
+    /// Returns true if the offset folds any of four facets, one per lane. `here`, `next` and `up` are the points and
+    /// normals of the corners: the first, the next in the row, and the one in the row above. See
+    /// [`is_not_positive_definite`] for the criterion.
     #[inline(always)]
     fn any_folds_x4(
         &self,
@@ -187,8 +194,9 @@ impl WideRow<'_> {
     }
 }
 
-/// Returns true if E + r B is not positive definite; returns false for NaN. `e1` and `e2` are two edges; `d1` and `d2`
-/// are r times the change of the normal along each.
+/// Returns true if the offset by r folds a facet: E + r B is not positive definite, where E and B are the first and
+/// second fundamental form over the edges `e1` and `e2`. `d1` and `d2` are r times the change of the unit normal along
+/// each edge. Returns false for NaN.
 #[inline(always)]
 fn is_not_positive_definite(e1: Vector, e2: Vector, d1: Vector, d2: Vector) -> bool {
     let e = e1.dot(&(e1 + d1));

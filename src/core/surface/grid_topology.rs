@@ -24,7 +24,7 @@ pub(crate) struct GridTopology {
     regular: Option<([f64; 2], [f64; 2])>,
 }
 
-/// Returns the points in grid order, with NaN at a node that has no point.
+/// Returns the points in the order of the nodes of the grid, with NaN at a node that has no point.
 pub(crate) fn reorder_to_grid(points: Vec<Point>, order: &GriddedCloud) -> Vec<Point> {
     if order.is_ordered() {
         return points;
@@ -34,7 +34,8 @@ pub(crate) fn reorder_to_grid(points: Vec<Point>, order: &GriddedCloud) -> Vec<P
 }
 
 impl GridTopology {
-    /// Builds the triangles over points that are ordered row by row, column fastest; NaN points are holes.
+    /// Builds the triangles of a grid over `points`, which are ordered row by row with the column fastest. A NaN point
+    /// is a hole. `regular_in_xy` is true if the nodes have equal steps in x and in y.
     pub(crate) fn new(columns: usize, rows: usize, points: &[Point], regular_in_xy: bool) -> Self {
         let holes = points.par_iter().any(|p| p.x.is_nan());
         let present = if holes { points.iter().map(|p| p.x.is_finite()).collect() } else { Vec::new() };
@@ -58,6 +59,7 @@ impl GridTopology {
         }
     }
 
+    /// Returns the number of nodes in a row.
     pub(crate) fn columns(&self) -> usize {
         self.columns as usize
     }
@@ -67,27 +69,30 @@ impl GridTopology {
         self.regular.is_some()
     }
 
+    /// Returns the number of rows of nodes.
     pub(crate) fn rows(&self) -> usize {
         self.rows as usize
     }
 
-    /// Returns the lower right facet of each cell in a row of cells, with its corners. Facets at holes are included.
+    /// Returns the first of the two facets of each cell in a row of cells, with its corners. It has the corners 00, 10
+    /// and 11 of the cell. Facets at holes are included.
     pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
         let first = row as u32 * self.columns;
         (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
     }
 
-    /// Returns true if the facet is on the grid and all of its nodes exist.
+    /// Returns true if the facet number belongs to a cell of the grid, and if the three corners of the facet exist.
     pub(crate) fn has_facet(&self, facet: u32) -> bool {
         let (i, j) = self.cell_of(facet);
         i + 1 < self.columns && j + 1 < self.rows && self.corners(facet).iter().all(|&c| self.is_present(c as usize))
     }
 
+    /// Returns true if the node exists; false if it is a hole.
     pub(crate) fn is_present(&self, node: usize) -> bool {
         self.present.is_empty() || self.present[node]
     }
 
-    /// Returns the existing nodes within `reach` rows and columns of a node, without the node itself.
+    /// Returns the existing nodes at most `reach` rows and columns away from a node, without the node itself.
     pub(crate) fn block_around(&self, node: u32, reach: u32) -> Vec<u32> {
         let (i, j) = (node % self.columns, node / self.columns);
         let within = |k: u32, count: u32| k.saturating_sub(reach)..(k + reach + 1).min(count);
@@ -95,13 +100,15 @@ impl GridTopology {
         nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
     }
 
-    /// Returns a facet at a node. If the node has no facet, returns a facet of the nearest cell whose four nodes exist.
+    /// Returns a facet near a node: a facet of the cell that begins at the node, or of the nearest cell whose four
+    /// nodes exist.
     pub(crate) fn facet_near(&self, node: u32) -> u32 {
         let (i, j) = (node % self.columns, node / self.columns);
         let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
         self.facet_at(i, j, 0)
     }
 
+    /// Returns true if the four nodes of the cell in column `i` and row `j` exist.
     fn cell_is_whole(&self, i: u32, j: u32) -> bool {
         let node = (j * self.columns + i) as usize;
         let above = node + self.columns as usize;
@@ -109,17 +116,21 @@ impl GridTopology {
             || (self.present[node] && self.present[node + 1] && self.present[above] && self.present[above + 1])
     }
 
+    /// Returns the number of a facet of the cell in column `i` and row `j`. `half` is 0 for the lower right facet and 1
+    /// for the upper left one.
     fn facet_at(&self, i: u32, j: u32, half: u32) -> u32 {
         2 * (j * self.columns + i) + half
     }
 
+    /// Returns column and row of the cell of a facet.
     fn cell_of(&self, facet: u32) -> (u32, u32) {
         let node = facet / 2;
         (node % self.columns, node / self.columns)
     }
 
-    /// Returns the cell at (u, v) steps from a cell, clamped to the grid. If a node of that cell does not exist, the
-    /// steps are halved until they lead to a cell whose four nodes exist; `None` if there is no such cell.
+    /// Returns the cell that lies `u` columns and `v` rows from the cell (i, j), clamped to the grid. If one of its
+    /// four nodes does not exist, halves `u` and `v` until they lead to a cell whose four nodes exist. Returns `None`
+    /// if there is no such cell.
     fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
         let clamp =
             |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
@@ -136,7 +147,8 @@ impl GridTopology {
         }
     }
 
-    /// Returns the nearest cell whose four nodes exist; searches in rings of growing size.
+    /// Returns column and row of the cell nearest to (i, j) whose four nodes exist. Searches in square rings of growing
+    /// size. Returns (0, 0) if there is no such cell.
     fn nearest_whole_cell(&self, i: u32, j: u32) -> (u32, u32) {
         if self.cell_is_whole(i, j) {
             return (i, j);
@@ -163,7 +175,9 @@ impl Facets for GridTopology {
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }
 
-    /// Returns a facet of the cell to which the barycentric weights point, if the facet is continued as a plane.
+    /// Returns the next facet on the way to a point. Continues `facet` as a plane to find the cell to which the
+    /// barycentric `weights` of the point lead. Returns `None` if that is the same facet, or if no cell exists on the
+    /// way.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let (u, v) =
@@ -204,6 +218,7 @@ impl Facets for GridTopology {
     }
 }
 
+/// Returns the smallest and the largest x and y of the points. NaN points are ignored.
 fn extremes(points: &[Point]) -> ([f64; 2], [f64; 2]) {
     let merge = |a: ([f64; 2], [f64; 2]), b: ([f64; 2], [f64; 2])| {
         ([a.0[0].min(b.0[0]), a.0[1].min(b.0[1])], [a.1[0].max(b.1[0]), a.1[1].max(b.1[1])])
@@ -233,12 +248,12 @@ const DERIVATIVES: [&[&[f64]]; 6] = [
     ],
 ];
 
-/// Fits the unit normals of a structured grid, and returns them together with the points. The directions of column, row
+/// Fits the unit normals of the nodes of a grid, and returns each node with its normal. The directions of column, row
 /// and normal are right-handed.
 ///
-/// Shapes: one vertex per node, in grid order. The normal is NaN at holes and at nodes that have no neighbour along one
-/// of the two grid lines. Equation: the tangents are the derivatives of the quartics through five nodes along each grid
-/// line, central inside and one-sided at the border; the normal is their cross product.
+/// Shapes: one vertex per node, in grid order. The normal is NaN at holes, and at nodes that have no neighbour along a
+/// row or along a column. Equation: the tangents are the derivatives of the quartics through five nodes along the row
+/// and along the column, central inside and one-sided at the border. The normal is their cross product.
 pub(crate) fn fit_grid_nodes(points: &[Point], lattice: &GridTopology) -> Vec<Vertex> {
     let arch = pulp::Arch::new();
     // Whole blocks are written directly into the result; the last block is filled up with the last node.
@@ -264,6 +279,7 @@ struct NodeBlock<'a> {
 impl pulp::NullaryFnOnce for NodeBlock<'_> {
     type Output = [Vertex; BLOCK];
 
+    /// Returns the nodes of the block with their fitted normals.
     #[inline(always)]
     fn call(self) -> [Vertex; BLOCK] {
         const NONE: Vertex = Vertex { point: Point::new(0.0, 0.0, 0.0), normal: Vector::new(0.0, 0.0, 0.0) };
@@ -288,7 +304,8 @@ impl pulp::NullaryFnOnce for NodeBlock<'_> {
 }
 
 impl NodeBlock<'_> {
-    /// Fits four nodes of one row of a grid without holes, none of them within two nodes of its border.
+    /// Fits the normals of four nodes of one row from the index `first` on, and writes them to `nodes`. The grid must
+    /// have no holes, and no node may be within two nodes of the border.
     #[inline(always)]
     fn fit_inside_x4(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.topology.columns()));
@@ -300,8 +317,8 @@ impl NodeBlock<'_> {
         }
     }
 
-    /// Returns the derivative at the middle one of five nodes, of the quartic through them, for four neighbours along a
-    /// row.
+    /// Returns the derivative along a grid line at four nodes from the index `node` on, one per lane. It is the central
+    /// derivative of the quartic through five nodes that are `stride` indices apart.
     #[inline(always)]
     fn central_derivative(&self, node: usize, stride: usize) -> Vector3x4 {
         let near = minus(&self.points_x4(node + stride), &self.points_x4(node - stride));
@@ -309,12 +326,15 @@ impl NodeBlock<'_> {
         minus(&times(&near, F64x4::splat(2.0 / 3.0)), &times(&far, F64x4::splat(1.0 / 12.0)))
     }
 
+    /// Packs the four points from the index `first` on into lanes.
     #[inline(always)]
     fn points_x4(&self, first: usize) -> Vector3x4 {
         let (four, _) = self.points[first..].split_first_chunk::<LANES>().expect("inside the grid");
         points_x4(four)
     }
 
+    /// Fits the normals of four nodes from the index `first` on, one by one, and writes them to `nodes`. Works at
+    /// borders and holes. Past the end it repeats the last node.
     #[inline(never)]
     fn fit_anywhere_x4(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (points, lattice) = (self.points, self.topology);
@@ -328,8 +348,9 @@ impl NodeBlock<'_> {
     }
 }
 
-/// Returns the derivative along one grid line at its node number `at` of `count`, from a window of existing nodes
-/// around this node. Returns NaN if the node is a hole or has no neighbour on the line.
+/// Returns the derivative along a row or a column at a node, from a window of up to five existing nodes around it.
+/// `stride` is the distance of neighbouring nodes in the list; `at` is the number of the node on its line, and `count`
+/// the number of nodes on the line. Returns NaN if the node is a hole or has no neighbour on the line.
 fn line_derivative(
     points: &[Point],
     lattice: &GridTopology,

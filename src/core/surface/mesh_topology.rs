@@ -24,11 +24,11 @@ pub(crate) struct MeshTopology {
 }
 
 impl MeshTopology {
-    /// Joins triangles edge to edge.
+    /// Builds the mesh from triangles, given by the indices of their corners. Finds the neighbours of each triangle.
     ///
     /// # Errors
-    /// Returns an error if there is no triangle, an index is out of range, three triangles share an edge, a triangle is
-    /// there twice, or neighbours have opposite orientation.
+    /// Returns an error if there is no triangle, if an index is out of range, if more than two triangles share an edge,
+    /// if a triangle is given twice, or if neighbours have opposite orientation.
     pub(crate) fn new(points: &[Point], corners: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
         if corners.is_empty() {
             return Err(SurfaceError::NoTriangles);
@@ -42,7 +42,11 @@ impl MeshTopology {
         Self::from_parts(points, corners, neighbours)
     }
 
-    /// Builds the mesh from triangles whose neighbours are known.
+    /// Builds the mesh from triangles whose neighbours are known. `neighbours[f][k]` is the triangle across the edge
+    /// opposite to corner k of the triangle f, or [`BORDER`].
+    ///
+    /// # Errors
+    /// Returns an error if there is no triangle.
     pub(crate) fn from_parts(
         points: &[Point],
         corners: Vec<[u32; 3]>,
@@ -75,7 +79,8 @@ impl MeshTopology {
         self.corners.len() as u32
     }
 
-    /// Calls `visit` with each facet around a vertex and the index of the vertex in it, counter-clockwise.
+    /// Calls `visit` with each facet around a vertex, counter-clockwise, and with the corner number (0 to 2) of the
+    /// vertex in that facet.
     #[inline]
     pub(crate) fn visit_facets_around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
         let first = self.vertex_facets[vertex as usize];
@@ -97,7 +102,7 @@ impl MeshTopology {
 }
 
 impl MeshTopology {
-    /// Calls `visit` with each neighbour of a vertex once, counter-clockwise.
+    /// Calls `visit` with each neighbouring vertex of a vertex once, counter-clockwise.
     #[inline]
     pub(crate) fn visit_neighbours(&self, vertex: u32, mut visit: impl FnMut(u32)) {
         let mut last = None;
@@ -115,9 +120,9 @@ impl MeshTopology {
 }
 
 impl MeshTopology {
-    /// Collects the neighbours of a vertex counter-clockwise, and after them the further neighbours of these, each
-    /// once. Returns the number of vertices in the first ring, and in both rings together. Returns `None` if the
-    /// surface ends within the rings or if `ring` is too small.
+    /// Writes the two rings of vertices around a vertex into `ring`: first its neighbours, counter-clockwise, then the
+    /// further neighbours of these, each vertex once. Returns the number of vertices in the first ring, and in both
+    /// rings together. Returns `None` if the surface ends within the rings, or if `ring` is too small.
     ///
     /// The facets around a neighbour are visited only on the side away from the vertex: from beyond one edge of the
     /// first ring to beyond the next.
@@ -172,7 +177,8 @@ impl Facets for MeshTopology {
         self.corners[facet as usize]
     }
 
-    /// Returns the neighbour across the edge that the point is farthest beyond, among the edges with a neighbour.
+    /// Returns the neighbour across the edge that the point is farthest beyond: the edge with the most negative
+    /// barycentric weight. Ignores edges without a neighbour. Returns `None` if no other edge has a negative weight.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let across = &self.neighbours[facet as usize];
@@ -192,7 +198,10 @@ impl Facets for MeshTopology {
     }
 }
 
-/// Returns the facet across each edge; finds it by sorting the edges.
+/// Returns for each facet the neighbours across its three edges. Finds them by sorting the edges.
+///
+/// # Errors
+/// Returns an error if more than two facets share an edge, or if two neighbours have opposite orientation.
 fn facet_neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 3]>, SurfaceError> {
     let mut edges: Vec<(u32, u32, u32)> = Vec::with_capacity(3 * corners.len());
     for (facet, c) in corners.iter().enumerate() {
@@ -221,7 +230,8 @@ fn facet_neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 
     Ok(neighbours)
 }
 
-/// Returns an error about the triangles that exist twice; `None` if there are none.
+/// Returns an error that counts the repeated triangles and names the place of one of them; `None` if no triangle is
+/// given twice.
 fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> {
     let mut sorted: Vec<[u32; 3]> = corners.to_vec();
     sorted.iter_mut().for_each(|corners| corners.sort_unstable());
@@ -232,8 +242,8 @@ fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> 
     Some(SurfaceError::DoubledTriangles { count, at: points[first as usize].into() })
 }
 
-/// Returns one facet at each vertex. At the border it is the facet from which the counter-clockwise order visits all
-/// facets of the vertex.
+/// Returns one facet at each vertex, or [`BORDER`] if the vertex has none. At the border it is the facet from which the
+/// counter-clockwise order visits all facets of the vertex.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
     for (facet, c) in corners.iter().enumerate() {

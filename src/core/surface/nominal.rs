@@ -59,10 +59,10 @@ pub enum NominalKind {
 }
 
 impl Nominal {
-    /// Creates a surface from points in any order. A regular grid in x and y is used directly; other points are
-    /// triangulated.
+    /// Creates a surface from points in any order. Points on a regular grid in x and y are used without a
+    /// triangulation. Other points are triangulated in the plane of `projection`.
     ///
-    /// Shapes: at least 9 points. The order of the points does not matter.
+    /// Shapes: at least 9 points.
     ///
     /// # Errors
     /// Returns an error if there are too few points, a coordinate is not finite, two points coincide, the points lie on
@@ -100,10 +100,10 @@ impl Nominal {
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
 
-    /// Creates a surface from a structured grid of points, one for each pair of parameters (u, v).
+    /// Creates a surface from a structured grid of points, one for each pair of parameters (u, v). Fits the normals.
     ///
-    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side
-    /// where u, v and the normal are right-handed.
+    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The directions of u, v and
+    /// the normal are right-handed.
     ///
     /// # Errors
     /// Returns an error if the number of points is not `columns * rows`, or if an axis has fewer than 3 nodes.
@@ -114,8 +114,11 @@ impl Nominal {
 
     /// Creates a surface from a grid of points that is regular in x and y, with known unit normals.
     ///
+    /// Shapes: `columns * rows` points and normals, row by row with x fastest; a NaN point is a hole.
+    ///
     /// # Errors
-    /// Returns the same errors as [`Nominal::from_parameter_grid`].
+    /// Returns an error if the number of points or normals is not `columns * rows`, or if an axis has fewer than 3
+    /// nodes.
     pub fn from_grid_with_normals(
         columns: usize,
         rows: usize,
@@ -128,11 +131,12 @@ impl Nominal {
         Ok(Self::new(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
 
-    /// Creates a surface from a mesh. The normals are on the side from which the triangles are counter-clockwise.
+    /// Creates a surface from a mesh. Each triangle is given by the indices of its corners in `points`. The normals are
+    /// on the side from which the triangles are counter-clockwise.
     ///
     /// # Errors
     /// Returns an error if a coordinate is not finite, there is no triangle, an index is out of range, more than two
-    /// triangles share an edge, a triangle is there twice, or neighbours turn opposite ways.
+    /// triangles share an edge, a triangle is given twice, or neighbours have opposite orientation.
     pub fn from_mesh(points: Vec<Point>, triangles: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
@@ -141,8 +145,8 @@ impl Nominal {
         Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Mesh))
     }
 
-    /// Joins several surfaces into one surface of several patches. A point belongs to the patch that its projection
-    /// lies on.
+    /// Joins several surfaces into one surface of several patches. A measured point belongs to the patch that contains
+    /// its projection. The outlines of the surfaces are dropped.
     ///
     /// # Errors
     /// Returns an error if the list is empty.
@@ -167,11 +171,13 @@ impl Nominal {
         Self { outline: Some(outline), ..self }
     }
 
+    /// Creates a surface from the points of a grid, in the order of its nodes. Fits the normals.
     fn from_grid_topology(lattice: GridTopology, points: &[Point]) -> Self {
         let kind = NominalKind::Grid { columns: lattice.columns(), rows: lattice.rows() };
         Self::new(Patch::grid(fit_grid_nodes(points, &lattice), lattice), kind)
     }
 
+    /// Creates a surface of one patch without an outline.
     fn new(patch: Patch, kind: NominalKind) -> Self {
         Self {
             patches: vec![patch],
@@ -183,10 +189,10 @@ impl Nominal {
         }
     }
 
-    /// Rejects a mesh that encloses a solid. The face of a part has a border.
+    /// Rejects a surface that encloses a solid, because it does not show which of its faces is ground.
     ///
     /// # Errors
-    /// Returns an error if a patch is a closed solid.
+    /// Returns [`SurfaceError::ClosedSolid`] if a mesh patch has no border.
     pub fn check_is_open(&self) -> Result<(), SurfaceError> {
         match self.patches.iter().find_map(Patch::closed_triangles) {
             Some(triangles) => Err(SurfaceError::ClosedSolid { triangles }),
@@ -194,7 +200,7 @@ impl Nominal {
         }
     }
 
-    /// Returns the source of the surface.
+    /// Returns from what the surface was created: a grid, scattered points, a mesh or several patches.
     pub fn kind(&self) -> NominalKind {
         self.kind
     }
@@ -216,7 +222,8 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns every point shifted along its normal by a length in millimetres, eq. (3); holes are skipped.
+    /// Returns every point shifted along its normal by `by_mm`, eq. (3) of the paper; a negative length shifts against
+    /// the normal. Holes are skipped.
     pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
         let moved = move |vertex: Vertex| vertex.point + vertex.normal * by_mm;
         self.patches
@@ -225,7 +232,7 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns the number of points; holes do not count.
+    /// Returns the number of points of all patches; holes do not count.
     pub fn len(&self) -> usize {
         self.points().count()
     }
@@ -245,7 +252,7 @@ impl Nominal {
             .collect()
     }
 
-    /// Returns the steepest slope against the xy plane among some places spread over the surface, in radians.
+    /// Returns the steepest slope against the xy plane, in radians, among some thousand places spread over the surface.
     pub fn max_slope_rad(&self) -> f64 {
         let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
         normals.fold(0.0, f64::max)
@@ -262,12 +269,14 @@ impl Nominal {
         self.extent_mm()[0]
     }
 
-    /// Returns the rms distance of the points from their best-fit plane, in millimetres: a measure of the shape that a
-    /// registration can use.
+    /// Returns the rms distance of the points from their best-fit plane, in millimetres. It measures the shape by which
+    /// a registration determines the pose.
     pub(crate) fn relief_mm(&self) -> f64 {
         self.extent_mm()[1]
     }
 
+    /// Returns the rms distances of the points from their centroid and from their best-fit plane, in mm. Computes them
+    /// from a sample at the first call.
     fn extent_mm(&self) -> [f64; 2] {
         *self.extent_mm.get_or_init(|| {
             let sample = self.sample(SAMPLE);
@@ -277,15 +286,15 @@ impl Nominal {
         })
     }
 
-    /// Returns the unit mean of the normals; returns z for a closed surface, which has no mean normal.
+    /// Returns the normalised mean of the normals; z if their sum is nearly zero, as for a closed surface.
     pub(crate) fn mean_normal(&self) -> Vector {
         let sum: Vector = self.sampled_vertices(512).iter().map(|(_, n)| n).sum();
         if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
     }
 
-    /// Returns the estimated rms error of fitted normals, in radians; 0 for a grid and for given normals.
+    /// Returns the estimated rms error of the fitted normals, in radians; 0 if no normal is fitted to scattered points.
     ///
-    /// The estimate is the rms change of the normal when the fit uses twice as many neighbours.
+    /// The estimate is the rms change of the normal if the fit uses twice as many neighbours.
     pub(crate) fn normal_error_rad(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
@@ -299,13 +308,13 @@ impl Nominal {
         if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
     }
 
-    /// Returns the standard deviation of the noise of the points along the normal, about a smooth surface, in
-    /// millimetres; 0 if the points show no noise.
+    /// Returns the standard deviation of the noise of the nominal points along the normal, about a smooth surface, in
+    /// millimetres. Returns 0 if they show no noise.
     pub(crate) fn noise_sigma_mm(&self) -> f64 {
         nominal_noise::noise_sigma_mm(&self.patches)
     }
 
-    /// Returns facets at the points of the surface that are nearest to a place, by their distance in space.
+    /// Returns facets at the three nominal points nearest to `p`, from a sample of about 20,000 points.
     pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = FacetIndex> {
         /// Number of points in the search tree, and number of facets returned.
         const TREE_POINTS: usize = 20_000;
@@ -324,8 +333,8 @@ impl Nominal {
         nearest.nearest(p, RETURNED).map(|(k, _)| places[k])
     }
 
-    /// Returns the surface made of every second node of its grid; `None` if it is not a single grid or would have too
-    /// few nodes.
+    /// Returns the surface made of every second node of its grid, with normals fitted anew. Returns `None` if the
+    /// surface is not a single grid, or if fewer than 3 nodes would remain along an axis.
     pub(crate) fn coarsened(&self) -> Option<Self> {
         let [patch] = &self.patches[..] else { return None };
         let Topology::Grid(grid) = &patch.topology else { return None };
@@ -336,7 +345,8 @@ impl Nominal {
         Some(Self::from_grid_topology(GridTopology::new(columns, rows, &points, grid.is_regular()), &points))
     }
 
-    /// Returns the curvature features at some places spread over the surface.
+    /// Returns the curvature features (principal curvatures with their directions) at about 3000 places spread over the
+    /// surface. Computes them at the first call.
     pub(crate) fn features(&self) -> &[CurvatureFeature] {
         self.features.get_or_init(|| {
             let (points, normals): (Vec<_>, Vec<_>) = self.sampled_vertices(FEATURES).into_iter().unzip();
@@ -349,6 +359,10 @@ impl Nominal {
 const SAMPLE: usize = 4096;
 const FEATURES: usize = 3000;
 
+/// Checks the size of a grid.
+///
+/// # Errors
+/// Returns [`SurfaceError::GridSize`] if an axis has fewer than 3 nodes, or if `points` is not `columns * rows`.
 pub(super) fn check_grid(columns: usize, rows: usize, points: usize) -> Result<(), SurfaceError> {
     if columns < 3 || rows < 3 || columns.checked_mul(rows) != Some(points) {
         return Err(SurfaceError::GridSize { columns, rows, points });

@@ -18,8 +18,8 @@ const CHECKED_POINTS: usize = 100;
 /// form of the surface itself.
 const MAX_GROWTH: f64 = 2.0;
 
-/// Returns the standard deviation of the noise of the points along the normal, in millimetres; 0 if the points show
-/// only a smooth surface.
+/// Returns the standard deviation of the noise of the points along the normal, in millimetres. Returns 0 if the
+/// residuals of local fits grow with their size: the points then show only the form of the surface.
 pub(super) fn noise_sigma_mm(patches: &[Patch]) -> f64 {
     let some = |patch| Patch::sample(patch, (CHECKED_POINTS / patches.len()).max(1)).map(move |vertex| (patch, vertex));
     let vertices: Vec<(&Patch, u32)> = patches.iter().flat_map(some).collect();
@@ -32,8 +32,8 @@ pub(super) fn noise_sigma_mm(patches: &[Patch]) -> f64 {
     if many > MAX_GROWTH * few { 0.0 } else { many }
 }
 
-/// Returns the residual variances of two cubics about a vertex, fitted to few neighbours and to many; `None` if there
-/// are too few neighbours or they do not determine a cubic.
+/// Returns the residual variances in mm^2 of two cubics about a vertex: one fitted to 17 points, the other to 31.
+/// Returns `None` if there are too few neighbours, or if they do not determine a cubic.
 fn residual_variances(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     let around = tangent_frame_neighbours(patch, vertex);
     // The point itself is included; these are the smallest numbers that leave a few degrees of freedom.
@@ -41,8 +41,8 @@ fn residual_variances(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     Some([of(NEIGHBOURS + 3)?, of(2 * NEIGHBOURS + 3)?])
 }
 
-/// Returns a point and its neighbours, sorted by distance. The coordinates are along two tangents and the normal at the
-/// point.
+/// Returns a vertex and its neighbours, nearest first. Coordinates are along two tangents and along the normal at the
+/// vertex, in mm, with the vertex as origin.
 fn tangent_frame_neighbours(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     let wanted = 2 * NEIGHBOURS + 3;
     let others: Vec<u32> = match &patch.topology {
@@ -60,8 +60,8 @@ fn tangent_frame_neighbours(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     around
 }
 
-/// Returns the sum of squared residuals of the best cubic, divided by the degrees of freedom; `None` if the places do
-/// not determine a cubic.
+/// Fits a cubic w(u, v) to places [u, v, w] by least squares. Returns the sum of squared residuals divided by the
+/// degrees of freedom. Returns `None` if the places do not determine a cubic, or if no degree of freedom is left.
 fn cubic_residual_variance(places: &[[f64; 3]]) -> Option<f64> {
     let size = places.last().map(|[u, v, _]| u.hypot(*v)).filter(|size| *size > 0.0)?;
     let mut normal = SMatrix::<f64, TERMS, TERMS>::zeros();

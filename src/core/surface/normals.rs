@@ -28,12 +28,13 @@ pub(crate) struct LocalFit {
     pub(crate) direction: Vector,
 }
 
-/// Fits w = p u + q v + quadratic and cubic terms through a vertex, by weighted least squares over its rings of
-/// neighbours.
+/// Fits the normal and the curvature of the surface at a vertex. Fits the cubic w = p u + q v + quadratic and cubic
+/// terms by weighted least squares to whole rings of neighbours, until there are `wanted` or more.
 ///
-/// Frame: the mean normal of the facets around the vertex and two tangents. Weights fall with distance s as 1/(1 +
-/// (s/h)^2), where h is the mean distance, so that a far neighbour in an uneven ring affects the fit less. If the
-/// neighbours do not determine a cubic (at a border, on a line), the fit is a quadric, then a plane.
+/// Frame: w is along the mean normal of the facets around the vertex, u and v are along two tangents. The weight of a
+/// neighbour at the distance s is 1/(1 + (s/h)^2), where h is the mean distance. So a far neighbour in an uneven ring
+/// affects the fit less. If the neighbours do not determine a cubic (at a border, on a line), the fit is a quadric,
+/// then a plane.
 pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wanted: usize) -> LocalFit {
     let mut ring = [0u32; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
@@ -41,7 +42,8 @@ pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wa
     fit_to_neighbours(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
-/// Fits as [`fit_to_ring`] does, but to given neighbours of a point. `mean` is the approximate normal.
+/// Fits the normal and the curvature at the point `at` to given neighbours, in the same way as [`fit_to_ring`]. `mean`
+/// is the approximate unit normal.
 pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
     let mut local = [[0.0; 3]; MAX_NEIGHBOURS];
@@ -63,8 +65,8 @@ pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterat
     LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
 }
 
-/// Fits the normals of four vertices in parallel lanes. Each normal equals that of [`fit_to_ring`] except for rounding,
-/// and does not depend on the other three vertices.
+/// Fits the normals of four vertices in parallel lanes. Each normal equals the normal of [`fit_to_ring`] except for
+/// rounding, and does not depend on the other three vertices.
 #[inline(always)]
 pub(crate) fn fit_normals_x4(points: &[Point], mesh: &MeshTopology, vertices: &[u32; LANES]) -> [Vector; LANES] {
     let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MAX_NEIGHBOURS], max_count: 0 };
@@ -96,7 +98,8 @@ struct Rings {
 }
 
 impl Rings {
-    /// Writes the neighbours of a vertex into a lane; returns its mean normal and tangents.
+    /// Writes the neighbours of a vertex into a lane, in the frame of the vertex and in units of their mean distance.
+    /// Returns this frame: the mean normal and two tangents.
     #[inline(always)]
     fn add(&mut self, points: &[Point], mesh: &MeshTopology, vertex: u32, lane: usize) -> [Vector; 3] {
         let mut ring = [0u32; MAX_NEIGHBOURS];
@@ -119,14 +122,15 @@ impl Rings {
         [mean, tu, tv]
     }
 
-    /// Copies the previous lane into a lane.
+    /// Copies the neighbours of lane `lane - 1` into the lane `lane`.
     fn repeat(&mut self, lane: usize) {
         for c in self.local[..self.max_count].iter_mut().flatten() {
             c.0[lane] = c.0[lane - 1];
         }
     }
 
-    /// Returns the slopes along u and v of the cubics, and true for each lane whose neighbours determine a cubic.
+    /// Fits a cubic in each lane. Returns its slopes along u and v at the vertex, and for each lane true if the
+    /// neighbours determine a cubic.
     ///
     /// The normal equations contain only 25 different numbers: the weighted sums of the monomials of degrees 2 to 6.
     #[inline(always)]
@@ -161,7 +165,8 @@ const TERMS: [[usize; 2]; 9] = [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], 
 /// Number of monomials of u and v of degrees 2 to 6.
 const MOMENTS: usize = 25;
 
-/// Extends the three monomials of the second degree to higher degrees; each degree begins with u^n and ends with v^n.
+/// Returns the first N of the weighted monomials of degree 2, 3 and higher. `squares` are those of degree 2: u^2, u v
+/// and v^2, each times a weight. Each degree n begins with u^n and ends with v^n.
 #[inline(always)]
 fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4; N] {
     let mut all = [F64x4::splat(0.0); N];
@@ -177,7 +182,8 @@ fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4;
     all
 }
 
-/// Solves four systems for their first two unknowns, and returns true for each system that has a solution.
+/// Solves four symmetric linear systems m x = right side by Cholesky decomposition, one per lane. `x` holds the right
+/// sides. Returns the first two unknowns of each system, and true for each system that has a solution.
 #[inline(always)]
 fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
     let least_pivot: [f64; LANES] =
@@ -215,7 +221,8 @@ fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x
 }
 
 impl LocalFit {
-    /// Computes normal and curvature from w = p u + q v + a u^2 + b uv + c v^2.
+    /// Computes the normal and the principal curvatures at the origin of w = p u + q v + a u^2 + b uv + c v^2. The axes
+    /// of u, v and w are `tu`, `tv` and `mean`.
     fn new(mean: &Vector, tu: &Vector, tv: &Vector, [p, q, a, b, c]: &[f64; 5]) -> Self {
         let root = (1.0 + p * p + q * q).sqrt();
         let normal = (mean - tu * *p - tv * *q) / root;
@@ -233,22 +240,25 @@ impl LocalFit {
     }
 }
 
-/// Returns the direction (x, y) in the null space of the singular symmetric matrix `[[a, b], [b, c]]`.
+/// Returns the unit vector (x, y) in the null space of the singular symmetric matrix `[[a, b], [b, c]]`; (1, 0) for the
+/// zero matrix.
 fn null_direction(a: f64, b: f64, c: f64) -> (f64, f64) {
     let (x, y) = if a.abs() > c.abs() { (-b, a) } else { (c, -b) };
     let norm = x.hypot(y);
     if norm > 0.0 { (x / norm, y / norm) } else { (1.0, 0.0) }
 }
 
-/// Returns two unit vectors perpendicular to a unit vector and to each other, right-handed.
+/// Returns two unit vectors perpendicular to the unit vector `n` and to each other. The two and `n` are right-handed,
+/// in this order.
 pub(crate) fn tangents(n: &Vector) -> [Vector; 2] {
     let axis = if n.x.abs() < 0.6 { Vector::x() } else { Vector::y() };
     let tu = (axis - n * n.dot(&axis)).normalize();
     [tu, n.cross(&tu)]
 }
 
-/// Solves the weighted normal equations of the first N monomials; returns `None` if the neighbours do not determine
-/// them.
+/// Fits the first N monomials of a cubic (2, 5 or 9) to `local`, places [u, v, w] in units of their mean distance, by
+/// weighted least squares. Returns the coefficients, with 0 for the others. Returns `None` if the places do not
+/// determine them.
 ///
 /// The arrays have fixed bounds: the compiler unrolls and vectorises the loops, which makes the fit several times
 /// faster.
@@ -278,8 +288,8 @@ fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     Some(solution)
 }
 
-/// Replaces the lower half of a symmetric matrix by its Cholesky factor, and returns the inverses of the pivots; `None`
-/// if a pivot is not above `least_pivot`.
+/// Replaces the part of a symmetric matrix below the diagonal by that of its Cholesky factor. Returns the inverse of
+/// each diagonal entry of the factor. Returns `None` if a pivot is not above `least_pivot`.
 #[inline(always)]
 fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
     let mut inverse_pivots = [0.0; N];
@@ -298,6 +308,8 @@ fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[
     Some(inverse_pivots)
 }
 
+/// Solves L L^T x = right side by forward and backward substitution, with the Cholesky factor L of [`cholesky`]. `x`
+/// holds the right side, and then the solution.
 #[inline(always)]
 fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &mut [f64; N]) {
     for i in 0..N {
@@ -310,15 +322,16 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
-/// Returns the neighbours of a vertex in whole rings, nearest ring first, until there are `wanted` or more. Fewer are
-/// returned if the mesh has no more. No more than [`MAX_NEIGHBOURS`] are returned.
+/// Returns the vertices around a vertex in whole rings, nearest ring first, until there are `wanted` or more. Returns
+/// fewer if the mesh has no more, and never more than [`MAX_NEIGHBOURS`].
 pub(super) fn ring_around(mesh: &MeshTopology, vertex: u32, wanted: usize) -> Vec<u32> {
     let mut ring = [0; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
     ring[..found].to_vec()
 }
 
-/// Writes whole rings of neighbours of a vertex into `ring` until there are `wanted` or more, and returns their number.
+/// Writes the vertices around a vertex into `ring`, in whole rings, until there are `wanted` or more. Returns their
+/// number.
 fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u32; MAX_NEIGHBOURS]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
         Some([first, _]) if first >= wanted => return first,
@@ -335,8 +348,8 @@ fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u3
     count
 }
 
-/// Adds the neighbours of the vertex `of` that are not yet in the ring around `vertex`; returns the new number of
-/// entries.
+/// Appends to `ring`, which holds `count` vertices around `vertex`, the neighbours of the vertex `of` that it does not
+/// yet contain. Returns the new number of entries.
 #[inline(always)]
 fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIGHBOURS], mut count: usize) -> usize {
     mesh.visit_neighbours(of, |candidate| {
@@ -348,7 +361,8 @@ fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIG
     count
 }
 
-/// Returns the unit mean of the normals of the facets around a vertex, weighted by area; z if there is none.
+/// Returns the normalised mean of the normals of the facets around a vertex, weighted by their areas; z if there is no
+/// facet.
 fn mean_facet_normal(points: &[Point], mesh: &MeshTopology, vertex: u32) -> Vector {
     let mut sum = Vector::zeros();
     mesh.visit_facets_around(vertex, |facet, _| {

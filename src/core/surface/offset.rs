@@ -88,8 +88,8 @@ pub struct PointProjection {
 }
 
 impl PointProjection {
-    /// Orders projections by their distance beyond an edge, then by the absolute distance of the point from the
-    /// surface.
+    /// Compares two projections of one point: less is nearer. Compares the distances beyond the edge first, then the
+    /// absolute distances of the point from the surface.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
         self.beyond_edge_mm
             .total_cmp(&other.beyond_edge_mm)
@@ -109,9 +109,9 @@ const MAX_STEPS: usize = 4096;
 pub(super) const MIN_INSIDE_WEIGHT: f64 = -1e-10;
 
 impl<'a> OffsetSurface<'a> {
-    /// Creates the offset of a nominal surface by a probe radius.
+    /// Creates the offset of a nominal surface by a probe radius, towards `side`.
     ///
-    /// Units: millimetres. A radius of 0 is the nominal surface itself.
+    /// Units: millimetres. A radius of 0 gives the nominal surface itself.
     ///
     /// # Errors
     /// Returns an error if the radius is negative or not finite.
@@ -122,17 +122,17 @@ impl<'a> OffsetSurface<'a> {
         Ok(Self { nominal, radius_mm, side, distance_model: DistanceModel::default(), lookup: Lookup::default() })
     }
 
-    /// Sets the shape of the surface between the corners of a facet.
+    /// Sets the shape of the surface between the corners of a facet: curved or flat.
     pub fn with_distance_model(self, distance: DistanceModel) -> Self {
         Self { distance_model: distance, ..self }
     }
 
-    /// Sets the rule that assigns a point to a facet.
+    /// Sets the rule that assigns a point to a facet, see [`Lookup`].
     pub(crate) fn with_lookup(self, lookup: Lookup) -> Self {
         Self { lookup, ..self }
     }
 
-    /// Returns the nominal surface that is offset.
+    /// Returns the nominal surface from which this surface is offset.
     pub fn nominal(&self) -> &'a Nominal {
         self.nominal
     }
@@ -155,16 +155,16 @@ impl<'a> OffsetSurface<'a> {
         self.side
     }
 
-    /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square with the area of two
-    /// of its facets.
+    /// Returns the local step of the nominal sampling at the facet `place`, in millimetres: the side of a square with
+    /// twice the area of the facet.
     pub(crate) fn spacing_mm(&self, place: FacetIndex) -> f64 {
         let patch = &self.nominal.patches()[place.patch as usize];
         let [a, b, c] = patch.corners(place.facet).map(|v| *patch.point(v));
         (b - a).cross(&(c - a)).norm().sqrt()
     }
 
-    /// Returns the projection of a point in the model frame. The search starts from the facet where the last search for
-    /// this point ended.
+    /// Returns the projection of the point `p`, in the model frame, onto the offset surface. The search starts from the
+    /// facet `start`, where the last search for this point ended; [`FacetIndex::UNKNOWN`] if there is none.
     ///
     /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
     /// plane at the nearest point of the edge.
@@ -176,11 +176,11 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Returns the projection onto the patch that a point belongs to: the nearest projection inside a patch, otherwise
-    /// the projection that is least beyond an edge.
+    /// Projects the point `p` onto each patch, and returns the best projection: the nearest one inside a patch,
+    /// otherwise the one least beyond an edge.
     ///
     /// The offset surfaces of two patches that only touch leave a gap over a convex seam. If a projection is slightly
-    /// beyond the edges of two patches at about the same height, it lies in this gap, and therefore on the part.
+    /// beyond the edges of two patches at about the same height, it lies in this gap. It then counts as on the part.
     fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
         let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
@@ -204,11 +204,11 @@ impl<'a> OffsetSurface<'a> {
         best
     }
 
-    /// Searches for the projection of a point from the places of the surface nearest to the point, and returns the
-    /// nearest one found.
+    /// Projects a point without a start facet. Starts one search from each of the three places of the surface nearest
+    /// to the point, and returns the nearest projection found.
     ///
-    /// A search moves only to nearer facets. A search that starts on the wrong wall of a gutter can end there, because
-    /// no neighbouring facet is nearer.
+    /// A search moves only to nearer facets. A single search that starts on the wrong wall of a gutter can end there,
+    /// because no neighbouring facet is nearer.
     #[cold]
     pub(crate) fn project_without_start(&self, p: &Point) -> PointProjection {
         let found = self
@@ -218,6 +218,8 @@ impl<'a> OffsetSurface<'a> {
         found.min_by(PointProjection::by_nearness).unwrap_or_else(|| self.project(p, FacetIndex::UNKNOWN))
     }
 
+    /// Returns the projection of the point `p` onto one patch; `number` is the index of the patch. The search starts
+    /// from `start` if that facet belongs to this patch.
     #[inline]
     fn project_onto_patch(&self, patch: &Patch, number: u32, p: &Point, start: FacetIndex) -> PointProjection {
         let start = if start.patch == number { start.facet } else { u32::MAX };
@@ -227,8 +229,11 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Walks over the flat facets of the nominal surface to a facet near the projection, and returns this facet. No
-    /// normal is fitted on the way: the point is moved back to the nominal surface along the normal of each flat facet.
+    /// Walks over the flat facets of the nominal surface towards the projection of `p`. Returns a facet near the
+    /// projection. Returns the start facet if the normals are already known.
+    ///
+    /// No normal is fitted on the way: the point is moved back to the nominal surface along the normal of each flat
+    /// facet. `start` is a facet number, or `u32::MAX` if it is unknown.
     #[inline]
     fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
         let mut facet = if start == u32::MAX { facets.start(p) } else { start };
@@ -253,12 +258,13 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
-    /// Returns a facet of the first patch near the projection of a point, without fitting its normals.
+    /// Returns a facet of the first patch near the projection of the point `p`, without fitting a normal.
     pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: FacetIndex) -> FacetIndex {
         FacetIndex { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
-    /// Walks from facet to facet until one contains the projection, then computes the distance there.
+    /// Walks from facet to facet of one patch until a facet contains the projection of `p`. Returns the projection onto
+    /// this facet. `number` is the index of the patch, and `start` a facet number, or `u32::MAX` if it is unknown.
     #[inline]
     fn search_projection<F: Facets>(
         &self,
@@ -302,7 +308,8 @@ impl<'a> OffsetSurface<'a> {
         Facet::new([a, b, c].map(|vertex| offset_corner(vertex, sign, self.radius_mm)), sign)
     }
 
-    /// Returns the barycentric weights of the projection of a point onto the plane of the flat facet.
+    /// Returns the barycentric weights, in the flat facet, of the projection of the point `p`. The point is projected
+    /// perpendicular to the facet, or along z if the lookup is [`Lookup::AlongZ`].
     #[inline(always)]
     fn weights(&self, facet: &Facet<f64>, p: &Point) -> [f64; 3] {
         let mut w = facet.vector_from_corner(0, &p.coords.into());
@@ -312,6 +319,9 @@ impl<'a> OffsetSurface<'a> {
         facet.weights(&w)
     }
 
+    /// Returns the projection of the point `p` onto a facet, with the index `place`. `weights` are the barycentric
+    /// weights of `p`; `inside` is true if the projection is on the part. Otherwise it is beyond an edge where the
+    /// surface ends.
     #[inline(always)]
     fn project_in_facet(
         &self,
@@ -352,7 +362,8 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Returns the distance of a point from the tangent plane at a place of the edge, and the normal of this plane.
+    /// Returns the distance of the point `p` from the tangent plane at a place of the edge, in mm, and the unit normal
+    /// of this plane. `at` are the barycentric weights of the place.
     #[cold]
     fn tangent_plane_distance(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
         let (on_flat, flat) = (Vector::from(facet.point(at)), Vector::from(facet.flat_normal()));
@@ -364,8 +375,8 @@ impl<'a> OffsetSurface<'a> {
     }
 }
 
-/// Returns the barycentric weights of the place of a facet that is nearest to a point beyond the edge with the most
-/// negative weight.
+/// Returns the barycentric weights of the place on one edge of a facet that is nearest to the point `p`. The edge is
+/// the one with the most negative weight in `b`, the barycentric weights of `p`.
 fn clamped_weights(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);

@@ -39,12 +39,12 @@ enum Vertices {
 }
 
 impl Patch {
-    /// Creates a patch from a grid and its nodes, whose normals are all known.
+    /// Creates a patch from a grid and its nodes. The normals of all nodes are known.
     pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridTopology) -> Self {
         Self { topology: Topology::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
-    /// Returns the number of triangles of a mesh that has no border; `None` for other patches.
+    /// Returns the number of triangles if the patch is a mesh without border, which encloses a solid; otherwise `None`.
     pub(crate) fn closed_triangles(&self) -> Option<usize> {
         match &self.topology {
             Topology::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
@@ -94,7 +94,7 @@ impl Patch {
         }
     }
 
-    /// Returns about `count` vertices, spread over the patch, without holes.
+    /// Returns the indices of about `count` vertices, spread over the patch. Holes of a grid are omitted.
     pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
         let n = self.len();
         let (columns, step_i, step_j) = match &self.topology {
@@ -110,7 +110,7 @@ impl Patch {
             .filter(|&v| self.point(v).x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite()))
     }
 
-    /// Returns a facet at a vertex; if the vertex has no facet, a facet near it.
+    /// Returns a facet at or near a vertex, from which a search can start.
     pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
         match &self.topology {
             Topology::Grid(grid) => grid.facet_near(vertex),
@@ -118,7 +118,7 @@ impl Patch {
         }
     }
 
-    /// Returns true if the normals are fitted to scattered neighbours.
+    /// Returns true if the patch is a mesh, whose normals are fitted to neighbouring points; false for a grid.
     pub(crate) fn has_scattered_normals(&self) -> bool {
         matches!(self.vertices, Vertices::Lazy(..))
     }
@@ -139,6 +139,7 @@ impl Patch {
         }
     }
 
+    /// Fits the normal at a vertex of a mesh. Panics for a grid, whose normals are all known.
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.topology {
@@ -149,8 +150,9 @@ impl Patch {
         }
     }
 
-    /// Fits the unknown normals of many vertices, on all cores and four at a time. This is several times faster than
-    /// fitting each when it is first needed, and gives the same bits.
+    /// Fits those normals of the given vertices that are still unknown, on all cores and four at a time. Does nothing
+    /// for a grid. This is several times faster than fitting each normal when it is first needed, and gives the same
+    /// bits.
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
         /// Number of vertices per task.
         const CHUNK: usize = 256;
@@ -168,7 +170,7 @@ impl Patch {
         });
     }
 
-    /// Returns the corners of a facet that exists.
+    /// Returns the three corners of a facet, as indices of vertices. The facet must exist.
     pub(crate) fn corners(&self, facet: u32) -> [u32; 3] {
         match &self.topology {
             Topology::Grid(grid) => grid.corners(facet),
@@ -202,16 +204,19 @@ impl pulp::NullaryFnOnce for NormalFitX4<'_> {
 struct NormalCell([AtomicU64; 3]);
 
 impl NormalCell {
+    /// Creates a cell whose normal is not yet computed.
     fn unknown() -> Self {
         Self(std::array::from_fn(|_| AtomicU64::new(f64::NAN.to_bits())))
     }
 
+    /// Returns the normal; `None` if it is not yet computed.
     #[inline]
     fn get(&self) -> Option<Vector> {
         let [x, y, z] = [0, 1, 2].map(|k| f64::from_bits(self.0[k].load(Ordering::Relaxed)));
         (!(x + y + z).is_nan()).then(|| Vector::new(x, y, z))
     }
 
+    /// Stores the normal and returns it.
     fn set(&self, normal: Vector) -> Vector {
         for (cell, c) in self.0.iter().zip(normal.iter()) {
             cell.store(c.to_bits(), Ordering::Relaxed);

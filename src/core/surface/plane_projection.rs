@@ -40,10 +40,12 @@ pub(crate) enum Projector {
 const MAX_FOLDED_SHARE: f64 = 0.05;
 
 impl PlaneProjection {
-    /// Returns the projection that is used for these points, and its map.
+    /// Chooses a projection in which the surface through the points is one-to-one. Returns its kind, never `Auto`, and
+    /// the projector for these points. `Auto` takes the first suitable one of xy plane, best-fit plane and sphere.
     ///
     /// # Errors
-    /// Returns an error if the requested projection folds the surface, or if with `Auto` every projection does.
+    /// Returns [`SurfaceError::NoProjection`] if the requested projection folds the surface, or if with `Auto` every
+    /// projection does.
     pub(crate) fn choose(self, points: &[Point]) -> Result<(Self, Projector), SurfaceError> {
         let candidates: &[Self] = match self {
             Self::Auto => &[Self::Xy, Self::BestFit, Self::Spherical],
@@ -63,6 +65,7 @@ impl PlaneProjection {
         Err(SurfaceError::NoProjection { tried: describe(&shares) })
     }
 
+    /// Returns the projector for these points; `None` if they determine no sphere for the spherical projection.
     fn projector(self, points: &[Point]) -> Option<Projector> {
         match self {
             Self::Auto | Self::Xy => {
@@ -74,6 +77,7 @@ impl PlaneProjection {
     }
 }
 
+/// Describes for a message what share of the surface each projection folds.
 fn describe(shares: &[(PlaneProjection, f64)]) -> String {
     let name = |p: &PlaneProjection| match p {
         PlaneProjection::Auto => "auto",
@@ -81,11 +85,12 @@ fn describe(shares: &[(PlaneProjection, f64)]) -> String {
         PlaneProjection::BestFit => "best-fit",
         PlaneProjection::Spherical => "spherical",
     };
-    shares.iter().map(|(p, s)| format!("{} folds {:.0} % of it", name(p), 100.0 * s)).collect::<Vec<_>>().join(", ")
+    let folds = |(p, s): &(PlaneProjection, f64)| format!("{} folds {:.0} % of the surface", name(p), 100.0 * s);
+    shares.iter().map(folds).collect::<Vec<_>>().join(", ")
 }
 
 impl Projector {
-    /// Returns the place of a point in the plane, and its height over the plane.
+    /// Returns the place (u, v) of a point in the plane of the projection, and its height over the plane; all in mm.
     pub(crate) fn project(&self, p: &Point) -> ([f64; 2], f64) {
         match self {
             Self::Plane { origin, axes } => {
@@ -102,8 +107,8 @@ impl Projector {
         }
     }
 
-    /// Returns the share, from 0 to 1, of small neighbourhoods in the plane whose heights do not lie on one sheet of
-    /// the surface.
+    /// Returns how much the projection folds the surface: the share, from 0 to 1, of small neighbourhoods in the plane
+    /// that contain more than one sheet of the surface.
     ///
     /// In a neighbourhood of size s a smooth sheet deviates from its tangent plane by a small part of s, even where it
     /// is steep. Two sheets deviate from any plane by half their distance.
@@ -135,13 +140,15 @@ struct Sheet {
 }
 
 impl Sheet {
+    /// Adds a point at (u, v) with the height w, in units of the size of the neighbourhood.
     fn add(&mut self, u: f64, v: f64, w: f64) {
         let row = Vector4::new(1.0, u, v, w);
         self.gram += row * row.transpose();
         self.count += 1;
     }
 
-    /// Returns the rms residual about the plane; `None` if there are too few points.
+    /// Returns the rms residual of the heights about their least-squares plane, in units of the size of the
+    /// neighbourhood. Returns `None` if there are fewer than six points.
     fn residual(&self) -> Option<f64> {
         if self.count < 6 {
             return None;
@@ -154,6 +161,8 @@ impl Sheet {
     }
 }
 
+/// Returns the projection to the least-squares plane of the points. Its normal points to the side of +z, or, for an
+/// upright plane, along its largest component.
 fn best_fit_plane(points: &[Point]) -> Projector {
     let (origin, eigen) = principal_axes(points);
     let least = eigen.eigenvalues.imin();
@@ -165,7 +174,8 @@ fn best_fit_plane(points: &[Point]) -> Projector {
     Projector::Plane { origin, axes: [tu, tv, normal] }
 }
 
-/// Returns the centroid and the eigendecomposition of the scatter matrix about it.
+/// Returns the centroid of the points, and the eigenvalues and eigenvectors of their scatter matrix, the sum of d d^T
+/// over the vectors d from the centroid. The eigenvectors are the principal axes.
 pub(crate) fn principal_axes(points: &[Point]) -> (Point, SymmetricEigen<f64, nalgebra::Const<3>>) {
     let centroid = centroid(points);
     let scatter = points.iter().map(|p| p - centroid).map(|d| d * d.transpose()).sum::<Matrix3<f64>>();
@@ -176,8 +186,10 @@ pub(crate) fn centroid(points: &[Point]) -> Point {
     Point::from(points.iter().map(|p| p.coords).sum::<Vector>() / points.len() as f64)
 }
 
-/// Fits the algebraic least-squares sphere, |p|^2 = 2 c.p + (r^2 - |c|^2), which is linear in its four unknowns.
-/// Returns `None` if the points do not determine it.
+/// Returns the projection from the least-squares sphere through the points; `None` if they do not determine a sphere.
+///
+/// Equation: the algebraic fit |p|^2 = 2 c.p + (r^2 - |c|^2), with the centre c and the radius r, is linear in its four
+/// unknowns.
 fn best_fit_sphere(points: &[Point]) -> Option<Projector> {
     let middle = centroid(points);
     let (mut gram, mut right) = (Matrix4::zeros(), Vector4::zeros());
@@ -205,6 +217,7 @@ pub(crate) fn is_line(points: &[Point]) -> bool {
     are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
 }
 
+/// Returns true if the points lie on one line, except for rounding. Examines all points.
 fn are_on_line(points: &[Point]) -> bool {
     let (_, eigen) = principal_axes(points);
     let mut spread: [f64; 3] = eigen.eigenvalues.into();

@@ -20,13 +20,15 @@ const CHUNK: usize = 512;
 const NEAR_STEPS: f64 = 24.0;
 
 impl OffsetSurface<'_> {
-    /// Returns true if a normal is fitted only when it is first needed, so that few normals should be used.
+    /// Returns true if the surface fits a normal only when it is first needed, as a mesh does. Callers should then use
+    /// few normals.
     pub(crate) fn has_lazy_normals(&self) -> bool {
         self.nominal().patches().iter().any(|patch| patch.has_scattered_normals())
     }
 
-    /// Fits the normals that the projections of some points in the model frame need, all together. Returns a start
-    /// facet for each point. Returns an empty list if the normals are already known, or if there are several patches.
+    /// Fits all normals that the projections of the `points`, in the model frame, will need. Returns a start facet for
+    /// the projection of each point. Returns an empty list if the normals are already known, or if there are several
+    /// patches.
     pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<FacetIndex> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
         let Topology::Mesh(mesh) = &patch.topology else { return Vec::new() };

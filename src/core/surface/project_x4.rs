@@ -30,12 +30,12 @@ impl OffsetSurface<'_> {
             && self.lookup() == Lookup::ContainingFacet
     }
 
-    /// Finds the projections of four points near the facets `places`, and replaces these by the facets of the
-    /// projections.
+    /// Projects four points `p`, one per lane. Each search starts from a facet in `places`; the facet of the projection
+    /// replaces it.
     ///
-    /// Returns `None` if one of the points lies beyond the edge or too far away; `places` are then invalid. On a mesh
-    /// it returns `None` as soon as a point is not on its facet, because a walk over a mesh would fit normals on the
-    /// way.
+    /// Returns `None` if one of the points is beyond the edge or too far from its start facet; `places` are then
+    /// invalid. On a mesh it returns `None` as soon as a point is not on its start facet, because a walk over a mesh
+    /// would fit normals on the way. The caller must check [`OffsetSurface::supports_project_x4`] first.
     #[inline(always)]
     pub(crate) fn project_x4(&self, p: &Vector3x4, places: &mut [FacetIndex; LANES]) -> Option<ProjectionX4> {
         let patch = &self.nominal().patches()[0];
@@ -45,8 +45,9 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the expected facets of the next four points. The step from `last` to them is the step from `before` to
-    /// `last`. Returns `None` if there is no prediction: on a mesh, or if a facet of `last` is unknown.
+    /// Predicts the facets of the next four points of a grid by linear extrapolation: the step from `last` to them is
+    /// the step from `before` to `last`. A prediction outside the grid or at a hole is replaced by the facet of `last`.
+    /// Returns `None` on a mesh, or if a facet of `last` is unknown.
     pub(crate) fn extrapolate_x4(
         &self,
         before: &[FacetIndex; LANES],
@@ -64,6 +65,8 @@ impl OffsetSurface<'_> {
         }))
     }
 
+    /// Projects four points `p` onto one patch, as [`OffsetSurface::project_x4`] does. Returns `None` if a point is not
+    /// on its facet after `jumps` moves to other facets.
     #[inline(always)]
     fn project_x4_onto<F: Facets>(
         &self,
@@ -96,6 +99,7 @@ impl OffsetSurface<'_> {
         }
     }
 
+    /// Returns four facets in lanes, with their corners on the offset surface.
     #[inline(always)]
     fn facets_x4<F: Facets>(&self, patch: &Patch, facets: &F, places: &[FacetIndex; LANES]) -> Facet<F64x4> {
         let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
@@ -106,7 +110,8 @@ impl OffsetSurface<'_> {
         Facet::new([first, second, third], F64x4::splat(self.side().sign()))
     }
 
-    /// Returns one corner of each of four facets: its point on the offset surface and its normal.
+    /// Returns one corner of each of four facets, packed into lanes: the points on the offset surface, and the unit
+    /// normals. a, b, c and d are indices of vertices.
     #[inline(always)]
     fn corners_x4(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
         let four = vertices_x4(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
@@ -114,8 +119,8 @@ impl OffsetSurface<'_> {
     }
 }
 
-/// Moves each point that does not stay to the facet to which its weights point. Returns false if one of these points
-/// has no next facet.
+/// Moves each point whose flag in `stays` is false to the next facet, in the direction of its barycentric weights `b`.
+/// Changes `places`. Returns false if one of these points has no next facet.
 #[inline(never)]
 fn jump_to_facets<F: Facets>(
     facets: &F,

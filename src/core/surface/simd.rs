@@ -100,6 +100,7 @@ impl Real for f64 {
 }
 
 impl F64x4 {
+    /// Returns the smaller of two numbers in each lane.
     #[inline(always)]
     pub(crate) fn min(self, other: Self) -> Self {
         let least = |a: f64, b: f64| if a < b { a } else { b };

@@ -72,7 +72,7 @@ pub(crate) struct Triangulation {
 }
 
 impl Triangulation {
-    /// Triangulates at least three points.
+    /// Triangulates at least three points (Delaunay, divide and conquer).
     pub(crate) fn new(sites: SortedSites) -> Self {
         let count = sites.places.len();
         // The system supplies zeroed memory untouched; the threads that build here are the first to touch it.
@@ -83,10 +83,10 @@ impl Triangulation {
         Self { edges, hull }
     }
 
-    /// Returns the corners of the inner faces, counter-clockwise, and for each corner the face across the opposite
-    /// edge.
+    /// Returns the triangles of the triangulation: their corners, counter-clockwise, and for each corner the triangle
+    /// across the opposite edge, or [`BORDER`].
     ///
-    /// Faces are numbered in the order of their edges, so that in memory they lie about where their corners do.
+    /// Triangles are numbered in the order of their edges, so that in memory they lie about where their corners do.
     pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
         let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
         self.visit_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
@@ -117,10 +117,12 @@ impl Triangulation {
             .unzip()
     }
 
+    /// Returns the next edge along the face on the left of the edge `e`.
     fn left_next(&self, e: u32) -> u32 {
         self.edges[(e ^ 1) as usize][BEFORE]
     }
 
+    /// Calls `visit` with each edge of the convex hull.
     fn visit_hull(&self, visit: impl Fn(u32)) {
         let mut e = self.hull;
         loop {
@@ -133,8 +135,9 @@ impl Triangulation {
     }
 }
 
-/// Triangulates a range of the points with the edges that are reserved for it. `base` is the number of the first of
-/// these edges.
+/// Triangulates the points with the indices `range`. Large ranges are divided between threads. `edges` is the storage
+/// that is reserved for this part; `base` is the number of its first edge. Returns the part and the edge numbers that
+/// it left unused.
 fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32) -> (PartialTriangulation, FreeEdges) {
     if range.len() <= MAX_POINTS_PER_THREAD {
         let fresh = base..base + edges.len() as u32;
@@ -158,8 +161,8 @@ fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32
 }
 
 impl SortedSites<'_> {
-    /// Divides a range of at least two points by a line. Returns the index where the second part begins, and the axis
-    /// along which the second part has the larger coordinates.
+    /// Divides a range of at least two points by a line along u or v. Returns the index of the first point of the
+    /// second part, and the axis along which the second part has the larger coordinates.
     fn cut(&self, range: &Range<usize>) -> (usize, CutAxis) {
         let keys = &self.keys[range.clone()];
         let differing = keys[0] ^ keys[keys.len() - 1];
@@ -179,7 +182,8 @@ struct FreeEdges {
 }
 
 impl FreeEdges {
-    /// Takes an unused pair of numbers that differ in the last bit, and returns the lower one.
+    /// Takes two unused edge numbers, one for an edge and one for its reverse, and returns the lower one. They differ
+    /// only in the last bit.
     fn allocate(&mut self) -> u32 {
         if let Some(e) = self.freed.pop() {
             return e;
@@ -194,7 +198,7 @@ impl FreeEdges {
         }
     }
 
-    /// Marks the edges whose numbers were never assigned.
+    /// Marks as deleted the edges whose numbers were never assigned.
     fn mark_deleted(&self, edges: &mut [Edge]) {
         for range in &self.fresh {
             edges[range.start as usize..range.end as usize].fill([DELETED; 3]);
@@ -212,6 +216,7 @@ struct Subdivision<'a> {
 }
 
 impl Subdivision<'_> {
+    /// Triangulates the points with the indices `range` on this thread, by divide and conquer.
     fn build(&mut self, range: Range<usize>) -> PartialTriangulation {
         match range.len() {
             1 => PartialTriangulation::Vertex(range.start as u32),
@@ -226,7 +231,7 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Joins three points to a triangle, or to two edges if they lie on one line.
+    /// Joins three points, from the index `first` on, to a triangle, or to two edges if they lie on one line.
     fn join_three(&mut self, first: u32) -> PartialTriangulation {
         let mut v = [first, first + 1, first + 2];
         let orientation = self.orient2d(v[0], v[1], v[2]);
@@ -243,7 +248,8 @@ impl Subdivision<'_> {
         PartialTriangulation::Hull(a)
     }
 
-    /// Merges two parts that a line separates; the lower part lies before the line. Returns their common hull.
+    /// Merges two triangulated parts that a line separates, and returns the merged part. `lower` has the smaller
+    /// coordinates along `axis`.
     fn merge(
         &mut self,
         lower: PartialTriangulation,
@@ -275,8 +281,12 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Deletes the edges on one side that are not Delaunay: the circle through the base and the end of the edge
-    /// contains the next vertex. Returns the first edge that remains.
+    /// Deletes edges that the merge makes invalid, at one end of the base edge, and returns the first edge that
+    /// remains. Starts at the edge `e` and goes around its origin in the direction `way` ([`AFTER`] or [`BEFORE`]).
+    /// `left` and `right` are the ends of the base edge.
+    ///
+    /// An edge is not Delaunay, and is deleted, if the circle through `left`, `right` and its end contains the end of
+    /// the next edge.
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
@@ -288,8 +298,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Adds the lowest edge between two parts, seen with the separating line upright, and returns it. It runs from the
-    /// upper part to the lower.
+    /// Adds the lower common tangent of two parts: the lowest edge between them, seen with the separating line upright.
+    /// Returns this edge; it runs from the upper part to the lower.
     fn tangent(&mut self, lower: PartialTriangulation, upper: PartialTriangulation, axis: CutAxis) -> u32 {
         // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
@@ -329,8 +339,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Walks along a hull to its farthest vertex, and returns the hull edge that starts there. `beyond(a, b)` is true
-    /// if vertex b is farther than vertex a.
+    /// Walks along a hull, from the edge `e`, to its farthest vertex. Returns the hull edge that starts there.
+    /// `beyond(a, b)` is true if vertex b is farther than vertex a.
     fn farthest(&self, mut e: u32, beyond: impl Fn(u32, u32) -> bool) -> u32 {
         let next = |e: u32| self.edge(e ^ 1)[AFTER];
         let previous = |e: u32| self.edge(e)[BEFORE] ^ 1;
@@ -343,7 +353,8 @@ impl Subdivision<'_> {
         e
     }
 
-    /// Compares two vertices across a line that separates parts; ties are ordered along the line.
+    /// Compares the coordinates of two vertices along `axis`, across the line that separates the parts. If they are
+    /// equal, compares the other coordinates.
     fn compare(&self, axis: CutAxis, a: u32, b: u32) -> std::cmp::Ordering {
         let (a, b) = (self.sites.places[a as usize], self.sites.places[b as usize]);
         match axis {
@@ -353,33 +364,37 @@ impl Subdivision<'_> {
         }
     }
 
+    /// Returns the edge with the number `e`.
     #[inline(always)]
     fn edge(&self, e: u32) -> &Edge {
         &self.edges[(e - self.base) as usize]
     }
 
+    /// Returns the edge with the number `e`, to be changed.
     #[inline(always)]
     fn edge_mut(&mut self, e: u32) -> &mut Edge {
         &mut self.edges[(e - self.base) as usize]
     }
 
+    /// Returns the vertex where the edge `e` starts.
     #[inline(always)]
     fn origin(&self, e: u32) -> u32 {
         self.edge(e)[ORIGIN]
     }
 
+    /// Returns the vertex where the edge `e` ends.
     #[inline(always)]
     fn destination(&self, e: u32) -> u32 {
         self.edge(e ^ 1)[ORIGIN]
     }
 
-    /// Returns the next edge along the face on the left.
+    /// Returns the next edge along the face on the left of the edge `e`.
     #[inline(always)]
     fn left_next(&self, e: u32) -> u32 {
         self.edge(e ^ 1)[BEFORE]
     }
 
-    /// Adds an edge that is not connected to any other, and returns its number.
+    /// Adds an edge between the vertices `from` and `to` that is not connected to any other edge. Returns its number.
     fn make(&mut self, from: u32, to: u32) -> u32 {
         let e = self.free_edges.allocate();
         *self.edge_mut(e) = [from, e, e];
@@ -387,7 +402,8 @@ impl Subdivision<'_> {
         e
     }
 
-    /// Inserts an edge that is alone at its origin directly after another one, counter-clockwise.
+    /// Inserts the edge `e`, which is not yet connected at its origin, directly after the edge `other`,
+    /// counter-clockwise around their common origin.
     #[inline(always)]
     fn insert_after(&mut self, e: u32, other: u32) {
         let next = self.edge(other)[AFTER];
@@ -397,8 +413,8 @@ impl Subdivision<'_> {
         (edge[BEFORE], edge[AFTER]) = (other, next);
     }
 
-    /// Adds an edge from the end of `a` to the origin of `b`, across the face on the left of both, and returns its
-    /// number.
+    /// Adds an edge from the end of the edge `a` to the origin of the edge `b`. Both must have the same face on their
+    /// left, which the new edge divides. Returns the number of the new edge.
     fn connect(&mut self, a: u32, b: u32) -> u32 {
         let e = self.make(self.destination(a), self.origin(b));
         self.insert_after(e, self.left_next(a));
@@ -406,6 +422,7 @@ impl Subdivision<'_> {
         e
     }
 
+    /// Removes the edge `e` and its reverse, and frees their numbers.
     fn delete(&mut self, e: u32) {
         for e in [e, e ^ 1] {
             let [_, after, before] = *self.edge(e);
@@ -416,19 +433,21 @@ impl Subdivision<'_> {
         self.free_edges.freed.push(e & !1);
     }
 
+    /// Returns the orientation of three vertices, see the function [`orient2d`].
     #[inline(always)]
     fn orient2d(&self, a: u32, b: u32, c: u32) -> f64 {
         orient2d([a, b, c].map(|v| self.sites.places[v as usize]))
     }
 
+    /// Returns true if vertex `d` lies inside the circle through `a`, `b` and `c`, see the function [`in_circle`].
     #[inline(always)]
     fn in_circle(&self, a: u32, b: u32, c: u32, d: u32) -> bool {
         in_circle([a, b, c, d].map(|v| self.sites.places[v as usize]))
     }
 }
 
-/// Returns a positive value if three points are counter-clockwise, a negative one if they are clockwise, and 0 if they
-/// lie on a line; the sign is exact.
+/// Returns a positive value if the points a, b and c are counter-clockwise, a negative value if they are clockwise, and
+/// 0 if they lie on one line. The sign is exact (Shewchuk's predicate).
 #[inline(always)]
 fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
     // The first filter of Shewchuk's predicate is repeated here so that it is inlined. Its epsilon is half the distance
@@ -444,7 +463,8 @@ fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
 
 const HALF_EPSILON: f64 = 0.5 * f64::EPSILON;
 
-/// Returns true if the fourth point lies inside the circle through the other three, which are counter-clockwise; exact.
+/// Returns true if the point d lies inside the circle through a, b and c, which must be counter-clockwise. The result
+/// is exact (Shewchuk's predicate).
 #[inline(always)]
 fn in_circle([a, b, c, d]: [[f64; 2]; 4]) -> bool {
     const BOUND: f64 = (10.0 + 96.0 * HALF_EPSILON) * HALF_EPSILON;

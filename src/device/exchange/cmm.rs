@@ -60,7 +60,8 @@ pub struct CmmExchange {
 }
 
 impl CmmExchange {
-    /// Returns the default settings for a part and two folders.
+    /// Returns the default settings of a CMM that exchanges files: `part` is the name of the part, `outbox` the folder
+    /// for plans, `inbox` the folder for results.
     pub fn new(part: impl Into<String>, outbox: impl Into<PathBuf>, inbox: impl Into<PathBuf>) -> Self {
         Self {
             part: part.into(),
@@ -175,7 +176,7 @@ struct FinishedJudgement {
 type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
 impl CmmFolders {
-    /// Creates the folders from their settings. Reads nothing before the driver opens them.
+    /// Creates the driver of the two exchange folders from its settings. Reads no folder before it is opened.
     pub fn new(settings: CmmExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -183,7 +184,11 @@ impl CmmFolders {
         Self { judge, watch, running_judgement: None, published: None, expected: None, last_judgement: None }
     }
 
-    /// Returns the expected result of a job. After a restart, reads the hand-over from the outbox.
+    /// Returns the result that is expected for a job: its hand-over, plan and targets. After a restart, reads them from
+    /// the outbox.
+    ///
+    /// # Errors
+    /// The job was not handed over, or its files cannot be read.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
         if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.header.job() == job) {
             return Ok(expected.clone());
@@ -210,8 +215,9 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Starts a check of the files `found`, unless a check still runs. Returns the finished check. Returns `None` if
-    /// the check takes longer than `read_timeout`, was of another job, or accepted a file that has changed since then.
+    /// Starts a check of the files `found` in another thread, unless a check still runs, and waits for its result for
+    /// at most `read_timeout`. Returns the finished check. Returns `None` if the check still runs, was of another job,
+    /// or accepted a file that has changed since the check began.
     fn finished_judgement(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<FinishedJudgement> {
         let job = expected.stored.header.job();
         if self.running_judgement.is_none() {
@@ -257,8 +263,8 @@ impl Judge {
         Ok(accepted)
     }
 
-    /// Returns true if a file may be read. A file that was in the inbox before the hand-over may be read only if the
-    /// settings accept such files; otherwise a note is added.
+    /// Returns true if a file may be read as an answer. A file that was in the inbox before the hand-over may be read
+    /// only if the settings accept such files; otherwise a text about it is added to `notes`.
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
@@ -309,7 +315,12 @@ impl Judge {
         }
     }
 
-    /// Returns the reason why a file does not belong to a hand-over, or `None` if it does.
+    /// Returns the reason, as text, why a file does not belong to the hand-over `ticket`, or `None` if it does. A file
+    /// belongs to it if its header states this job or plan, or if its name matches `pattern`, and if nothing in its
+    /// header contradicts.
+    ///
+    /// # Errors
+    /// The file cannot be read.
     fn foreign_reason(
         &self,
         ticket: &HandOverHeader,
@@ -345,7 +356,8 @@ impl Judge {
         Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], notes })
     }
 
-    /// Reads a file of points and checks it against plan and cell. Returns it with the SHA-256 of its bytes.
+    /// Reads a file of points and checks that no other hand-over has accepted it. Then checks it against the plan and
+    /// the cell file. Returns its content and the SHA-256 of its bytes in hexadecimal digits.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
         let sha = hex(&Sha256::digest(&bytes));
@@ -353,7 +365,8 @@ impl Judge {
         Ok((self.requirements(expected).read(path, &bytes)?, sha))
     }
 
-    /// Returns the requirements for a result of a hand-over.
+    /// Returns what a result of this hand-over must fulfil: the targets, the content, and the probe radius with its
+    /// tolerance.
     fn requirements<'a>(&'a self, expected: &'a Expected) -> ResultRequirements<'a> {
         ResultRequirements {
             targets: (!self.settings.free_count).then_some(&*expected.targets),
@@ -363,8 +376,8 @@ impl Judge {
         }
     }
 
-    /// Returns an error if a file with the same SHA-256 was accepted as the answer to another hand-over. Exception: the
-    /// other hand-over is of another run, and the cell file accepts earlier files.
+    /// Returns an error if a file with the same SHA-256, `sha`, was accepted as the answer to another hand-over. This
+    /// is allowed only if the other hand-over is of another job and the cell file has `accept_earlier_files`.
     fn check_not_accepted_before(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
         let own = (expected.stored.header.job, expected.stored.header.cycle);
         let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.accepted);
@@ -418,7 +431,11 @@ impl Judge {
         Ok(Some(accepted))
     }
 
-    /// Returns the two files of each complete station, and the names of the missing files.
+    /// Returns the complete stations, each as its file of points and its file of reference points. Also returns what is
+    /// still missing, as texts: names of files, or files that still change.
+    ///
+    /// # Errors
+    /// Several files match the name of one file.
     fn paired<'f>(
         &self,
         ticket: &HandOverHeader,
@@ -438,8 +455,11 @@ impl Judge {
         Ok((pairs, waiting))
     }
 
-    /// Returns the file whose name matches `pattern`, if it no longer changes. Otherwise returns a text that describes
-    /// what is missing. Several matching files are an error.
+    /// Returns the only file in `new` whose name matches the pattern, if the file no longer changes. Otherwise the
+    /// inner `Err` is a text about what is awaited.
+    ///
+    /// # Errors
+    /// The outer `Err` means that several files match the pattern.
     fn settled<'f>(
         &self,
         pattern: &Pattern,
@@ -454,7 +474,9 @@ impl Judge {
         }
     }
 
-    /// Returns the stations with each star replaced by the characters that it matches, in the order of their names.
+    /// Returns the names of the two files of each station: points and reference points. If the cell file has a star in
+    /// both names, there is a station for each text in place of the star for which both files exist, in the order of
+    /// `files`.
     fn named_stations(
         &self,
         ticket: &HandOverHeader,
@@ -523,7 +545,10 @@ impl Judge {
         place_station(&format!("{} ({name})", index + 1), seen, nominal, stations.limit_mm)
     }
 
-    /// Returns an error for the file of a station that states another part, cycle or plan.
+    /// Returns an error value if the file of a station states another part, cycle or plan, otherwise `None`.
+    ///
+    /// # Errors
+    /// The file cannot be read.
     fn station_contradiction(
         &self,
         expected: &Expected,
@@ -618,7 +643,10 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     (off > 0).then(|| format!("{name}: {off} rows are switched off and were ignored"))
 }
 
-/// Reads the plan of a hand-over from its files as they were written.
+/// Reads the plan of a hand-over back from the files `plan.json` and `plan.csv` in its folder.
+///
+/// # Errors
+/// A file cannot be read, or somebody has changed its layout.
 fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
     #[derive(Deserialize)]
     struct Stored {
@@ -646,7 +674,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
     Ok(Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: None })
 }
 
-/// Parses a row of `plan.csv`; returns `None` for any other row.
+/// Parses a row of `plan.csv` as a target. Returns `None` if the row is not a target.
 fn stored_target(row: &str) -> Option<PlanTarget> {
     let cells: Vec<&str> = row.split(',').collect();
     let [index, x, y, z, nx, ny, nz, what] = cells[..] else { return None };
@@ -664,7 +692,8 @@ fn stored_target(row: &str) -> Option<PlanTarget> {
     })
 }
 
-/// Returns the plan as a CSV table, with a header that identifies it.
+/// Returns the text of `plan.csv`: the targets of a plan as a CSV table, after a header with the part, the job and
+/// `identity`, the SHA-256 of the plan.
 pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\

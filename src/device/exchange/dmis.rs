@@ -27,7 +27,8 @@ fn quotable(text: &str) -> Option<&str> {
     (text.len() <= 60 && text.chars().all(is_plain)).then_some(text)
 }
 
-/// Returns the DMIS program of a plan.
+/// Returns the DMIS program with which a CMM measures the targets of a plan. `about` contains the part, the cycle, the
+/// identity of the plan and the sensor.
 pub(super) fn program(plan: &Plan, about: &DmisHeader<'_>) -> String {
     let (compensation, what) = match about.coordinates {
         Coordinates::Centres => ("OFF", "centres"),

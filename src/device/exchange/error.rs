@@ -31,7 +31,7 @@ pub enum ExchangeError {
     Count { path: PathBuf, found: usize, expected: usize },
     /// Too few targets of the plan have a point.
     #[error(
-        "{path}: points of {found} of {expected} targets; at least {min} are required; export the complete \
+        "{path}: {found} of {expected} targets have a point; at least {min} are required; export the complete \
          measurement, or touch the missing targets first"
     )]
     TooFewTargets { path: PathBuf, found: usize, expected: usize, min: usize },
@@ -44,7 +44,7 @@ pub enum ExchangeError {
     /// A station sees too few or too many reference points.
     #[error(
         "station {station} sees {seen} reference points without names, the nominal file has {nominal} ({names}); \
-         {reason}: give one point for each, or give the points the nominal names"
+         {reason}: measure all of them, or give the points the nominal names"
     )]
     ReferenceCount { station: String, seen: usize, nominal: usize, names: String, reason: &'static str },
     /// Too few reference points have a nominal name.
@@ -72,7 +72,9 @@ pub enum ExchangeError {
     #[error("job {job} cycle {cycle} was already handed over, see {folder}; it is never handed over twice")]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
     /// The client had stopped waiting for the hand-over, so it was not published.
-    #[error("job {job} cycle {cycle} was not handed over: it took too long, and the request had ended")]
+    #[error(
+        "job {job} cycle {cycle} was not handed over: writing its files took too long, and the start was withdrawn"
+    )]
     Withdrawn { job: u32, cycle: u16 },
     /// The confirmation names another map than the one that was handed over.
     #[error("the confirmation names the map {}, but the map {} was handed over", hex(&found[..8]), hex(&expected[..8]))]
@@ -86,7 +88,10 @@ pub enum ExchangeError {
     )]
     Missing { folder: PathBuf },
     /// The thread that read the files has failed.
-    #[error("{folder}: this program failed to read a file there; remove files that do not belong there, and report it")]
+    #[error(
+        "{folder}: this program failed to read a file there; remove files that do not belong there, and report this \
+         error"
+    )]
     ReaderFailed { folder: PathBuf },
     /// The header of the file, or its points, show that it is not the requested measurement.
     #[error("{path}: {reason}; export the requested measurement")]

@@ -67,7 +67,11 @@ impl Confirmation {
         Self { map: ticket.identity.clone(), job: Some(ticket.job), cycle: Some(ticket.cycle), ..Self::default() }
     }
 
-    /// Returns an error if the confirmation does not match a hand-over.
+    /// Checks that a confirmation of a pass belongs to the hand-over `ticket`. `path` is the file of the confirmation,
+    /// for the error text.
+    ///
+    /// # Errors
+    /// The confirmation names another map, job or cycle, or one of its numbers is negative or not finite.
     fn check(&self, path: &Path, ticket: &HandOverHeader) -> Result<(), ExchangeError> {
         let wrong = |found: String, expected: String, remedy| {
             Err(ExchangeError::Confirmation { path: path.to_owned(), found, expected, remedy })
@@ -101,7 +105,7 @@ impl Confirmation {
 }
 
 impl GrinderFolders {
-    /// Creates the folders from their settings. Reads nothing before the driver opens them.
+    /// Creates the driver of the two exchange folders from its settings. Reads no folder before it is opened.
     pub fn new(settings: GrinderExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -117,8 +121,9 @@ impl GrinderFolders {
         Ok(stored)
     }
 
-    /// Returns the confirmation in the file `name`, with the SHA-256 of the file. Returns `None` if the file does not
-    /// exist, still changes, or does not belong to this hand-over. If the file exists, the reason is added to `notes`.
+    /// Returns the confirmation of a pass from the file `name` of the inbox, with the SHA-256 of the file in
+    /// hexadecimal digits. Returns `None` if the file does not exist, was there before the hand-over, still changes, or
+    /// does not belong to the hand-over. If the file exists, the reason is added to `notes`.
     fn confirmation(
         &self,
         name: &str,
@@ -229,7 +234,7 @@ impl Exchange for GrinderFolders {
 fn correction_csv(ticket: &HandOverHeader, map: &CorrectionMap) -> String {
     let mut text = format!(
         "# Regrind correction\n# part: {}\n# job: {}\n# cycle: {}\n# map: {}\n# units: mm\n# frame: model\n\
-         # correction: by how much the ground surface is wanted displaced along the outward normal; positive leaves material\n\
+         # correction: required displacement of the ground surface along the outward normal; positive leaves material\n\
          x_mm,y_mm,correction_mm\n",
         ticket.part, ticket.job, ticket.cycle, ticket.identity
     );

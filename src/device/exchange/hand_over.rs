@@ -16,11 +16,15 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// Answer that comes back.
     type Answer: std::fmt::Debug + Clone + Send + 'static;
 
-    /// Checks access to both folders. Returns every hand-over in the folder, earlier ones included, the oldest first.
+    /// Checks access to the outbox and the inbox. Returns every hand-over in the outbox, the oldest first. Hand-overs
+    /// of earlier runs are included.
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
-    /// Publishes a hand-over as a whole, by one rename. Never publishes a job and cycle twice, and not if the permit
-    /// was withdrawn before that rename.
+    /// Publishes a hand-over: all its files appear at once, by the rename of a folder. `sequence` is its start number.
+    ///
+    /// # Errors
+    /// The job and cycle were published before, the permit was withdrawn before the rename, or the outbox cannot be
+    /// written.
     fn publish(
         &mut self,
         job: Job,
@@ -29,14 +33,15 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
         permit: &Permit,
     ) -> Result<(), ExchangeError>;
 
-    /// Changes the status of a hand-over.
+    /// Changes the status of the hand-over of a job to `standing`.
     fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError>;
 
-    /// Looks for the answer to an open hand-over. `now` is the time since the driver was created.
+    /// Looks in the inbox for the answer to the open hand-over of a job. `now` is the time since the driver was
+    /// created.
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Self::Answer>, ExchangeError>;
 
-    /// Records that a person has begun or ended the job with this map identity. The default returns an error, for
-    /// machines that report a job by files alone.
+    /// Records the confirmation of a person that the job with this map identity has begun or has ended. The default
+    /// returns an error, for machines that report a job only by files.
     fn confirm(&mut self, job: Job, _what: ConfirmedStep, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
     }
@@ -53,17 +58,19 @@ const USED: u8 = 1;
 const WITHDRAWN: u8 = 2;
 
 impl Permit {
-    /// Creates a valid permit.
+    /// Creates a permit for one publication.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Uses the permit up. Returns false if it was withdrawn.
+    /// Uses the permit for a publication. Returns false if it was withdrawn or used before: then nothing may be
+    /// published.
     pub fn use_up(&self) -> bool {
         self.0.compare_exchange(VALID, USED, Ordering::AcqRel, Ordering::Acquire).is_ok()
     }
 
-    /// Withdraws the permit. Returns false if it was not valid any more, so that the hand-over may have appeared.
+    /// Withdraws the permit. Returns true if it was not used yet. Returns false if it was used or withdrawn before:
+    /// then the hand-over may have been published.
     pub(super) fn withdraw(&self) -> bool {
         self.0.swap(WITHDRAWN, Ordering::AcqRel) == VALID
     }

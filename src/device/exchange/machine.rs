@@ -51,8 +51,8 @@ struct FolderMachine<M: Exchange> {
 }
 
 impl<M: Exchange> ExchangeMachine<M> {
-    /// Creates the machine from its folders; `name` is its name in messages. If the folders do not answer in time, for
-    /// example on a lost network drive, the machine counts as lost.
+    /// Creates the machine from the driver of its folders; `name` is its name in messages. If an access to the folders
+    /// takes longer than `answers_within`, for example on a lost network drive, the machine counts as lost.
     pub fn new(name: impl Into<Arc<str>>, kind: MachineKind, exchange: M, answers_within: Duration) -> Self {
         let name = name.into();
         let machine = FolderMachine {
@@ -186,8 +186,8 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    /// Reads all hand-overs in the folder. At the first call, restores job and state of this machine from an open or
-    /// held hand-over.
+    /// Reads all hand-overs in the outbox. The first call restores the job and the state of this machine from an open
+    /// or held hand-over.
     fn open(&mut self) -> DeviceResult<()> {
         self.hand_overs = self.exchange.open().map_err(|error| self.failed(MachineCommand::Claim, error))?;
         if !self.connected
@@ -201,7 +201,7 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Checks whether the answer is in the inbox, while the state is EXECUTE.
+    /// Looks for the answer in the inbox if the state is EXECUTE. `now` is the time since the driver was created.
     fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == MachineState::Execute) else { return Ok(()) };
         let look = self.exchange.poll(now, job).map_err(|error| self.failed(MachineCommand::Start, error))?;
@@ -261,9 +261,11 @@ impl<M: Exchange> FolderMachine<M> {
         self.started(armed)
     }
 
-    /// Withdraws a hand-over that appeared after its client had stopped waiting for it. The client may have continued
-    /// without it, so it must not stay open. The ending `.stopped` of its folder remains. Returns the error
-    /// `DeadToken`.
+    /// Marks a hand-over as stopped that appeared after its client had stopped waiting for it. The client may have
+    /// continued without it, so it must not stay open.
+    ///
+    /// # Errors
+    /// Always returns the refusal [`Answer::DeadToken`], or the error of the marking.
     fn take_back_late(&mut self, armed: &Armed) -> DeviceResult<Started> {
         self.mark(MachineCommand::Start, HandOverStatus::Stopped)?;
         self.notes = self.withdrawal_notes();
@@ -277,7 +279,11 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
-    /// Handles an error during the publication of a hand-over: checks in the folder whether the hand-over is there.
+    /// Handles an error during the publication of a hand-over. If the outbox contains the hand-over, the start counts,
+    /// or is taken back if the permit was withdrawn.
+    ///
+    /// # Errors
+    /// Returns `error` if the hand-over is not there, and [`DeviceError::StartUnknown`] if the outbox cannot be read.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
         let why = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {
@@ -386,8 +392,11 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Accepts the operator confirmation that the job with this map identity has begun, or has ended with the part
-    /// clear.
+    /// Accepts the confirmation of a person that the job with this map identity has begun, or has ended with the
+    /// machine clear of the part. The returned list of files is always empty.
+    ///
+    /// # Errors
+    /// The machine is a CMM, no job runs, or the confirmation is of another map.
     fn confirm(&mut self, what: ConfirmedStep, map_identity: [u8; 32]) -> DeviceResult<Vec<String>> {
         self.check_connected("a confirmation")?;
         if self.kind == MachineKind::Cmm {
@@ -412,7 +421,7 @@ impl<M: Exchange> FolderMachine<M> {
         };
         if handed.job != intended.job || handed.sequence != intended.start_sequence {
             let why = format!(
-                "the folder has a hand-over of {} with number {}, expected {} with number {}",
+                "the folder has a hand-over of {} with START number {}, expected {} with START number {}",
                 handed.job, handed.sequence, intended.job, intended.start_sequence
             );
             return Ok(Reconciled::Unknown { reason: why });
@@ -461,7 +470,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         &self.name
     }
 
-    /// Returns the notes; empty while another thread works on the folders.
+    /// Returns the notes for a person. Returns none while another thread works on the folders.
     fn notes(&self) -> Vec<String> {
         match self.machine.try_lock() {
             Ok(machine) => machine.notes.clone(),

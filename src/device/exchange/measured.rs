@@ -113,7 +113,8 @@ pub fn check_measurement(
     }
 }
 
-/// Assembles a measurement from its files. A value that no file gives stays unknown.
+/// Assembles a measurement from its points and from the statements in its result files. `done` is the number of the
+/// START that began it. A value that no file states is `None`.
 pub fn assemble_measurement(
     points: Vec<MeasuredPoint>,
     results: &[ResultFile],
@@ -135,7 +136,8 @@ pub fn assemble_measurement(
     }
 }
 
-/// Returns a text if the header of a file names another part, cycle or plan; otherwise `None`.
+/// Returns a text if the header of a result file, `says`, names another part, cycle or plan than expected. `plan` is
+/// the identity of the plan in hexadecimal digits. Returns `None` if the header agrees or does not name them.
 pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
     if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
         return Some(format!("is of part {other}, not {part}"));

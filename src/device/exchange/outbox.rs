@@ -59,7 +59,8 @@ pub(super) struct HandOverHeader {
 }
 
 impl HandOverHeader {
-    /// Creates the header of a hand-over, with the list of files that are in the inbox now.
+    /// Creates the header of a hand-over. `identity` is that of the plan or map, and the files that are now in `inbox`
+    /// are listed as earlier files.
     pub(super) fn new(
         part: &str,
         job: Job,
@@ -86,13 +87,14 @@ impl HandOverHeader {
         Job { job: self.job, cycle: self.cycle, digest: self.digest }
     }
 
-    /// Returns true if a file was in the inbox before the hand-over and has not changed since.
+    /// Returns true if the file `name` was in the inbox when the hand-over was created, and `look` shows the same size
+    /// and time of change.
     pub(super) fn is_earlier(&self, name: &str, look: &FileStamp) -> bool {
         self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
     }
 }
 
-/// Returns the time of change since 1970, in ns.
+/// Returns the time since 1970 in ns.
 fn nanoseconds(at: SystemTime) -> u128 {
     at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
 }
@@ -122,7 +124,8 @@ pub(super) struct Outbox {
 }
 
 impl Outbox {
-    /// Checks access to this folder and to the inbox, and returns every hand-over, the oldest first.
+    /// Checks that the outbox can be written and the inbox can be read. Returns every hand-over in the outbox, the
+    /// oldest first.
     pub(super) fn open(&self, inbox: &mut Watch) -> Result<Vec<HandOver>, ExchangeError> {
         try_writing(&self.folder)?;
         inbox.scan(Duration::ZERO)?;
@@ -166,18 +169,24 @@ impl Outbox {
         Ok(found)
     }
 
-    /// Returns the hand-over of a job and cycle, if there is one.
+    /// Returns the hand-over of a job and its cycle, or `None` if there is none.
     fn find(&self, job: Job) -> Result<Option<StoredHandover>, ExchangeError> {
         Ok(self.list()?.into_iter().find(|l| (l.header.job, l.header.cycle) == (job.job, job.cycle)))
     }
 
-    /// Returns the hand-over of a job and cycle; an error if it is missing.
+    /// Returns the hand-over of a job and its cycle.
+    ///
+    /// # Errors
+    /// There is none, or the outbox cannot be read.
     pub(super) fn handed_over(&self, job: Job) -> Result<StoredHandover, ExchangeError> {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
-    /// Publishes a hand-over in the folder: `ticket` as its header, and `files` with their names. Publishes nothing if
-    /// the permit was withdrawn.
+    /// Publishes a hand-over in the outbox: `ticket` as its header, and `files` with their names.
+    ///
+    /// # Errors
+    /// The job and cycle were published before, the permit was withdrawn, or the outbox cannot be written. Nothing is
+    /// published then.
     pub(super) fn publish(
         &self,
         ticket: &HandOverHeader,
@@ -266,8 +275,8 @@ pub(super) fn json_lines(value: &serde_json::Value) -> Vec<u8> {
     format!("{value:#}\n").into_bytes()
 }
 
-/// Decodes an identity of 64 hexadecimal digits. An invalid digit pair gives a zero byte, so that the result matches no
-/// identity.
+/// Decodes an identity from 64 hexadecimal digits. An invalid pair of digits gives a zero byte, so that the result
+/// matches no identity.
 pub(super) fn unhex(digits: &str) -> [u8; 32] {
     let mut identity = [0; 32];
     for (byte, pair) in identity.iter_mut().zip(digits.as_bytes().chunks_exact(2)) {

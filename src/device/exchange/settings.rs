@@ -177,7 +177,10 @@ impl ExchangeWire {
         ExchangeMachine::new(name, kind, folders, FOLDER_TIMEOUT).apart(self.cannot_reach_part)
     }
 
-    /// Returns the two folders. Both must exist: Regrind does not create them, because no machine or person would use a
+    /// Returns the outbox and the inbox.
+    ///
+    /// # Errors
+    /// One of the two folders does not exist. Regrind does not create them, because no machine or person would use a
     /// folder that Regrind created itself.
     fn folders(&self, making: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
         let table = machine.name();
@@ -191,8 +194,8 @@ impl ExchangeWire {
         Ok([folder("outbox", &self.outbox)?, folder("inbox", &self.inbox)?])
     }
 
-    /// Returns the settings of the stations. Reads the reference points at once, so that an error in them does not
-    /// appear only after a day of measuring.
+    /// Returns the settings of the stations, or `None` if the cell file has no stations. Reads the reference points at
+    /// once, so that an error in them does not appear only after a day of measuring.
     fn stations(&self, making: &DriverContext<'_>) -> Result<Option<Stations>, DriverError> {
         let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
             return Ok(None);

@@ -29,7 +29,8 @@ pub struct PlacedStation {
 }
 
 impl PlacedStation {
-    /// Returns in words the fit of this station and its missing points.
+    /// Returns a text about this station: how well its reference points fit in mm, which nominal points it does not
+    /// see, and which of its points are not nominal.
     pub fn summary(&self) -> String {
         let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
         let mut words = format!(
@@ -47,11 +48,12 @@ impl PlacedStation {
     }
 }
 
-/// Registers a station to the nominal reference points.
+/// Registers a station to the nominal reference points by a rigid best fit. `seen` are the reference points that the
+/// station has measured.
 ///
 /// Points are matched by name if the station names at least one nominal point (three are required), otherwise by their
-/// order. A station that names none and sees fewer points than there are is matched in order by its distances, if these
-/// allow only one match.
+/// order. A station without these names that has fewer points than `nominal` is matched by the distances between its
+/// points, if only one subset of `nominal`, in order, has the same distances.
 ///
 /// # Errors
 /// The points cannot be matched, they determine no pose, or a residual exceeds `limit_mm`.
@@ -137,7 +139,11 @@ fn match_points(
     }
 }
 
-/// Finds the unique subset of the nominal points, in order, that fits the seen points.
+/// Finds the subset of the nominal points, in their order, to which the points `seen` fit with residuals of at most
+/// `limit_mm`.
+///
+/// # Errors
+/// Returns a text if no subset fits, or more than one.
 fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Result<Matching, &'static str> {
     let (have, want) = (seen.points.len(), nominal.points.len());
     let chosen = |mask: u32| (0..want).filter(|n| mask >> n & 1 == 1).enumerate().collect::<Vec<_>>();
@@ -154,7 +160,9 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     }
 }
 
-/// Returns the index of the reference point to name, if there is one, and the probable cause of the misfit in words.
+/// Looks for the cause why the points `from` do not fit the nominal points `to`: two points are swapped, or one point
+/// is wrong. Returns the index of the point that the message names, or `None` if no single point explains it, and the
+/// probable cause as text.
 fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (Option<usize>, String) {
     let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.max_residual().1 <= limit_mm);
     for a in 0..from.len() {
@@ -183,7 +191,8 @@ fn without(points: &[Point], index: usize) -> Vec<Point> {
     points.iter().enumerate().filter(|(k, _)| *k != index).map(|(_, p)| *p).collect()
 }
 
-/// Returns the distance in mm of a point from its nominal position when only the other points are fitted.
+/// Returns the distance in mm of the point `index` from its nominal position, if only the other points are fitted.
+/// Returns `None` if these determine no pose.
 fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
     let fit = fit_rigid(&without(from, index), &without(to, index)).ok()?;
     Some((to[index] - fit.pose.transform_point(&from[index])).norm())

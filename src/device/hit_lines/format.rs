@@ -53,25 +53,25 @@ impl LineFormat {
         (Self::LetteredIntegerRotary, "lettered-integer-rotary"),
     ];
 
-    /// Returns true if the numbers are whole: micrometres and tenths of a degree.
+    /// Returns true if the numbers of a line are integers: coordinates in micrometres and angles in tenths of a degree.
     pub fn is_integer(self) -> bool {
         use LineFormat::*;
         matches!(self, Integer | LetteredInteger | IntegerRotary | LetteredIntegerRotary)
     }
 
-    /// Returns true if the letters of the axes precede the numbers.
+    /// Returns true if each number of a line begins with the letter of its axis.
     pub fn is_lettered(self) -> bool {
         use LineFormat::*;
         matches!(self, LetteredDecimal | LetteredInteger | LetteredDecimalRotary | LetteredIntegerRotary)
     }
 
-    /// Returns true if a fourth value is the angle of a rotary table.
+    /// Returns true if a line has a fourth value, the angle of a rotary table.
     pub fn has_rotary(self) -> bool {
         use LineFormat::*;
         matches!(self, DecimalRotary | IntegerRotary | LetteredDecimalRotary | LetteredIntegerRotary)
     }
 
-    /// Returns its name in a cell file.
+    /// Returns the name of the format in a cell file.
     pub fn name(self) -> &'static str {
         Self::ALL.iter().find(|(format, _)| *format == self).map_or("", |(_, name)| name)
     }
@@ -188,8 +188,11 @@ impl LineParser {
         Err(LineError::whole_line(format!("it has {} values instead of {expected}: {why}", fields.len())))
     }
 
-    /// Returns a value without blanks and without the letter of its axis. Returns an error if the format requires the
-    /// letter and it is missing.
+    /// Returns the text of value number `k` (from 0) of a line, without blanks and without the letter of its axis.
+    /// `field` is the text between two separators.
+    ///
+    /// # Errors
+    /// The format requires the letter, and it is missing.
     fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineError> {
         let field = field.trim_matches(' ');
         if !self.format.is_lettered() {
@@ -276,8 +279,8 @@ impl fmt::Display for LineParser {
     }
 }
 
-/// Parses a number with an optional sign and `least` to `most` digits after the decimal mark. Without a mark, `least`
-/// must be 0. If `most` is 0, no mark is allowed. Returns `None` for any other text.
+/// Parses a number with an optional sign and `least` to `most` digits after the decimal mark `mark`. Without a mark,
+/// `least` must be 0. If `most` is 0, no mark is allowed. Returns `None` for any other text.
 fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
     let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
     let (whole, behind) = match digits.split_once(mark) {

@@ -137,17 +137,17 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a received line, or the beginning of data without a line end.
+    /// Processes a received line. Rejects data that are too long for a line and have no line end.
     pub(super) fn process(&mut self, gathered: ReceivedLine) {
         match gathered {
             ReceivedLine::Line(line) => self.line(&line),
             ReceivedLine::Endless(text) => {
-                self.reject_line(&text, "it does not end: check baud rate, parity and the cable")
+                self.reject_line(&text, "it has no line end: check baud rate, parity and the cable")
             }
         }
     }
 
-    /// Rejects a line whose end did not arrive in time.
+    /// Rejects the incomplete line `text`, whose end did not arrive in time.
     pub(super) fn cut_short(&mut self, text: &str) {
         self.reject_line(text, "it is incomplete: its end did not arrive; touch that point again");
     }
@@ -194,8 +194,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a line that is not a valid touch. During a measurement, refuses the line; without a measurement, only
-    /// counts it.
+    /// Processes a line that is not a valid touch, for the reason `why`. During a measurement, also a held one, the
+    /// line is listed as refused. Without a measurement, the line is only counted.
     fn reject_line(&mut self, line: &str, why: &str) {
         match (&mut self.measurement, self.state) {
             (Some(asked), state) if state.is_moving() => {
@@ -221,8 +221,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Records that the connection was lost: later touches are not received. `begun` is the incomplete last line, if
-    /// there is one.
+    /// Records that the connection was lost: a running measurement holds, because later touches are not received.
+    /// `begun` is the incomplete last line, if there is one.
     pub(super) fn link_lost(&mut self, error: DeviceError, begun: Option<String>) {
         if let Some(text) = begun {
             self.cut_short(&text);
@@ -234,8 +234,8 @@ impl MeasurementSession {
         self.link_error = Some(error);
     }
 
-    /// Ends a complete measurement when `clear_after` has passed since its last line: the time that the probe needs to
-    /// move clear.
+    /// Ends a complete measurement if `clear_after` has passed since its last line. This is the time that the probe
+    /// needs to move clear of the part. With `None`, does nothing.
     pub(super) fn finish_if_clear(&mut self, clear_after: Option<Duration>) {
         let (Some(asked), Some(clear_after), MachineState::Execute) = (&self.measurement, clear_after, self.state)
         else {
@@ -258,7 +258,8 @@ impl MeasurementSession {
 
     // ---- words ------------------------------------------------------------------------------------------------------------------------
 
-    /// Returns the last refused lines and other notes on lines.
+    /// Returns notes for a person about lines: the last refused lines, the number of repeated lines, and lines that
+    /// arrived without a measurement.
     pub(super) fn refusals(&self) -> Vec<String> {
         let asked = self.measurement.as_ref();
         let refused = asked.into_iter().flat_map(|asked| asked.refused_lines.iter().cloned());
@@ -285,7 +286,8 @@ impl MeasurementSession {
         refused.chain(duplicate_lines).chain(unrequested_lines).collect()
     }
 
-    /// Returns a short text of the remaining targets.
+    /// Returns a text with the number of targets that are not touched yet, and the first 12 of them. Returns an empty
+    /// text without a measurement.
     pub(super) fn remaining_targets(&self) -> String {
         const SOME: usize = 12;
         let Some(asked) = &self.measurement else { return String::new() };

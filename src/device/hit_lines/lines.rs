@@ -50,7 +50,8 @@ impl LineSplitter {
         !self.partial.is_empty()
     }
 
-    /// Discards an incomplete line and returns its text so far. Returns `None` if there is none, or only blanks.
+    /// Discards the line that has begun and not ended, and returns its text so far. Returns `None` if there is none, or
+    /// if it has only blanks.
     pub fn give_up(&mut self) -> Option<String> {
         self.overlong = false;
         let line = std::mem::take(&mut self.partial);

@@ -62,7 +62,11 @@ pub(super) struct Listener {
 }
 
 impl Listener {
-    /// Opens the line, discards the data received so far, and then listens.
+    /// Opens the line to the machine and discards the data received so far. Then a thread of its own passes each line
+    /// to `hearing`.
+    ///
+    /// # Errors
+    /// The line cannot be opened.
     pub(super) async fn open(
         machine: &Arc<str>,
         line: HitSource,

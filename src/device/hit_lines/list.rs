@@ -54,7 +54,8 @@ pub(super) enum TouchAssignment {
 }
 
 impl TargetList {
-    /// Creates the list for a plan. With `is_free`, the list has no targets and accepts any points.
+    /// Creates the list of the targets of a plan. `what` states whether lines contain probe centres or contact points,
+    /// and `telling` are the rules for touches. With `is_free`, the list has no targets and accepts any points.
     pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: TouchRules) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };
@@ -72,7 +73,8 @@ impl TargetList {
         self.expected_mm.is_empty()
     }
 
-    /// Assigns a point to its target. `came` is the time of its line since the measurement began.
+    /// Assigns the point of a line to the nearest target. Recognises a line that arrived twice. `came` is the time of
+    /// the line since the measurement began.
     ///
     /// # Errors
     /// Returns the reason, as text, why the point is not a touch of a target.
@@ -115,7 +117,8 @@ impl TargetList {
         away.min_by(|(_, a), (_, b)| a.total_cmp(b)).unwrap_or((0, f64::INFINITY))
     }
 
-    /// Returns the number of points and the number of targets; `None` for the latter if any points are accepted.
+    /// Returns the number of touched targets and the number of all targets. If the list accepts any points, returns the
+    /// number of points and `None`.
     pub(super) fn progress(&self) -> (usize, Option<usize>) {
         (self.points.iter().flatten().count(), (!self.is_free()).then_some(self.points.len()))
     }
@@ -130,7 +133,8 @@ impl TargetList {
         self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
     }
 
-    /// Returns the points in the order of the plan; a target that was not touched has the status not found.
+    /// Returns one point for each target, in the order of the plan. A target that was not touched has the status
+    /// `NotFound`. If the list accepts any points, returns them in the order in which they arrived.
     pub(super) fn points(&self) -> Vec<MeasuredPoint> {
         let missed = |k: usize| MeasuredPoint {
             index: self.indices.get(k).copied().unwrap_or_default(),
@@ -141,7 +145,7 @@ impl TargetList {
         self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
     }
 
-    /// Returns the points from `from` on, up to the first missing one.
+    /// Returns the points from index `from` on, up to the first target that is not touched yet.
     pub(super) fn ready(&self, from: usize) -> Vec<MeasuredPoint> {
         self.points.iter().skip(from).map_while(|point| *point).collect()
     }
@@ -156,7 +160,7 @@ pub(super) mod tests {
     use super::*;
     use crate::payload::{PlanTarget, TargetKind};
 
-    /// Plan of targets on a line along x, 5 mm apart, on a plane that faces up.
+    /// Returns a plan for tests: `targets` targets on a line along x, 5 mm apart, on a plane that faces up.
     pub(in super::super) fn plan(targets: u32) -> Plan {
         let target = |k: u32| PlanTarget {
             index: 100 + k,

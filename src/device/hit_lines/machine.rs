@@ -37,7 +37,7 @@ pub struct HitLinesCmm {
 }
 
 impl HitLinesCmm {
-    /// Creates a machine; does not listen yet.
+    /// Creates the driver of a machine. It does not listen yet.
     pub fn new(settings: HitLinesSettings) -> Self {
         let hearing = Arc::new(Mutex::new(MeasurementSession::new(settings.line_rules())));
         let name = format!("cmm by hit lines, {}", settings.source).into();
@@ -126,8 +126,10 @@ impl HitLinesCmm {
         }
     }
 
-    /// Ends the measurement after a person has confirmed its end. Returns the paths of the stored files, or an error
-    /// text.
+    /// Ends the measurement after a person has confirmed its end. Returns the paths of the stored files.
+    ///
+    /// # Errors
+    /// Returns a text if no measurement is requested, no point arrived, or fewer points arrived than required.
     fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
         let Some(asked) = &hearing.measurement else { return Err("no measurement is requested".to_owned()) };
         let (there, _) = asked.list.progress();
@@ -147,7 +149,7 @@ impl HitLinesCmm {
         let mut hearing = locked(&self.session);
         let taken = match (word, hearing.state) {
             (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
-                Err("its points come by the line: remove --file".to_owned())
+                Err("this machine sends its points over its line: remove --file".to_owned())
             }
             (OperatorConfirmation::Done { .. }, MachineState::Execute | MachineState::Holding | MachineState::Held) => {
                 self.finish_measurement(&mut hearing)
@@ -186,7 +188,7 @@ fn status_of(hearing: &MeasurementSession) -> Status {
     }
 }
 
-/// Returns the path of the list of a job, relative to the folder of its run.
+/// Returns the path of the list of targets of a job, relative to the folder of its run.
 fn plan_file(job: Job) -> String {
     format!("cycle-{}/plan{}.csv", job.batch_id().cycle, batch_suffix(job))
 }
@@ -202,7 +204,8 @@ fn batch_suffix(job: Job) -> String {
     }
 }
 
-/// Writes the list into the folder of the run, and opens the file that stores the lines.
+/// Writes the list of targets of a job into the folder of the run. Opens and returns the file that stores the received
+/// lines.
 fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<JsonlAppender, FormatError> {
     let path = settings.run_folder.join(plan_file(job));
     ResultFolder::prepare(path.parent().unwrap_or(&settings.run_folder))?.keep();
@@ -211,8 +214,8 @@ fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<Json
     JsonlAppender::open(&settings.run_folder.join(hits_file(job)))
 }
 
-/// Writes the list as `plan.csv` into the folder from which the machine's part program reads it. Does nothing if the
-/// cell file names no folder.
+/// Writes the list of targets as `plan.csv` into the folder from which the machine's part program reads it. Does
+/// nothing if the cell file names no such folder.
 fn show_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<(), FormatError> {
     let Some(folder) = &settings.plan_folder else { return Ok(()) };
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
@@ -401,7 +404,7 @@ impl Machine for HitLinesCmm {
     }
 }
 
-/// Returns an empty plan, for the measurement of an interrupted run, of which only the job is known.
+/// Returns a plan without targets, for a measurement of an interrupted run: only its job is known.
 fn no_plan() -> Plan {
     Plan {
         targets: Vec::new(),

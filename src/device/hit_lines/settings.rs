@@ -292,7 +292,7 @@ impl DriverFactory for HitLinesWire {
 }
 
 impl HitLinesWire {
-    /// Returns the source of the lines.
+    /// Returns where the lines come from: a serial line or a TCP address.
     pub fn source(&self) -> HitSource {
         let Self { device, host, port, .. } = self.clone();
         match (device, host) {
@@ -316,7 +316,7 @@ impl HitLinesWire {
         }
     }
 
-    /// Returns the parameters of the parsing of lines.
+    /// Returns the parser of the lines, with the format that the cell file states.
     pub fn parser(&self) -> LineParser {
         LineParser {
             // A cell file without this key is refused.

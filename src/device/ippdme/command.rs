@@ -71,7 +71,7 @@ impl DmeCommand {
         Ok(Self::new(name, reader.in_parentheses()?))
     }
 
-    /// Returns the line with its tag and its line end.
+    /// Returns the command as a line, with its tag and its line end.
     pub fn line(&self, tag: Tag) -> String {
         format!("{tag} {self}\r\n")
     }
@@ -83,7 +83,7 @@ impl fmt::Display for DmeCommand {
     }
 }
 
-/// Splits a line into its tag and the rest after the blank.
+/// Splits a line into its tag and the text after the blank that follows the tag.
 fn tagged(line: &str) -> Result<(Tag, &str), SyntaxError> {
     let illegal = SyntaxError { number: 1, reason: "an invalid tag" };
     let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;

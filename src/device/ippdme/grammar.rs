@@ -110,12 +110,12 @@ const COMMANDS: &[(&str, Shape)] = &[
     ("TiltPart", Numbers(&[4], &[])),
 ];
 
-/// Returns the names of all commands.
+/// Returns the names of all commands of I++ DME.
 pub(super) fn names() -> impl Iterator<Item = &'static str> {
     COMMANDS.iter().map(|(name, _)| *name)
 }
 
-/// Returns true if a command of this name exists.
+/// Returns true if I++ DME has a command of this name.
 pub(super) fn is_known(name: &str) -> bool {
     names().any(|known| known == name)
 }
@@ -249,8 +249,8 @@ fn touch(items: &[Item]) -> Result<(), SyntaxError> {
 
 // ---- properties of tools --------------------------------------------------------------------------------------------------------
 
-/// Returns the error for a trailing comma: a name, then a comma with nothing after it, is refused as a property without
-/// parentheses. Otherwise returns `otherwise`.
+/// Returns the error for arguments that end in a name and a comma: the name is refused as a property without
+/// parentheses. For all other arguments, returns the error `otherwise`.
 fn trailing(items: &[Item], otherwise: SyntaxError) -> Result<(), SyntaxError> {
     match items {
         [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),

@@ -50,13 +50,13 @@ pub struct IppdmeCmm {
 }
 
 impl IppdmeCmm {
-    /// Creates a machine; sends nothing to it yet.
+    /// Creates the driver of a machine. Sends nothing to the machine yet.
     pub fn new(settings: IppdmeSettings) -> Self {
         Self::build(settings, Box::new(SystemConnector), false)
     }
 
-    /// Creates a machine that opens its connections with `dial` and computes on no other thread: for servers in the
-    /// same process, and for simulated time.
+    /// Creates the driver of a machine that opens its connections with `dial` and computes on no other thread: for
+    /// servers in the same process, and for simulated time.
     pub fn with_connector(settings: IppdmeSettings, dial: Box<dyn Connector>) -> Self {
         Self::build(settings, dial, true)
     }
@@ -77,9 +77,9 @@ impl IppdmeCmm {
         }
     }
 
-    /// Opens a session and checks the identity of the machine. When the session is open, nothing moves: the server
-    /// first finishes its current command, or aborts it if an abort was ordered that no session has sent. A motion left
-    /// from our own job may last at most `silence_limit`.
+    /// Opens a session with the server, and checks the identity of the machine. When this returns, nothing moves. The
+    /// server first finishes its current command; a motion of a job of this client may last at most `silence_limit`,
+    /// then it is aborted. If an abort was ordered and not sent yet, the command is aborted at once.
     async fn open(&mut self) -> DeviceResult<Identity> {
         let state = locked(&self.shared).state;
         let moved = state.is_moving() || self.memory.unresolved.is_some();
@@ -152,7 +152,11 @@ impl IppdmeCmm {
         })
     }
 
-    /// Checks the machine class against the cell file: simulated or real, and the expected name.
+    /// Checks the machine class that the server reports against the cell file.
+    ///
+    /// # Errors
+    /// The class is of a simulated machine and the cell file of a real one, or the reverse, or it is not the expected
+    /// name.
     fn check_identity(&self, class: &str) -> DeviceResult<()> {
         let machine = || Arc::clone(&self.name);
         let simulation = class.contains(SIMULATED);
@@ -229,7 +233,11 @@ impl IppdmeCmm {
         orders.send(order).await.map_err(|_| locked(&self.shared).session_error.clone().unwrap_or(gone))
     }
 
-    /// Checks that the server answers. While something moves, the task that owns the session does this check.
+    /// Checks that the server answers. Sends nothing while the machine moves, because the task that owns the session
+    /// then makes this check.
+    ///
+    /// # Errors
+    /// The session is lost or not open.
     async fn check_alive(&self) -> DeviceResult<()> {
         self.current_status()?;
         if locked(&self.shared).state.is_moving() {

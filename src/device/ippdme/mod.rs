@@ -29,7 +29,8 @@ pub use session::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
 pub use text::{Item, SyntaxError, Tag, number};
 
-/// Returns the static name of a command, for messages that hold no owned strings; `"a command"` for an unknown name.
+/// Returns the command name as a static string, for messages that hold no owned strings. Returns `"a command"` for an
+/// unknown name.
 fn static_command_name(name: &str) -> &'static str {
     grammar::names().find(|known| *known == name).unwrap_or("a command")
 }

@@ -42,7 +42,8 @@ pub struct ServerError {
 }
 
 impl ServerError {
-    /// Returns true for severity 0 (information) or 1 (warning), which does not interrupt the work.
+    /// Returns true if the severity is 0 (information) or 1 (warning). Such an error does not interrupt the work of the
+    /// server.
     pub fn is_warning(&self) -> bool {
         self.severity < 2
     }
@@ -56,10 +57,11 @@ impl fmt::Display for ServerError {
 }
 
 impl DmeResponse {
-    /// Parses a line without its line end.
+    /// Parses a line of the server, without its line end: a tag, then an acknowledgement, data, an error or a
+    /// completion.
     ///
     /// # Errors
-    /// Returns an error if the line is not a valid answer.
+    /// The line is none of these.
     pub fn read(line: &str) -> Result<Self, SyntaxError> {
         let none = |why| SyntaxError { number: 8, reason: why };
         let tag = line.get(..5).and_then(Tag::read).ok_or(none("no tag"))?;
@@ -95,6 +97,7 @@ fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, SyntaxEr
 }
 
 /// Parses `Error(severity, number, cause, text)`. Cause and text may lack their quotes and may contain any characters.
+/// Returns `None` if the severity or the number is missing or too large.
 fn error(text: &str) -> Option<ServerError> {
     let inside = text.trim().strip_prefix("Error")?.trim_start().strip_prefix('(')?;
     let inside = inside.trim_end().strip_suffix(')').unwrap_or(inside);
@@ -111,7 +114,8 @@ fn error(text: &str) -> Option<ServerError> {
     Some(ServerError { severity, number, cause: bare(cause), text: bare(text) })
 }
 
-/// Returns the number of a property in the data, at any position; `None` if the property is missing or occurs twice.
+/// Returns the number of the property `name` in the data, at any position. Returns `None` if the property is missing,
+/// occurs twice or does not have one number.
 pub fn value(data: &[Item], name: &str) -> Option<f64> {
     match &values(data, name)?[..] {
         [Item::Number(value)] => Some(*value),
@@ -119,7 +123,8 @@ pub fn value(data: &[Item], name: &str) -> Option<f64> {
     }
 }
 
-/// Returns the items in the parentheses of a property in the data; `None` if it is missing or occurs twice.
+/// Returns the items in the parentheses of the property `name` in the data. Returns `None` if the property is missing
+/// or occurs twice.
 pub fn values(data: &[Item], name: &str) -> Option<Vec<Item>> {
     let mut found = data.iter().filter_map(|item| match item {
         Item::Call(called, values) if called == name => Some(values),

@@ -43,10 +43,11 @@ pub(super) struct Route {
 }
 
 impl Route {
-    /// Finds the route. If `scan` is given, rows of targets whose spacing is at most `scan.step_mm` are scanned.
+    /// Finds the route of the probe to all targets of a plan. `volume_mm` is the lower and the upper corner of the
+    /// travel. If `scan` is given, rows of targets whose spacing is at most `scan.step_mm` are scanned.
     ///
     /// # Errors
-    /// Returns an error for a target that is not reachable from above, or for a position outside of the volume.
+    /// A target is not reachable from above, or a position is outside of `volume_mm`.
     pub(super) fn find(
         plan: &Plan,
         scan: Option<Scanning>,
@@ -79,7 +80,7 @@ impl Leg {
 }
 
 /// Splits a plan, in its own order, into rows that are scanned and targets that are touched one by one. The slow first
-/// targets of a careful plan, the reference sphere and targets outside of all rows are touched.
+/// targets of a careful start, targets on the reference sphere and targets outside of all rows are touched.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
@@ -96,7 +97,9 @@ fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     legs
 }
 
-/// Returns the index after the last target of the row that begins at index `from`.
+/// Returns the index after the last target of the row that begins at index `from`. A row ends at a step longer than
+/// `scan.step_mm`, at a sharp change of direction, at a target that is not on the part, or at the maximum length of a
+/// scan.
 fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     let targets = &plan.targets[from..plan.targets.len().min(from + MAX_SCAN_TARGETS)];
     let step = |k: usize| -> [f64; 3] {
@@ -116,7 +119,7 @@ fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
 }
 
 /// Returns the approach point of a target: the position of the probe's centre from which the probe moves along the
-/// normal.
+/// normal to the target.
 pub(super) fn approach(target: &PlanTarget, plan: &Plan) -> [f64; 3] {
     point_on_normal(target, plan.approach_mm + plan.probe_radius_mm)
 }
@@ -137,7 +140,7 @@ fn check(
         return Err(DeviceError::BadPayload {
             machine: Arc::clone(machine),
             payload: "plan",
-            field: format!("the height of the normal of target {}", target.index),
+            field: format!("the z component of the normal of target {}", target.index),
             value: target.normal[2],
             limit: "-0.2 or more, because the probe comes from above; turn the part, or remove the target",
         });
@@ -164,7 +167,7 @@ fn check(
     Ok(())
 }
 
-/// Returns the order of the touches, as indices into the plan. The slow first targets of a careful plan stay first.
+/// Returns the order of the touches, as indices into the plan. The slow first targets of a careful start stay first.
 /// Targets on the reference sphere stay separate from targets on the part.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
@@ -266,7 +269,7 @@ impl<'a> Tour<'a> {
         apart(self.places[a], self.places[b])
     }
 
-    /// Returns the distance from stop `a` to stop `b`; 0 if `b` is `None`.
+    /// Returns the distance in mm from stop `a` to stop `b` of the tour, or 0 if `b` is `None`.
     fn to(&self, a: usize, b: Option<&usize>) -> f64 {
         b.map_or(0.0, |b| self.apart(a, *b))
     }

@@ -21,14 +21,15 @@ use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 const STRAIGHT_MM: f64 = 1e4;
 
 impl Worker {
-    /// Configures the server for scanning: speed, retract, and points at the targets. Does nothing if the cell does not
-    /// scan, or if the tool radius is unknown: then rows are touched.
+    /// Configures the server for scanning: the scan speed, the retract distance, and one point at each target. Does
+    /// nothing if the cell file has no scanning, or if the server reports no radius of its tool: then the targets are
+    /// touched one by one.
     pub(super) async fn set_up_scans(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let Some(scan) = self.settings.scan else { return Ok(()) };
         if locked(&self.shared).radius_mm.is_none() {
             // A point of a scan does not report the radius either.
             self.session
-                .note("it does not report the radius of its tool, so rows are touched and not scanned".to_owned());
+                .note("it does not report the radius of its tool, so rows are not scanned but touched".to_owned());
             return Ok(());
         }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
@@ -41,8 +42,8 @@ impl Worker {
         Ok(())
     }
 
-    /// Scans a row. Returns false if the tool radius is unknown, or if the probe lost the surface or met it elsewhere:
-    /// then the targets must be touched one by one.
+    /// Scans a row of targets, and stores their points. Returns false if the tool radius is unknown, or if the probe
+    /// lost the surface or met it elsewhere: then the targets must be touched one by one.
     pub(super) async fn scan(&mut self, work: &RoutedPlan, row: Range<usize>) -> Result<bool, Failure> {
         if locked(&self.shared).radius_mm.is_none() {
             return Ok(false);
@@ -58,7 +59,7 @@ impl Worker {
             Ok(answer) if answer.data.is_empty() && answer.warnings.iter().any(is_missed) => None,
             Ok(answer) => Some(self.decode_scan(work, targets, &answer.data)?),
             Err(Failure::Refused(error)) if is_missed(&error) && error.severity <= 2 => {
-                self.session.note(format!("the row from target {} on is touched: {error}", targets[0].index));
+                self.session.note(format!("the row from target {} is touched, not scanned: {error}", targets[0].index));
                 self.session.clear_errors(1).await?;
                 None
             }
@@ -74,8 +75,10 @@ impl Worker {
         Ok(is_there)
     }
 
-    /// Converts the numbers that a scan returned to measured points, one for each target. Returns an error if their
-    /// count does not match the targets or a point is not at its target.
+    /// Converts the numbers that a scan returned to measured points, one for each target.
+    ///
+    /// # Errors
+    /// The number of points differs from the number of targets, or a point is not at its target.
     fn decode_scan(
         &self,
         work: &RoutedPlan,
@@ -155,8 +158,8 @@ fn lateral_distance_mm(target: &PlanTarget, plan: &Plan, at_mm: [f64; 3]) -> f64
     (0..3).map(|k| (off[k] - along_mm * target.normal[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the smallest radius of curvature along the rows, in mm, estimated from the change of the normal between
-/// neighbouring targets; at most `STRAIGHT_MM`.
+/// Returns the smallest radius of curvature along the scanned rows, in mm, estimated from the change of the normal
+/// between neighbouring targets. The result is at most `STRAIGHT_MM`, the value for straight rows.
 fn min_radius_mm(work: &RoutedPlan) -> f64 {
     let rows = work.route.legs.iter().filter_map(|leg| if let Leg::Scan(row) = leg { Some(row.clone()) } else { None });
     let pairs = rows.flat_map(|row| work.plan.targets[row].windows(2));

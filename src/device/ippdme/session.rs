@@ -106,7 +106,11 @@ struct Pending<'a> {
 }
 
 impl Session {
-    /// Opens the connection; sends nothing yet.
+    /// Opens the connection with `dial`; sends nothing yet. `aborts` is the counter of ordered aborts, `aborted` the
+    /// number of them that were sent.
+    ///
+    /// # Errors
+    /// The connection cannot be opened, or not in time.
     pub(super) async fn connect(
         machine: Arc<str>,
         (line, dial): (&LineAddress, &mut dyn Connector),
@@ -120,8 +124,8 @@ impl Session {
         Ok(Self::from_stream(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
-    /// Creates a session. `aborted` is the number of aborts that earlier sessions have sent; an abort ordered later is
-    /// sent first.
+    /// Creates a session on an open connection. `aborted` is the number of aborts that earlier sessions have sent. If
+    /// more were ordered, the session first sends an abort.
     fn from_stream(
         aborted: u64,
         machine: Arc<str>,
@@ -143,12 +147,12 @@ impl Session {
         }
     }
 
-    /// Starts a new session, whatever the server is doing. It first ends a session that may be left over, and waits for
-    /// its motion. If the server refuses because it is in an error state or a session, its errors are cleared and the
-    /// start is retried once.
+    /// Starts a new session, whatever state the server is in. First ends a session that may be left from an earlier
+    /// connection, and waits for the end of its motion. If the server still refuses because of an error or a session,
+    /// clears its errors and tries once more.
     ///
-    /// A motion left from our own job runs to its end, unless an abort was ordered or the motion lasts longer than
-    /// `ours_within`.
+    /// If `ours_within` is given, the motion is of a job of this client and is aborted after that time. An ordered
+    /// abort is sent before everything else.
     pub(super) async fn open(&mut self, ours_within: Option<Duration>) -> Result<(), Failure> {
         const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
         if self.is_abort_ordered() {
@@ -179,12 +183,19 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a command without motion and waits for its end.
+    /// Sends a command that causes no motion, and waits until the server has completed it.
+    ///
+    /// # Errors
+    /// The server refuses the command, an abort was ordered, or the connection fails.
     pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<CommandReply, Failure> {
         self.request_motion(name, arguments, Duration::ZERO).await
     }
 
-    /// Sends a command whose motion takes at most `motion`, and waits for its end.
+    /// Sends a command that causes a motion, and waits until the server has completed it. `motion` is the maximum
+    /// duration of the motion.
+    ///
+    /// # Errors
+    /// The server refuses the command, an abort was ordered, or the connection fails.
     pub(super) async fn request_motion(
         &mut self,
         name: &str,
@@ -243,7 +254,11 @@ impl Session {
         }
     }
 
-    /// Processes a line with the tag of the command. Returns the answer when the command is over, otherwise `None`.
+    /// Processes a line with the tag of the pending command. Returns the reply when the server has completed the
+    /// command, otherwise `None`.
+    ///
+    /// # Errors
+    /// The server has refused the command.
     fn process_own_line(
         &mut self,
         pending: &mut Pending<'_>,
@@ -269,7 +284,11 @@ impl Session {
         Ok(None)
     }
 
-    /// Processes a line with another tag: an unsolicited message of the server, or a late line of a finished command.
+    /// Processes a line with another tag than that of the pending command: an unsolicited message of the server, or a
+    /// late line of a finished command.
+    ///
+    /// # Errors
+    /// The message is an error that stops the machine, or the tag was never sent.
     fn process_other_line(&mut self, response: DmeResponse) -> Result<(), Failure> {
         match (response.tag, response.content) {
             (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
@@ -350,8 +369,8 @@ impl Session {
         self.clear_errors(CLEARING_TRIES).await
     }
 
-    /// Sends the abort and waits for its end. With `may_refuse`, an error answer is accepted: a server without a
-    /// session may have nothing to abort.
+    /// Sends AbortE and waits until the server has completed it. With `may_refuse`, an error answer is accepted,
+    /// because a server without a session may have nothing to abort.
     async fn send_abort(&mut self, may_refuse: bool) -> Result<(), Failure> {
         let (command, tag) = (DmeCommand::new("AbortE", Vec::new()), self.next_event());
         self.write(&command, tag).await.map_err(Failure::Link)?;

@@ -226,7 +226,7 @@ impl IppdmeWire {
     }
 }
 
-/// Returns the name of a machine in messages.
+/// Returns the name of a machine in messages, with its address.
 pub(super) fn name(settings: &IppdmeSettings) -> Arc<str> {
     format!("cmm at {}:{} (I++ DME)", settings.host, settings.port).into()
 }

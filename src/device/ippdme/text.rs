@@ -20,7 +20,7 @@ impl Tag {
     /// Tag of messages that the server sends unasked.
     pub const UNSOLICITED: Self = Self::Event(0);
 
-    /// Parses the five characters of a tag; `None` if they are not a tag.
+    /// Parses a tag: five digits, or for an event command `E` and four digits. Returns `None` for any other text.
     pub fn read(text: &str) -> Option<Self> {
         let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok()).flatten();
         match text.strip_prefix('E') {
@@ -49,12 +49,12 @@ pub struct SyntaxError {
     pub reason: &'static str,
 }
 
-/// Returns the error "incorrect arguments" (502).
+/// Returns the error 502, "incorrect arguments", with the reason `why`.
 pub(super) const fn arguments(why: &'static str) -> SyntaxError {
     SyntaxError { number: 502, reason: why }
 }
 
-/// Returns the error "bad argument" (509).
+/// Returns the error 509, "bad argument", with the reason `why`.
 pub(super) const fn bad(why: &'static str) -> SyntaxError {
     SyntaxError { number: 509, reason: why }
 }
@@ -87,7 +87,7 @@ impl Item {
         Self::Call(name.to_owned(), Vec::new())
     }
 
-    /// Returns the number, or `None` if the item is not a number.
+    /// Returns the value of the item if it is a number, otherwise `None`.
     pub fn number(&self) -> Option<f64> {
         if let Self::Number(value) = self { Some(*value) } else { None }
     }
@@ -116,7 +116,7 @@ pub(super) fn list(items: &[Item]) -> String {
     text
 }
 
-/// Formats a number with at most 16 digits, leading zeros included, because a strict server counts them too.
+/// Formats a number with at most 16 digits. Leading zeros count, because a strict server counts them too.
 pub fn number(value: f64) -> String {
     let value = if value == 0.0 { 0.0 } else { value };
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).count();
@@ -170,7 +170,7 @@ impl<'a> Reader<'a> {
         after.is_some()
     }
 
-    /// Parses the items in parentheses and the closing parenthesis; the opening one is already consumed.
+    /// Parses items up to the closing parenthesis, which is consumed. The opening one must have been consumed before.
     pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, SyntaxError> {
         if self.eat(')') {
             return Ok(Vec::new());

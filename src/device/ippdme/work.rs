@@ -170,7 +170,8 @@ impl Worker {
         }
     }
 
-    /// Records a failure in the shared state. Returns true if the session is lost.
+    /// Records a failure in the shared state: ABORTED after an abort, FAULTED after a refused command or an implausible
+    /// answer. Returns true if the connection failed, so that the session is lost.
     fn failed(&mut self, failure: Failure) -> bool {
         let why = self.device_error(&failure);
         self.position_mm = None;
@@ -205,7 +206,11 @@ impl Worker {
 
     // ---- a job ------------------------------------------------------------------------------------------------------------------------
 
-    /// Measures the targets of the plan that have no point yet.
+    /// Measures the targets of the plan that have no point yet, along the route. Stops before the next target if a hold
+    /// or a stop is requested.
+    ///
+    /// # Errors
+    /// An abort, a failed connection, or an answer that is an error or implausible.
     async fn run(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
@@ -259,8 +264,8 @@ impl Worker {
         Err(Failure::Refused(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
-    /// Returns the request in force. If no status request came within `silence_limit`, the job holds by itself, as a
-    /// machine does that loses its client.
+    /// Returns whether the client requests to continue, hold or stop the job. If no status request came within
+    /// `silence_limit`, the job holds by itself, as a machine does that loses its client.
     fn current_request(&self) -> JobRequest {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
@@ -382,8 +387,8 @@ impl Worker {
         Ok(in_force)
     }
 
-    /// Sets the travel and touch speeds for target `k`, if they differ from the speeds in force. The first targets of a
-    /// careful plan have a lower speed.
+    /// Sets the travel and touch speeds for target number `k`, if they differ from the speeds in force. The first
+    /// targets of a careful start have a lower speed.
     pub(super) async fn set_speeds(&mut self, work: &RoutedPlan, k: usize) -> Result<(), Failure> {
         let careful = work.plan.careful_start.filter(|careful| k < careful.target_count as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
@@ -398,7 +403,7 @@ impl Worker {
 
     // ---- motion -----------------------------------------------------------------------------------------------------------------------
 
-    /// Touches one target, with up to `retries` retries after a miss.
+    /// Touches one target and returns its point. After a miss, tries again up to `retries` times.
     async fn touch(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<MeasuredPoint, Failure> {
         let mut missed = TouchStatus::NotFound;
         for _ in 0..=self.settings.retries {
@@ -427,8 +432,10 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, position_mm: [0.0; 3] })
     }
 
-    /// Returns the measured point in the answer to a touch. Returns an error if a coordinate is missing or the point is
-    /// not plausible for this target.
+    /// Returns the measured point in the answer to a touch.
+    ///
+    /// # Errors
+    /// A coordinate is missing, the tool radius is not that of the plan, or the point is too far from its target.
     fn point(
         &mut self,
         work: &RoutedPlan,
@@ -449,7 +456,8 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: TouchStatus::Touched, quality, position_mm: at_mm })
     }
 
-    /// Checks that a point lies within approach + search + probe tolerance of the position to which the probe was sent.
+    /// Checks the touched position `at_mm`. It may be away from the position of the target by at most the sum of
+    /// approach distance, search distance and probe tolerance.
     pub(super) fn check_touch_position(
         &self,
         work: &RoutedPlan,
@@ -496,8 +504,9 @@ impl Worker {
         Ok(())
     }
 
-    /// Returns the maximum duration of a motion over `way_mm`, from the speed in force with index `speed`. If this
-    /// speed is not set yet, the machine uses its own speed, which can be low: 1 mm/s is assumed.
+    /// Returns the maximum duration of a motion over `way_mm`, with time for acceleration. `speed` is an index into the
+    /// speeds in force. If this speed is not set yet, the machine uses its own speed, which can be low: 1 mm/s is
+    /// assumed.
     pub(super) fn motion_time(&self, way_mm: f64, speed: usize) -> Duration {
         const MIN_SPEED_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
@@ -516,7 +525,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Sends a request that not every server supports. Returns `None` if this server lacks it.
+    /// Sends a request that not every server supports. Returns `None` if this server does not support it.
     pub(super) async fn request_if_supported(
         &mut self,
         name: &str,
@@ -530,7 +539,7 @@ impl Worker {
     }
 }
 
-/// Sends a request that not every server supports. Returns `None` if this server lacks it.
+/// Sends a request that not every server supports. Returns `None` if this server does not support it.
 pub(super) async fn request_if_supported(
     session: &mut Session,
     name: &str,
@@ -547,8 +556,8 @@ pub(super) async fn request_if_supported(
     }
 }
 
-/// Returns the error number of a missed touch that the server reported only as a warning, without data. Returns `None`
-/// if the answer has data or no such warning.
+/// Returns the error number of a touch without contact that the server reported only as a warning, without data.
+/// Returns `None` if the answer has data or no such warning.
 fn missed_by(answer: &CommandReply) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
     numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())
@@ -562,7 +571,7 @@ pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the machine fault that an error number means, independent of its severity and text.
+/// Returns the machine fault for an error number of the I++ DME standard. Severity and text of the error do not matter.
 fn fault(number: u16) -> Fault {
     match number {
         500 => Fault::StopCircuit,

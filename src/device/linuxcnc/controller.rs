@@ -67,7 +67,8 @@ impl Controller {
         Self { name, settings, connector: dial, link: None, link_error: None, has_control: false, configuration: None }
     }
 
-    /// Reconnects and checks the identity; changes only settings of this connection. Returns the name of the machine.
+    /// Reconnects to the controller and checks its identity. Changes only settings of this connection. Returns the name
+    /// of the machine: the server and its INI file.
     pub(super) async fn connect(&mut self) -> DeviceResult<String> {
         (self.link, self.has_control) = (None, false);
         let LinuxcncSettings { host, port, answer_timeout, connect_password, .. } = &self.settings;
@@ -111,8 +112,8 @@ impl Controller {
         }
     }
 
-    /// Reads the complete state. Errors are read only if `errors` is true, because the controller reports each error to
-    /// one reader only.
+    /// Reads the complete state of the controller. Reads its errors only if `errors` is true, because the controller
+    /// reports each error to only one client.
     pub(super) async fn read_state(&mut self, errors: bool) -> DeviceResult<ControllerState> {
         const WHAT: [Get; 9] = [
             Get::Enable,
@@ -166,7 +167,7 @@ impl Controller {
         })
     }
 
-    /// Reads the errors since the last call.
+    /// Reads the errors that the controller has reported since the last call.
     pub(super) async fn errors(&mut self) -> DeviceResult<Vec<String>> {
         let mut errors = Vec::new();
         while errors.len() < MAX_ERRORS {
@@ -192,8 +193,8 @@ impl Controller {
         }
     }
 
-    /// Sends an order after the pending requests. An acknowledgement means that the order was received, not that it
-    /// succeeded.
+    /// Sends an order and waits for its acknowledgement, which means that the order was received, not that it
+    /// succeeded. `command` is the name of the order in errors.
     pub(super) async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<()> {
         let asked = self.link("an order")?.ask(RshRequest::Set(set), self.settings.answer_timeout);
         let answer = asked.answer().await;
@@ -212,8 +213,8 @@ impl Controller {
         }
     }
 
-    /// Returns the error for a refused order: another client has control, or else the state of the controller does not
-    /// allow the order.
+    /// Asks the controller why it has refused an order, and returns that as an error: another client has control, or
+    /// the state of the controller does not allow the order.
     async fn denied(&mut self, command: MachineCommand) -> DeviceResult<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
             return Ok(self.control_taken());
@@ -222,7 +223,7 @@ impl Controller {
         Ok(DeviceError::Refused { machine, command, answer: Answer::WrongState, state: MachineState::Idle })
     }
 
-    /// Takes control of the controller.
+    /// Takes control of the controller, so that it accepts orders of this client.
     pub(super) async fn take_control(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let asked = self.link("control")?.ask(RshRequest::Set(enable), self.settings.answer_timeout);
@@ -234,7 +235,11 @@ impl Controller {
         Ok(())
     }
 
-    /// Aborts at once, whichever client has control: the two lines go out together without waiting.
+    /// Aborts, whichever client has control. Sends the line that takes control and the line that aborts together,
+    /// without waiting between them.
+    ///
+    /// # Errors
+    /// The password for control is wrong, or the controller does not acknowledge the abort.
     pub(super) async fn abort(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let within = self.settings.answer_timeout;
@@ -249,14 +254,18 @@ impl Controller {
         self.check_acknowledged(answer, MachineCommand::Abort).await
     }
 
-    /// Switches to a mode and waits until the controller reports that mode and an idle interpreter.
+    /// Switches the controller to a mode, and waits until it reports that mode and no active program. `command` names
+    /// the order in errors.
     pub(super) async fn enter(&mut self, mode: ControllerMode, command: MachineCommand) -> DeviceResult<()> {
         self.order(Set::Mode(mode), command).await?;
         self.wait_until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
     }
 
-    /// Opens a program and checks that it is then the open one. A failed open is acknowledged too, and leaves the
-    /// previous program open.
+    /// Opens the program `path` at the controller, and checks that it is then the open program. The controller
+    /// acknowledges a failed attempt too, and leaves the previous program open.
+    ///
+    /// # Errors
+    /// The controller reports an error or does not open the program in time.
     pub(super) async fn open(&mut self, path: &str, command: MachineCommand) -> DeviceResult<()> {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
@@ -333,7 +342,8 @@ impl Controller {
         DeviceError::NotLinuxcnc { machine: self.machine(), request: asked, reply: told.chars().take(80).collect() }
     }
 
-    /// Returns the error of an unanswered request, and closes a connection that cannot be used any more.
+    /// Returns the error for a request that had no answer; `what` names the request. Closes the connection, unless the
+    /// request was invalid and not sent.
     fn broken(&mut self, fault: LinkFault, what: &'static str) -> DeviceError {
         let error = self.fault(fault, what);
         if fault != LinkFault::Unsendable {

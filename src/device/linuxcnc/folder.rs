@@ -51,7 +51,11 @@ impl Folders {
         FramedProgram::frame(order).map_err(|why| format!("{}: {why}", file.display()))
     }
 
-    /// Writes a program into the folder that the controller sees, and reads it back.
+    /// Writes a program into the folder that the controller sees, and reads it back. Does nothing if the same program
+    /// is there already.
+    ///
+    /// # Errors
+    /// Returns a text if the file cannot be written or is different afterwards.
     pub(super) fn put(&self, program: &FramedProgram) -> Result<(), String> {
         let file = self.local.join(&program.name).with_extension(PROGRAM);
         let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
@@ -65,7 +69,7 @@ impl Folders {
         }
     }
 
-    /// Returns the record that a program wrote; `None` if there is no such file.
+    /// Returns the content of the log file that the program `name` wrote, or `None` if there is no such file.
     pub(super) fn record(&self, name: &str) -> Result<Option<ProgramRecord>, String> {
         let file = self.local.join(name).with_extension(RECORD);
         let read = std::fs::metadata(&file).and_then(|about| match about.len() <= MAX_RECORD_BYTES {
@@ -79,8 +83,8 @@ impl Folders {
         }
     }
 
-    /// Returns the program of this run whose record has this token. Such a program was prepared before this process
-    /// started. Returns `None` if there is none.
+    /// Returns the program of this run and cycle whose log file contains the token. An earlier process has prepared
+    /// that program. Returns `None` if there is none.
     pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<FramedProgram>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);
@@ -98,7 +102,7 @@ impl Folders {
     }
 }
 
-/// Returns the cycle number of a folder of a run.
+/// Returns the number in the name of a folder `cycle-N`, or `None` for another folder.
 fn cycle(folder: &Path) -> Option<u32> {
     folder.file_name()?.to_str()?.strip_prefix("cycle-")?.parse().ok()
 }

@@ -45,7 +45,10 @@ struct QueuedRequest {
 pub(super) struct PendingReply(Result<oneshot::Receiver<Result<RshReply, LinkFault>>, LinkFault>);
 
 impl PendingReply {
-    /// Waits for the answer.
+    /// Waits for the answer to this request.
+    ///
+    /// # Errors
+    /// The answer does not arrive in time, the request was invalid, or the connection fails.
     pub(super) async fn answer(self) -> Result<RshReply, LinkFault> {
         // The sender was dropped: the task has ended.
         self.0?.await.unwrap_or(Err(LinkFault::Disconnected))
@@ -53,7 +56,7 @@ impl PendingReply {
 }
 
 impl Link {
-    /// Connects; sends nothing yet.
+    /// Opens the connection with `dial`; sends nothing yet. `within` is the time limit.
     pub(super) async fn open(
         line: &LineAddress,
         dial: &mut dyn Connector,
@@ -69,7 +72,7 @@ impl Link {
         Ok(Self { requests: questions })
     }
 
-    /// Sends a request after the earlier ones, answered or not.
+    /// Sends a request without waiting for the answers of earlier ones. `within` is the time limit for the answer.
     pub(super) fn ask(&self, request: RshRequest, within: Duration) -> PendingReply {
         let Some(line) = request.line() else { return PendingReply(Err(LinkFault::Unsendable)) };
         let (reply, answer) = oneshot::channel();

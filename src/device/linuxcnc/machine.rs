@@ -76,13 +76,13 @@ pub struct LinuxcncGrinder {
 }
 
 impl LinuxcncGrinder {
-    /// Creates a grinder; sends nothing to it yet.
+    /// Creates the driver of a grinder. Sends nothing to the grinder yet.
     pub fn new(settings: LinuxcncSettings) -> Self {
         Self::build(settings, Box::new(SystemConnector), (false, random()))
     }
 
-    /// Creates a grinder that opens its connections with `dial`, uses no other thread, and draws its random numbers
-    /// from `seed`: for controllers in the same process, and for simulated time.
+    /// Creates the driver of a grinder that opens its connections with `dial`, uses no other thread, and draws its
+    /// random numbers from `seed`: for controllers in the same process, and for simulated time.
     pub fn with_connector(settings: LinuxcncSettings, dial: Box<dyn Connector>, seed: u64) -> Self {
         Self::build(settings, dial, (true, seed))
     }
@@ -325,7 +325,7 @@ impl Machine for LinuxcncGrinder {
                 return Err(not_taken("it has stopped: confirm done if the pass is complete, otherwise still"));
             }
             OperatorConfirmation::Done { file: Some(_), .. } => {
-                return Err(not_taken("a pass has no file: remove --file"));
+                return Err(not_taken("only a measurement has a file: remove --file"));
             }
             OperatorConfirmation::Done { map_identity: Some(map), .. }
                 if program.is_none_or(|program| program.map != map) =>
@@ -410,7 +410,7 @@ impl LinuxcncGrinder {
         self.controller.take_control().await
     }
 
-    /// Sends an order to a running or held job.
+    /// Sends an order to a running or held job, and returns the status after it.
     async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<Status> {
         match self.controller.order(set, command).await {
             Ok(()) => {}
@@ -426,7 +426,8 @@ impl LinuxcncGrinder {
         Ok(self.read_status().await?.1)
     }
 
-    /// Ends a pause that came just after the end of the program, so that the controller is free.
+    /// Aborts if the program had ended just before it was to pause: a controller that stays paused would accept no
+    /// other program. Returns the status after that.
     async fn abort_if_ended(&mut self, status: Status) -> DeviceResult<Status> {
         if !matches!(self.job.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
             return Ok(status);
@@ -451,7 +452,8 @@ impl LinuxcncGrinder {
         done.map_err(|why| DeviceError::Folder { machine: self.machine(), reason: why })
     }
 
-    /// Returns the record that the program of a job wrote, if its token is that of this preparation.
+    /// Returns the content of the log file that the program of a job wrote. Returns `None` if there is no such file, or
+    /// if its token is of another preparation.
     async fn record(&self, work: &ActiveJob) -> DeviceResult<Option<ProgramRecord>> {
         let Some(name) = work.program.as_ref().map(|program| program.name.clone()) else { return Ok(None) };
         Ok(work.own_record(self.in_folders(move |folders| folders.record(&name)).await?))

@@ -50,7 +50,8 @@ pub struct ProgramInputs<'a> {
 }
 
 impl FramedProgram {
-    /// Builds the program of a pass in its frame.
+    /// Builds the program that the controller runs: the program of the pass, its repetitions, and lines that log its
+    /// begin and its end.
     ///
     /// # Errors
     /// Returns the reason, as text, why the program must not be run.
@@ -79,7 +80,8 @@ impl FramedProgram {
         Ok(Self { name, cycle: order.cycle, text, lines, rounds: order.rounds.max(1), map: *order.map })
     }
 
-    /// Parses a program that was framed before this process started.
+    /// Parses a program that [`FramedProgram::frame`] of an earlier process built. Returns `None` if the text is not
+    /// such a program.
     pub(super) fn read(name: &str, cycle: u32, text: Vec<u8>) -> Option<Self> {
         let whole = std::str::from_utf8(&text).ok()?;
         let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
@@ -96,7 +98,7 @@ impl FramedProgram {
         Some(Self { name: name.to_owned(), cycle, lines, rounds, map: identity, text })
     }
 
-    /// Returns the progress of a line of the file, in thousandths of the pass.
+    /// Returns the progress of the pass in thousandths, when the controller is at the line number `line` of the file.
     pub(super) fn thousandths(&self, line: u32) -> u32 {
         let (first, count) = self.lines;
         let done = line.saturating_sub(first).min(count);
@@ -124,7 +126,7 @@ pub(super) fn path(folder: &str, name: &str, extension: &str) -> String {
     format!("{}/{name}.{extension}", folder.trim_end_matches('/'))
 }
 
-/// Returns the lines with which a controller opens a new record.
+/// Returns the lines with which a controller opens the new log file `record` and writes `token` into it.
 pub(super) fn opening(record: &str, token: u32) -> [String; 3] {
     [format!("(LOGOPEN,{record})"), format!("(LOG,{PREPARED} {token:08x})"), "(LOGCLOSE)".to_owned()]
 }
@@ -156,7 +158,7 @@ fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     }
 }
 
-/// Returns the words of a line, without comments.
+/// Returns the words of a line of G-code, without comments.
 fn code(line: &str) -> Vec<&str> {
     let line = line.split([';', '(']).next().unwrap_or_default();
     line.split_whitespace().collect()
@@ -195,7 +197,8 @@ pub struct ProgramRecord {
 }
 
 impl ProgramRecord {
-    /// Parses a record; an incomplete last line is ignored.
+    /// Parses the text of a log file: its token, and how often the program began and ended. An incomplete last line is
+    /// ignored.
     pub fn read(text: &str) -> Self {
         let mut record = Self::default();
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);

@@ -65,7 +65,7 @@ impl ControllerMode {
         }
     }
 
-    /// Returns the mode of this name, in upper or lower case.
+    /// Returns the mode with this name, in which upper and lower case are equal, or `None` for another name.
     pub fn from_name(word: &str) -> Option<Self> {
         [Self::Manual, Self::Auto, Self::Mdi].into_iter().find(|mode| mode.word().eq_ignore_ascii_case(word))
     }
@@ -139,7 +139,8 @@ pub enum RshReply {
 }
 
 impl RshRequest {
-    /// Returns the line with its line end; `None` if the request is not one plain line.
+    /// Returns the line of the request, with its line end. Returns `None` if the line is too long or has a character
+    /// other than printable ASCII.
     pub fn line(&self) -> Option<String> {
         let line = match self {
             Self::Hello { password } => format!("hello {password} regrind 1.1"),
@@ -154,7 +155,7 @@ impl RshRequest {
         (plain && line.len() < MAX_LINE_LENGTH).then(|| line + "\r\n")
     }
 
-    /// Returns the reply if a line answers this request.
+    /// Returns the reply that a line contains for this request, or `None` if the line does not answer it.
     pub fn answer(&self, line: &str) -> Option<RshReply> {
         match self {
             Self::Hello { .. } => said(line, "hello"),
@@ -177,14 +178,14 @@ impl RshRequest {
     }
 }
 
-/// Returns the text after a word at the beginning of a line, in upper or lower case.
+/// Returns the text after `word` if the line begins with this word, otherwise `None`. Upper and lower case are equal.
 fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
     let (head, rest) = line.split_at_checked(word.len())?;
     let ends = rest.is_empty() || rest.starts_with([' ', '\t']);
     (ends && head.eq_ignore_ascii_case(word)).then(|| rest.trim())
 }
 
-/// Parses `HELLO ACK name version` or `HELLO NAK`.
+/// Parses the answer to `hello`: `HELLO ACK name version` or `HELLO NAK`. Returns `None` for another line.
 fn said(line: &str, word: &str) -> Option<RshReply> {
     let rest = after(line, word)?;
     match after(rest, "ack") {
@@ -193,7 +194,8 @@ fn said(line: &str, word: &str) -> Option<RshReply> {
     }
 }
 
-/// Parses `X NAK` or `NAK` alone. A server answers `NAK` alone if it refuses before it evaluates the word.
+/// Parses `X NAK`, where X is `word`, or `NAK` alone, and returns the refusal. Returns `None` for another text. A
+/// server answers `NAK` alone if it refuses before it evaluates the word.
 fn refused(rest: &str, word: &str) -> Option<RshReply> {
     let rest = after(rest, word).unwrap_or(rest);
     rest.eq_ignore_ascii_case("nak").then_some(RshReply::Refused)
@@ -207,7 +209,7 @@ pub struct LineSplitter {
 }
 
 impl LineSplitter {
-    /// Adds bytes and returns the lines completed by them; `None` if the data are not a line of this protocol.
+    /// Adds bytes and returns the lines completed by them. Returns `None` if a line is too long for this protocol.
     pub fn push(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
         self.bytes.extend_from_slice(bytes);
         let mut lines = Vec::new();
@@ -249,7 +251,7 @@ impl<T> Default for PendingRequests<T> {
 }
 
 impl<T> PendingRequests<T> {
-    /// Adds a request that was sent.
+    /// Adds a request that was sent. `kept` is a value that is returned with its answer.
     pub fn push(&mut self, request: RshRequest, kept: T) {
         self.requests.push_back((request, kept));
     }
@@ -259,12 +261,13 @@ impl<T> PendingRequests<T> {
         self.requests.front().map(|(_, kept)| kept)
     }
 
-    /// Removes all pending requests and returns their attached values.
+    /// Removes all pending requests and returns the values attached to them.
     pub fn drain(&mut self) -> impl Iterator<Item = T> + '_ {
         self.requests.drain(..).map(|(_, kept)| kept)
     }
 
-    /// Assigns a line to the oldest pending request, if it answers it.
+    /// Compares a line with the oldest pending request. If the line answers it, removes the request and returns its
+    /// value with the reply. Too many lines in a row without a match mean that the server does not use this protocol.
     pub fn match_line(&mut self, line: &str) -> LineMatch<T> {
         match self.requests.front().and_then(|(request, _)| request.answer(line)) {
             Some(reply) => {

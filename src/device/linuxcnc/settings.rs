@@ -182,7 +182,8 @@ impl DriverFactory for LinuxcncWire {
 }
 
 impl LinuxcncWire {
-    /// Returns the command that prints the path that the controller executes, if the cell is simulated.
+    /// Returns the command that prints the path that the controller executes, for a simulated cell. Returns `None` if
+    /// the cell file has no such command.
     pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
         let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
         let at = Path::new(program);
@@ -194,8 +195,8 @@ impl LinuxcncWire {
         Some(command)
     }
 
-    /// Checks `executed_path`: a simulated cell has a real controller but no real machine, so it needs the executed
-    /// path.
+    /// Reports to the document a missing or superfluous `executed_path`. A simulated cell has a real controller but no
+    /// real machine, so its simulated wheel follows the executed path.
     fn check_path(&self, place: &MachineTable<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
@@ -215,7 +216,8 @@ impl LinuxcncWire {
         }
     }
 
-    /// Checks the folder at the controller: its path becomes part of a protocol line and of a comment in the program.
+    /// Reports to the document a folder at the controller whose path cannot be part of a protocol line or of a comment
+    /// in a program.
     fn check_folder(&self, place: &MachineTable<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {
             Some(folder) => ("wire.programs_at_controller", folder),

@@ -56,13 +56,13 @@ pub(super) enum Verdict {
 }
 
 impl ActiveJob {
-    /// Returns the record if it has the token of this job; otherwise `None`.
+    /// Returns the content of a log file if it has the token of this job; otherwise `None`.
     pub(super) fn own_record(&self, record: Option<ProgramRecord>) -> Option<ProgramRecord> {
         record.filter(|record| record.token == Some(self.token))
     }
 
-    /// Returns the verdict on a job that was begun. `still` is how long the controller has been seen idle. `settles` is
-    /// the maximum delay until a written record is visible.
+    /// Returns the verdict on a job that was begun. `record` is the content of its log file, `still` is how long the
+    /// controller has been seen idle, and `settles` is the maximum delay until a written log file is visible.
     pub(super) fn judge(
         &self,
         seen: &ControllerState,

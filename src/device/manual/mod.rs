@@ -86,7 +86,7 @@ pub struct ManualMachine {
 }
 
 impl ManualMachine {
-    /// Creates a machine operated by a person, for one run.
+    /// Creates the driver of a machine that a person operates, for one run.
     pub fn new(kind: MachineKind, settings: ManualSettings) -> Self {
         Self {
             name: format!("{kind} by hand").into(),
@@ -199,7 +199,8 @@ impl ManualMachine {
         ]
     }
 
-    /// Returns the run argument of `regrind confirm`; empty if the command finds the newest run by itself.
+    /// Returns the run folder as an argument of `regrind confirm`, with a blank before it. Returns an empty text if the
+    /// command finds the newest run by itself.
     fn run_argument(&self) -> String {
         let folder = &self.settings.run_folder;
         if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
@@ -232,7 +233,7 @@ impl ManualMachine {
                 let kept = match file {
                     Some(file) if is_cmm => self.accept_file(file).await?,
                     None if is_cmm => return Err(self.not_accepted("name the file of the measurement: --file")),
-                    Some(_) => return Err(self.not_accepted("a pass has no file: remove --file")),
+                    Some(_) => return Err(self.not_accepted("only a measurement has a file: remove --file")),
                     None if self.started_at.is_none() => {
                         return Err(self.not_accepted("confirm first that the pass has begun: regrind confirm started"));
                     }
@@ -255,7 +256,8 @@ impl ManualMachine {
         }
     }
 
-    /// Returns true if a confirmation names a map that is not the requested map.
+    /// Returns true if `named`, the map in a confirmation, is another map than that of the requested pass. Returns
+    /// false if the confirmation names no map.
     fn names_other_map(&self, named: Option<[u8; 32]>) -> bool {
         match &self.task {
             Some((ManualTask::Grind(_, map), _)) => named.is_some_and(|named| named != *map),
@@ -263,7 +265,11 @@ impl ManualMachine {
         }
     }
 
-    /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run.
+    /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run. Returns the paths of
+    /// the plan and of the stored file.
+    ///
+    /// # Errors
+    /// No measurement is requested, the file was accepted before, or it does not fulfil the plan.
     async fn accept_file(&mut self, file: PathBuf) -> DeviceResult<Vec<String>> {
         let (Some((job, done)), Some((ManualTask::Measure(plan), _))) = (self.job, &self.task) else {
             return Err(self.not_accepted("no measurement is requested"));
@@ -296,7 +302,7 @@ fn plan_file(job: Job) -> String {
     format!("plan{}.csv", batch_suffix(job))
 }
 
-/// Returns the suffix of the file names of a batch; empty for the first batch.
+/// Returns the suffix that the file names of a further batch of touches have; empty for the first batch.
 fn batch_suffix(job: Job) -> String {
     match job.batch_id().batch {
         0 => String::new(),
@@ -304,8 +310,8 @@ fn batch_suffix(job: Job) -> String {
     }
 }
 
-/// Returns true if a file was accepted before this process resumed the run: the folders of the cycles hold all accepted
-/// files.
+/// Returns true if a result file with this SHA-256 is stored in a cycle folder of the run, because an earlier process
+/// accepted it.
 fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let stem = |path: &Path, wanted: &str| path.file_stem().is_some_and(|stem| stem == wanted);
@@ -314,7 +320,8 @@ fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
 }
 
-/// Parses the bytes of a file and checks them against the plan. Returns the measurement.
+/// Parses the bytes of a measured file and checks them against the plan and the cell file. `done` is the number of the
+/// START that began the measurement. Returns the measurement.
 fn read_measurement(
     settings: &ManualSettings,
     plan: &Plan,
@@ -346,7 +353,7 @@ fn read_measurement(
     Ok(measurement)
 }
 
-/// Writes the plan for the person who measures.
+/// Writes the targets of a plan as a CSV file into `folder`, for the person who measures.
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
@@ -516,7 +523,7 @@ impl Grinder for ManualMachine {
     }
 }
 
-/// Returns the path of the program of a pass in the folder of a cycle, in any dialect.
+/// Returns the path of the program of a pass in the folder of a cycle, in any dialect. Returns `None` if there is none.
 fn find_program(folder: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
     let mut programs: Vec<PathBuf> =

@@ -56,7 +56,7 @@ impl ReadAhead {
         (self.words.len() / PAGE_REGISTERS) as u32
     }
 
-    /// Returns true if the next page should be full according to the progress in the status.
+    /// Returns true if `progress`, the number of measured points in the status, is sufficient to fill the next page.
     fn is_due(&self, progress: u32) -> bool {
         let registers = u64::from(progress) * self.header.registers as u64;
         let end = self.words.len() + PAGE_REGISTERS;
@@ -65,7 +65,8 @@ impl ReadAhead {
 }
 
 impl ModbusMachine {
-    /// Takes at most one step of reading ahead after a read of the status. Returns the new points, if there are any.
+    /// Does at most one step of reading preliminary points ahead, after a read of the status. Returns the new points,
+    /// or `None` if there are none.
     pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
         let block = self.last_block.take()?;
         let runs = matches!(
@@ -90,8 +91,8 @@ impl ModbusMachine {
         self.read_ahead_failures.start == start && self.read_ahead_failures.count >= MAX_FAILURES
     }
 
-    /// Counts a failure of the connection. If the machine refuses a request, reading ahead stops for this job. A busy
-    /// machine is not a failure.
+    /// Counts a failed request of reading ahead, for the job that the START number `start` began. If the machine
+    /// refuses the request, reading ahead stops for this job. A busy machine is not a failure.
     fn count_failure_ahead(&mut self, start: u32, error: &DeviceError) {
         if self.read_ahead_failures.start != start {
             self.read_ahead_failures = ReadAheadFailures { start, count: 0 };
@@ -130,7 +131,8 @@ impl ModbusMachine {
         self.read_page_ahead(page, block.progress.0).await
     }
 
-    /// Returns true if pages belong to this job and came over this connection from this boot of the machine.
+    /// Returns true if the pages in `ahead` are of this job and START, and came over the present connection from the
+    /// present boot of the machine.
     fn belongs_to(&self, ahead: &ReadAhead, job: Job, start: u32) -> bool {
         let boot_id = self.unit.identity().map(|identity| identity.boot_id);
         self.unit.generation() == Some(ahead.generation)
@@ -138,8 +140,10 @@ impl ModbusMachine {
             && (ahead.job, ahead.start) == (job, start)
     }
 
-    /// Reads the header of the partial result. It must name this job and its plan, and its `done` number must be 0,
-    /// because the job still runs.
+    /// Reads the header of the partial result of a running job.
+    ///
+    /// # Errors
+    /// The header does not name this job and its plan, or its `done` number is not 0, although the job still runs.
     async fn begin_ahead(&mut self, job: Job, block: &StatusBlock) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
         let words = self.unit.request_once("outbox header", address, LinkRequest::Read { address, count: 56 }).await?;
@@ -170,7 +174,8 @@ impl ModbusMachine {
         Ok(())
     }
 
-    /// Reads the selected page and stores it, if it is shown and full. Returns the new points, if there are any.
+    /// Reads the page number `page` of the partial result. Stores it if the machine shows this page and the page is
+    /// full. Returns the new points, or `None` if there are none.
     async fn read_page_ahead(&mut self, page: u32, progress: u32) -> Result<Option<PreliminaryPoints>, DeviceError> {
         let address = self.unit.map.outbox_page;
         let read = self
@@ -206,7 +211,8 @@ impl ModbusMachine {
         Ok((!told.points.is_empty()).then_some(told))
     }
 
-    /// Decodes the points with index `told` and above, which were not reported yet.
+    /// Decodes the points in the stored pages whose index is `told` or above, because the points below were returned
+    /// before.
     fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.point_count() * registers];
@@ -215,8 +221,8 @@ impl ModbusMachine {
         points.collect()
     }
 
-    /// Returns the registers that were read ahead of this result. Returns `None` if they belong to another job, line,
-    /// boot, plan or format, or are more than the result has.
+    /// Returns the registers of a complete result that were already read while its job ran. Returns `None` if they
+    /// belong to another job, connection, boot, plan or format, or are more than the result has.
     pub(super) fn registers_read_ahead(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
         let ahead = self.read_ahead.as_ref().filter(|ahead| self.belongs_to(ahead, job, done))?;
         let like = |of: &Header| {

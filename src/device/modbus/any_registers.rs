@@ -14,7 +14,8 @@ fn driver() -> ModbusMachine {
     ModbusMachine::new(MachineKind::Cmm, link, settings)
 }
 
-/// Reads bytes as the registers of each block. The first byte selects the block and the word order.
+/// Decodes any bytes as the registers of a block, to test the decoders. The first byte selects the block and the word
+/// order.
 ///
 /// # Panics
 /// Panics if a forbidden result occurs: a value that is not finite, a result above the maximum size, or a block that

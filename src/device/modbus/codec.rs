@@ -59,7 +59,7 @@ impl<'a> Registers<'a> {
         f64::from_bits(self.order.bits(self.slice(at, 4)))
     }
 
-    /// Returns the 32 bytes in 16 registers. A string of bytes has no word order.
+    /// Returns the identity of 32 bytes in the 16 registers from `at` on. The word order does not apply to bytes.
     pub(super) fn identity(&self, at: usize) -> [u8; 32] {
         let mut identity = [0; 32];
         for (pair, word) in identity.chunks_exact_mut(2).zip(self.slice(at, 16)) {
@@ -68,7 +68,8 @@ impl<'a> Registers<'a> {
         identity
     }
 
-    /// Returns the printable ASCII text up to the first zero. Any other byte becomes a question mark.
+    /// Returns the text in the registers from `at` on, up to the first zero byte. A byte that is not printable ASCII
+    /// becomes a question mark.
     pub(super) fn text(&self, at: usize, registers: usize) -> String {
         let bytes = bytes_of(self.slice(at, registers));
         let text = bytes.iter().take_while(|byte| **byte != 0);
@@ -137,7 +138,7 @@ impl Writer {
     }
 }
 
-/// Returns the bytes of registers in the order in which they are sent.
+/// Returns the bytes of registers, the high byte of each register first.
 pub(super) fn bytes_of(words: &[u16]) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_be_bytes()).collect()
 }
@@ -167,7 +168,7 @@ pub(super) struct CommandFrame {
 }
 
 impl CommandFrame {
-    /// Returns the 20 registers of the command block.
+    /// Returns the 20 registers of the command block in docs/modbus.md.
     pub(super) fn words(&self, order: WordOrder) -> Vec<u16> {
         let (job, cycle, digest) = self.job.map_or((0, 0, 0), |job| (job.job, job.cycle, job.digest));
         let mut frame = Writer::new(order);
@@ -185,9 +186,10 @@ pub(super) trait Payload: Identified {
     const KIND: u16;
     /// Name in messages.
     const NAME: &'static str;
-    /// Returns its registers.
+    /// Returns the registers of the payload in a word order.
     fn words(&self, order: WordOrder) -> Vec<u16>;
-    /// Returns the first value that no machine could accept: the field, its value, and the allowed range.
+    /// Returns the first value that no machine could accept, as the field, its value and the allowed range. Returns
+    /// `None` if there is none.
     fn invalid_field(&self) -> Option<(String, f64, &'static str)>;
 }
 
@@ -195,13 +197,15 @@ fn sha256(words: &[u16]) -> [u8; 32] {
     Sha256::digest(bytes_of(words)).into()
 }
 
-/// Returns the first value that is not a finite number.
+/// Returns the first value that is not a finite number, as the field, its value and the allowed range. Returns `None`
+/// if there is none.
 fn not_finite<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !value.is_finite());
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number"))
 }
 
-/// Returns the first value that is not a positive, finite number.
+/// Returns the first value that is not a positive, finite number, as the field, its value and the allowed range.
+/// Returns `None` if there is none.
 fn not_positive<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number above 0"))
@@ -361,7 +365,7 @@ pub(super) enum RecordError {
     Unlisted { field: &'static str, found: u32 },
 }
 
-/// Returns the number of registers of a point record in a format.
+/// Returns the number of registers of a point record in this format, or `None` for an unknown format.
 pub(super) fn point_registers(format: u16) -> Option<usize> {
     match format {
         1 => Some(16),
@@ -370,7 +374,11 @@ pub(super) fn point_registers(format: u16) -> Option<usize> {
     }
 }
 
-/// Decodes one measured point from the registers of its record. `scale_mm` is the scale of counts in format 2.
+/// Decodes one measured point from the registers of its record. In format 2 the coordinates are counts, and `scale_mm`
+/// is the length of one count.
+///
+/// # Errors
+/// The status is unknown, or a coordinate is not finite.
 pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordError> {
     let index = record.u32(0);
     let status = match record.u16(2) {
@@ -389,7 +397,11 @@ pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) ->
     Ok(MeasuredPoint { index, status, quality: record.u16(3), position_mm: at_mm })
 }
 
-/// Decodes a pass record: job, cycle, outcome, and the six values in their order.
+/// Decodes a pass record. Returns job, cycle, outcome, and six values: path, volume, depth, idle share, spindle load
+/// and wheel radius.
+///
+/// # Errors
+/// The outcome is unknown, or a value is not finite.
 pub(super) fn decode_pass_record(record: Registers<'_>) -> Result<(u32, u16, Outcome, [f64; 6]), RecordError> {
     const FIELDS: [&str; 6] =
         ["path travelled", "volume removed", "largest depth", "idle share", "spindle load", "wheel radius"];
@@ -401,7 +413,10 @@ pub(super) fn decode_pass_record(record: Registers<'_>) -> Result<(u32, u16, Out
     }
 }
 
-/// Decodes the outcome of a job.
+/// Decodes the outcome of a job from its number in docs/modbus.md.
+///
+/// # Errors
+/// The number is unknown.
 pub(super) fn decode_outcome(number: u16) -> Result<Outcome, RecordError> {
     Ok(match number {
         0 => Outcome::None,

@@ -123,16 +123,16 @@ struct QueuedRequest {
 
 /// Stream between a line and its machines. It can report if bytes wait to be read.
 pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
-    /// Returns the number of waiting bytes, as far as known.
+    /// Returns the number of received bytes that wait to be read, as far as known.
     ///
     /// # Errors
-    /// The far side has closed the stream.
+    /// The other end has closed the stream.
     fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
 }
 
 /// Method to open a line. Implement it for a line that is neither a socket nor a serial port of this computer.
 pub trait Connector: Debug + Send + Sync {
-    /// Opens the line.
+    /// Opens a connection to the address `line`.
     fn connect<'a>(&'a mut self, line: &'a LineAddress) -> ConnectFuture<'a>;
 }
 
@@ -153,6 +153,9 @@ pub struct Link {
 impl Link {
     /// Creates a line that is opened with its first request. `quarantine` is the worst-case answer time of a machine on
     /// it: after an error the line is not used for this time.
+    ///
+    /// # Errors
+    /// The thread of the line cannot be started.
     pub fn new(line: LineAddress, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let name = format!("line {line}");
@@ -162,8 +165,8 @@ impl Link {
         Ok(link)
     }
 
-    /// Creates a line that `dial` opens, as a task of the current runtime. Its random numbers come from `seed`. For
-    /// machines in the same process, and for simulated time.
+    /// Creates a line that `dial` opens and that runs as a task of the current runtime, with random numbers from
+    /// `seed`. For machines in the same process, and for simulated time. For `quarantine`, see [`Link::new`].
     pub fn with_connector(
         line: LineAddress,
         request_timeout: Duration,
@@ -218,8 +221,9 @@ impl Link {
         self.counters.count(|figures| figures.retries += 1);
     }
 
-    /// Sends one request to one unit and returns the generation on which the answer came, with the registers. With a
-    /// generation, the request is sent only on that connection; without one, the line is opened if necessary.
+    /// Sends one request to one unit. Returns the registers, and the generation of the connection: its number since the
+    /// line was created. If `generation` is given, the request is sent only on that connection; otherwise the line is
+    /// opened if necessary.
     pub(super) async fn request(&self, unit: u8, generation: Option<u64>, ask: LinkRequest) -> LinkResult {
         let (reply, answer) = oneshot::channel();
         let question = QueuedRequest { unit, generation, request: ask, reply };
@@ -318,7 +322,7 @@ impl Connection {
         }
     }
 
-    /// Drops the connection with all data that may still arrive on it, and sets the pause before the next opening.
+    /// Closes the connection, so that data that arrive late on it are lost, and sets the pause before the next opening.
     fn drop_connection(&mut self) {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);
@@ -379,8 +383,10 @@ impl Connection {
     }
 }
 
-/// Returns the registers if a response is the complete answer to the request and nothing else; otherwise returns the
-/// error.
+/// Returns the registers of a response if it is the complete answer to the request and nothing else.
+///
+/// # Errors
+/// The response is an exception, or it is not the answer to this request.
 fn check(ask: &LinkRequest, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>, LinkFault> {
     let response = response.map_err(fault_of)?;
     let response = response.map_err(|exception| LinkFault::Exception(exception.into()))?;
@@ -450,7 +456,7 @@ impl LineAddress {
         self.transmission(2 * 256)
     }
 
-    /// Returns the transmission time of a number of bytes; zero on TCP.
+    /// Returns the transmission time of `bytes` bytes; zero on TCP.
     pub(super) fn transmission(&self, bytes: u32) -> Duration {
         match self {
             Self::Tcp { .. } => Duration::ZERO,
@@ -459,7 +465,7 @@ impl LineAddress {
     }
 }
 
-/// Opens a line, and reads a serial line until it is silent.
+/// Opens a connection to the address `line`. On a serial line, then discards received data until the line is silent.
 async fn connect(line: &LineAddress, dial: &mut dyn Connector) -> io::Result<tokio_modbus::client::Context> {
     let mut stream = dial.connect(line).await?;
     match line {
@@ -494,7 +500,7 @@ impl Connector for SystemConnector {
     }
 }
 
-/// Reads a serial line until it has been silent for a time.
+/// Discards received data until the serial line has been silent for `silence`.
 async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + MAX_DRAIN_TIME;
     let mut bytes = [0; 256];

@@ -134,7 +134,7 @@ impl ModbusMachine {
         self.unit.name.clone()
     }
 
-    /// Returns the line of this machine.
+    /// Returns the Modbus line to this machine, which other machines may share.
     pub fn link(&self) -> &Link {
         &self.unit.link
     }
@@ -161,7 +161,10 @@ impl ModbusMachine {
         Ok(identity)
     }
 
-    /// Compares the identity of the machine with the cell file.
+    /// Compares the identity that the machine reports with the cell file.
+    ///
+    /// # Errors
+    /// The name is another one, or one is a simulated and the other a real machine.
     fn check_identity(&self, identity: &Identity) -> Result<(), DeviceError> {
         if let Some(expected) = self.expected_name.as_ref().filter(|expected| **expected != identity.name) {
             let (expected, found) = (expected.clone(), identity.name.clone());
@@ -190,7 +193,11 @@ impl ModbusMachine {
         self.unit.write("beat", self.unit.map.beat, beat.words()).await
     }
 
-    /// Reads the status block, all of one moment, without the additional signals.
+    /// Sends the heartbeat if it is due, and reads the status block. All registers are of one moment. The additional
+    /// signals are not included.
+    ///
+    /// # Errors
+    /// The two snapshot numbers of the block still differ after several reads, or a request fails.
     async fn read_status_block(&mut self) -> Result<StatusBlock, DeviceError> {
         self.send_heartbeat().await?;
         let address = self.unit.map.status;
@@ -275,8 +282,8 @@ impl ModbusMachine {
         Ok(status)
     }
 
-    /// Returns an error if another client has become the owner of the machine, because its commands are not reported
-    /// here. The states ABORTING and ABORTED are accepted, because every client may abort.
+    /// Returns an error if another client has become the owner of the machine, because this client would not notice the
+    /// commands of that client. ABORTING and ABORTED are accepted, because every client may abort.
     fn check_owner(&self, status: &StatusBlock) -> Result<(), DeviceError> {
         let aborts = matches!(status.state, MachineState::Aborting | MachineState::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
@@ -285,8 +292,8 @@ impl ModbusMachine {
         Err(DeviceError::OwnedByOther { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
-    /// Reads signal number `k`. If the machine does not have the signal, or its value is not a finite number, the value
-    /// is `None` and a cause is given.
+    /// Reads the additional signal with the index `k`. If the machine does not have the signal, or its value is not a
+    /// finite number, the value is `None` and a cause is given.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
         let ask = LinkRequest::Read { address: signal.address, count: signal.kind.registers() };
@@ -321,8 +328,10 @@ impl ModbusMachine {
         self.send_command(frame).await
     }
 
-    /// Writes a command until it is acknowledged, with the same frame every time. Returns an error if the machine
-    /// refuses it.
+    /// Writes a command and waits for its acknowledgement. Without one, writes the same frame again.
+    ///
+    /// # Errors
+    /// The machine refuses the command, or does not acknowledge it.
     async fn send_command(&mut self, frame: CommandFrame) -> Result<StatusBlock, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
         let status = self.write_until_acknowledged(frame).await?;
@@ -383,8 +392,10 @@ impl ModbusMachine {
         Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
     }
 
-    /// Waits until a condition on the status holds, and returns that status. A fault or the timeout ends the wait with
-    /// an error.
+    /// Reads the status until `holds` returns true for it, and returns that status.
+    ///
+    /// # Errors
+    /// The status shows a fault, or the wait takes longer than `SETTLE_TIMEOUT`.
     async fn wait_until(&mut self, holds: impl Fn(&StatusBlock) -> bool) -> Result<StatusBlock, DeviceError> {
         let began = Instant::now();
         loop {
@@ -403,7 +414,10 @@ impl ModbusMachine {
         }
     }
 
-    /// Returns an error unless the machine has the intended job.
+    /// Checks that the job in a status is the intended one.
+    ///
+    /// # Errors
+    /// The machine has another job, cycle or digest of the payloads.
     fn check_job(&self, job: Job, status: &StatusBlock) -> Result<(), DeviceError> {
         let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
         let fields = [
@@ -414,8 +428,10 @@ impl ModbusMachine {
         self.compare(fields)
     }
 
-    /// Returns an error for the first field whose two values differ. A field is its name, the value that was sent, and
-    /// the value at the machine.
+    /// Compares pairs of values. A field is its name, the value that was sent, and the value at the machine.
+    ///
+    /// # Errors
+    /// Returns an error for the first field whose two values differ.
     fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
             Some((field, sent, held)) => {
@@ -483,9 +499,8 @@ impl ModbusMachine {
         self.run_command(MachineCommand::Release).await
     }
 
-    /// Ends the job at once. Does not depend on the state of the connection, or on the sequence numbers that another
-    /// client has used: it connects without the pause that other commands observe, and uses a number above the last one
-    /// that the machine has acknowledged.
+    /// Ends the job at once. Connects without the pause that other commands observe after an error. If another client
+    /// has used higher sequence numbers, uses a number above those.
     async fn abort(&mut self) -> Result<StatusBlock, DeviceError> {
         self.unit.link.skip_pause();
         if self.unit.identity().is_none() {
@@ -653,8 +668,11 @@ impl ModbusMachine {
         }
     }
 
-    /// Compares the payload in force at the machine with the payload of this kind that was loaded. Returns an error if
-    /// they differ. Does nothing if no payload of this kind was loaded.
+    /// Compares the payload in force at the machine with the payload of this kind number that this client has loaded.
+    /// Does nothing if it has loaded none.
+    ///
+    /// # Errors
+    /// The two payloads differ, or the machine cannot be read.
     async fn compare_slot(&mut self, kind: u16) -> Result<(), DeviceError> {
         let Some(slot) = self.loaded.get(&kind).copied() else { return Ok(()) };
         let address = self.unit.map.in_force + 24 * (kind - 1);
@@ -679,7 +697,8 @@ impl ModbusMachine {
 
     // ---- results ---------------------------------------------------------------------------------------------------
 
-    /// Fetches the result of a job, with proof that it is complete. Returns the status, the header and the registers.
+    /// Fetches the complete result of a job, and checks its job and its CRC. `kind` is the payload number of the
+    /// result. Returns the status, the header and the registers of the result.
     async fn fetch(
         &mut self,
         job: Job,
@@ -804,8 +823,8 @@ impl ModbusMachine {
         })
     }
 
-    /// Fetches one page. A machine may need a cycle of its program to provide it, so if another page number is there,
-    /// the request is repeated for a while.
+    /// Fetches the page number `page` of a result and adds its `due` data registers to `words`. If the machine shows
+    /// another page, repeats the request for a while, because a machine may need a cycle of its program to show it.
     async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
         let map = self.unit.map;
         let mut select = self.unit.writer();
@@ -934,8 +953,8 @@ struct Header {
     identity: [u8; 32],
 }
 
-/// Returns the outcome of a start according to a status. Returns `None` if the status shows no accepted start; this
-/// counts only if a second status shows it too.
+/// Returns the outcome of the start `intended` according to a status. Returns `None` if the status shows that the start
+/// was not accepted. This counts only if a second status shows it too.
 fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
     let unknown = |why: String| Some(Reconciled::Unknown { reason: why });
@@ -1012,19 +1031,19 @@ macro_rules! modbus_driver {
         pub struct $driver(ModbusMachine);
 
         impl $driver {
-            /// Creates a driver on a line of its own. Sends nothing before it connects.
+            /// Creates the driver of a machine on a line of its own. Sends nothing before it connects.
             pub fn new(settings: ModbusSettings) -> io::Result<Self> {
                 let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)?;
                 Ok(Self::on(link, settings))
             }
 
-            /// Creates a driver on a line that it shares with other machines. The wire and the timeouts of the line
-            /// apply, not those of the settings.
+            /// Creates the driver of a machine on a line that it shares with other machines. The address and the
+            /// timeouts of `link` apply, not those in `settings`.
             pub fn on(link: Link, settings: ModbusSettings) -> Self {
                 Self(ModbusMachine::new($kind, link, settings))
             }
 
-            /// Returns the line, for its statistics or to put another machine on it.
+            /// Returns the Modbus line, for its statistics or to create another machine on it.
             pub fn link(&self) -> &Link {
                 self.0.link()
             }

@@ -30,7 +30,7 @@ pub enum WordOrder {
 }
 
 impl WordOrder {
-    /// Returns the name in a cell file.
+    /// Returns the name of the word order in a cell file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Big => "big",
@@ -40,7 +40,7 @@ impl WordOrder {
         }
     }
 
-    /// Returns the order with the two words of a value exchanged.
+    /// Returns the word order in which the words of a value are in the other order.
     pub fn with_words_swapped(self) -> Self {
         match self {
             Self::Big => Self::Little,
@@ -50,7 +50,7 @@ impl WordOrder {
         }
     }
 
-    /// Returns the order with the two bytes of each register exchanged.
+    /// Returns the word order in which the two bytes of each register are in the other order.
     pub fn with_bytes_swapped(self) -> Self {
         match self {
             Self::Big => Self::Badc,
@@ -60,7 +60,7 @@ impl WordOrder {
         }
     }
 
-    /// Returns true if the low word comes first.
+    /// Returns true if the low word of a value comes first.
     pub fn is_low_first(self) -> bool {
         matches!(self, Self::Little | Self::Dcba)
     }
@@ -169,12 +169,12 @@ impl TcpWire {
         }
     }
 
-    /// Returns `None`: a network address cannot be checked before it is used.
+    /// Returns `None`, because whether a network address exists is not known before it is used.
     pub(super) fn missing(&self) -> Option<String> {
         None
     }
 
-    /// Reports to the document if both machines have the same address.
+    /// Reports to the document if the CMM and the grinder have the same host, port and unit.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self == grinder && self.port != 0 {
             let found = format!("is {}, the same as that of the CMM at the same host and port", grinder.unit);
@@ -216,10 +216,11 @@ impl RtuWire {
         LineAddress::Rtu { device, baud, parity, stop_bits }
     }
 
-    /// Does nothing: only the system can check the name of a port, see [`Self::missing`].
+    /// Does nothing, because only the operating system can check the name of a port, see [`Self::missing`].
     pub(super) fn check_address(&self, _: &MachineTable<'_>, _: &mut Document) {}
 
-    /// Reports to the document if both machines have the same unit on one line, or different settings of that line.
+    /// Reports to the document if the CMM and the grinder have the same unit on one serial line, or different settings
+    /// of that line.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self.device != grinder.device {
             return;
@@ -235,8 +236,8 @@ impl RtuWire {
         }
     }
 
-    /// Returns a message that the port does not exist on this computer, with the names of the existing ports. Returns
-    /// `None` if the port exists.
+    /// Returns a message if the serial port does not exist on this computer, with the names of the existing ports.
+    /// Returns `None` if the port exists.
     pub(super) fn missing(&self) -> Option<String> {
         port::missing(&self.device)
     }
@@ -368,7 +369,7 @@ pub enum SignalType {
 }
 
 impl SignalType {
-    /// Returns the number of registers of a value.
+    /// Returns the number of registers of a value of this type.
     pub fn registers(self) -> u16 {
         match self {
             Self::U16 | Self::I16 => 1,
@@ -430,8 +431,8 @@ pub struct Signal {
 }
 
 impl Signal {
-    /// Checks the signals of a cell file and returns them. Returns `None` if one is incomplete; the schema has reported
-    /// that.
+    /// Checks the signals of a cell file, reports their errors to the document, and returns the signals. Returns `None`
+    /// if a required key of a signal is missing, which the schema has reported.
     pub fn from_tables(
         written: &[SignalTable],
         word_order: WordOrder,
@@ -516,7 +517,8 @@ pub struct ModbusSettings {
 }
 
 impl ModbusSettings {
-    /// Returns default settings for a machine on an undisturbed network. Change single fields as required.
+    /// Returns default settings for a machine on a line. They suit an undisturbed network; change single fields as
+    /// required.
     pub fn new(line: LineAddress) -> Self {
         Self {
             line,

@@ -4,7 +4,8 @@ use super::codec::Registers;
 use super::settings::{Signal, SignalType, WordOrder};
 
 impl Signal {
-    /// Returns the value of registers for a word order, in the unit of the signal. The value may be NaN or infinite.
+    /// Decodes the value of the signal from its registers in a word order, in the unit of the signal. The value may be
+    /// NaN or infinite.
     pub(super) fn value(&self, words: &[u16], order: WordOrder) -> f64 {
         let block = Registers::new(words, order);
         let kept = match self.kind {

@@ -74,8 +74,8 @@ impl ModbusUnit {
         self.identity.is_some() && self.flags & OFFERS_READ_AHEAD != 0
     }
 
-    /// Returns the generation of the line on which the identity was verified; `None` if it must be verified again. The
-    /// line may have been lost since then without any effect here.
+    /// Returns the number of the connection on which the identity of the machine was verified, or `None` if it must be
+    /// verified again. That connection may have been lost since then.
     pub(super) fn generation(&self) -> Option<u64> {
         self.verified_generation
     }
@@ -93,7 +93,8 @@ impl ModbusUnit {
         self.connect_within(CONNECT_BUSY_TIMEOUT).await
     }
 
-    /// Does the same as [`Self::connect`], but retries a machine whose program is still starting for the time `busy`.
+    /// Discards the known identity, verifies the identity of the machine again and returns it. Retries for the time
+    /// `busy` if the machine answers that its program is still starting.
     pub(super) async fn connect_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
         self.verified_generation = None;
@@ -110,20 +111,22 @@ impl ModbusUnit {
         self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), operation: "identity" })
     }
 
-    /// Reads registers, after the identity of the machine was verified on this line. `what` names the operation in
-    /// errors.
+    /// Reads `count` registers. If necessary, first verifies the identity of the machine on this connection. `what`
+    /// names the operation in errors.
     pub(super) async fn read(&mut self, what: &'static str, address: u16, count: u16) -> Result<Vec<u16>, DeviceError> {
         self.exchange(what, address, LinkRequest::Read { address, count }).await
     }
 
-    /// Writes registers, after the identity of the machine was verified on this line. A retry can write them more than
-    /// once.
+    /// Writes registers. If necessary, first verifies the identity of the machine on this connection. A retry can write
+    /// them more than once. `what` names the operation in errors.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
         self.exchange(what, address, LinkRequest::Write { address, words: words.into() }).await.map(drop)
     }
 
-    /// Sends a request once, without a retry, for a request that may fail without consequences. Returns
-    /// [`DeviceError::NotConnected`] if the identity of the machine is not verified on the line.
+    /// Sends a request once, without a retry. Use it for a request whose failure has no consequences.
+    ///
+    /// # Errors
+    /// Returns [`DeviceError::NotConnected`] if the identity of the machine is not verified on the present connection.
     pub(super) async fn request_once(
         &mut self,
         what: &'static str,
@@ -138,7 +141,7 @@ impl ModbusUnit {
     }
 
     /// Sends one request. Converts the bytes of each register between the order of docs/modbus.md and the order of the
-    /// machine. Returns the generation of the line and the received registers.
+    /// machine. Returns the number of the connection (its generation) and the received registers.
     async fn send(&self, generation: Option<u64>, ask: LinkRequest) -> Result<(u64, Vec<u16>), LinkFault> {
         let order = self.map.word_order;
         let ask = match ask {
@@ -161,8 +164,8 @@ impl ModbusUnit {
         DeviceError::Corrupt { machine: self.name.clone(), data: what, expected, found }
     }
 
-    /// Returns true if a request must not be retried after this error. A machine that answers that it is busy is
-    /// retried until `lost_after` has passed; a machine that does not answer, at most `retries` times.
+    /// Returns true if a request must not be retried after this error. Only a failed communication is retried: until
+    /// `lost_after` has passed since `began` if the machine answers that it is busy, otherwise at most `retries` times.
     fn is_final(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
@@ -248,9 +251,9 @@ impl ModbusUnit {
         }
     }
 
-    /// Verifies the identity of the machine and returns the generation of the line. Reads the identity block, then
-    /// writes two random words and reads back their complements, which only the machine can provide after this moment.
-    /// Then reads the identity block again; both readings must be equal.
+    /// Verifies the identity of the machine and returns the number of the connection (its generation). Reads the
+    /// identity block, then writes two random words and reads back their complements, which only the machine can
+    /// provide after this moment. Then reads the identity block again; both readings must be equal.
     async fn verify_identity(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
         let read = LinkRequest::Read { address: first, count: IDENTITY_REGISTERS };
@@ -295,7 +298,10 @@ impl ModbusUnit {
         Ok(())
     }
 
-    /// Decodes an identity block, or returns an error that describes the device that answers.
+    /// Decodes an identity block.
+    ///
+    /// # Errors
+    /// Returns an error that describes the device that answers, for example one with another version or word order.
     pub(super) fn decode_identity(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
         if let Some(how) = layout_fault(words, self.map.word_order) {
@@ -358,8 +364,8 @@ fn is_starting(error: &DeviceError) -> bool {
     matches!(error, DeviceError::Exception { code: 5 | 6, .. })
 }
 
-/// Returns in words how the layout of an identity block is wrong, with the correct word order if the bytes are
-/// exchanged. Returns `None` if the layout is correct, or if there is no identity block.
+/// Returns a text that states how the layout of an identity block is wrong: its address is off by one, or the bytes are
+/// in the other order. Returns `None` if the layout is correct, or if there is no identity block.
 fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
     let begins = |from: usize, swap: fn(u16) -> u16| {
         let due = [MAGIC[0], MAGIC[1], VERSION];

@@ -50,7 +50,7 @@ modbus_wire!(TcpWire);
 modbus_wire!(RtuWire);
 
 impl ModbusSettings {
-    /// Returns the settings for a unit on a line, from the cell file.
+    /// Returns the settings of the driver for a unit on a line. The other values come from the cell file.
     pub fn from_context(line: LineAddress, unit: u8, making: &DriverContext<'_>) -> Self {
         let timing = making.timing;
         Self {
@@ -71,8 +71,11 @@ impl ModbusSettings {
     }
 }
 
-/// Creates the line of a machine, or shares the line of the other machine, and returns it with all settings of the
-/// driver.
+/// Returns the line of a machine and all settings of its driver. If the other machine of the cell has the same line,
+/// the two share it. `missing` is the message about a port that does not exist.
+///
+/// # Errors
+/// The port does not exist, or the line cannot be created.
 fn link(
     line: LineAddress,
     unit: u8,

@@ -95,12 +95,14 @@ pub struct Amended {
     pub unit_assumed: bool,
 }
 
-/// Reads a program, corrects it, and writes it under another name.
+/// Reads the program `base`, corrects it by the map of `amendment`, and writes it to `out`. Returns a summary of the
+/// changes.
 ///
 /// # Errors
 /// A program that already contains the map, that belongs to another part, or that contains a correction other than the
-/// one the map is based on; a program with content that cannot be corrected; a program without a move at feed, or with
-/// almost none over the map; corrected lines that do not match the base program and the map; errors of files.
+/// one the map is based on; a line that cannot be corrected; a program without a move at feed, or with less than 5 % of
+/// its feed length over the map; corrected lines that do not match the base program and the map; a file that cannot be
+/// read or written, or `out` equal to `base`. Then `out` is not written.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MAX_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
@@ -158,8 +160,8 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     Ok(done)
 }
 
-/// Returns a program as text: UTF-8, or else Latin-1, which older programs use for remarks; `None` if it has control
-/// characters and is therefore not text.
+/// Decodes a program as UTF-8, or else as Latin-1, which older programs use for remarks. Returns `None` if it has
+/// control characters and is therefore not text.
 fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
     if bytes.iter().any(|b| *b < b' ' && !b"\t\r\n\x0c".contains(b)) {
         return None;
@@ -168,7 +170,8 @@ fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
     Some(std::str::from_utf8(bytes).map_or_else(|_| latin(), Into::into))
 }
 
-/// Detects a program for a control other than LinuxCNC by its first lines; returns its kind and the remedy.
+/// Detects, from the first 20 lines, a program for a Fanuc, Heidenhain or Sinumerik control, which cannot be corrected.
+/// Returns the fault and the remedy; `None` for any other program.
 fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
     const AGAIN: &str = "regrind compensate supports only the dialect of LinuxCNC; for another control, write the program with regrind plan --program in its dialect";
     /// Number of lines that are checked; later lines do not identify the control.
@@ -192,7 +195,8 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
         .map(|what| (what, AGAIN))
 }
 
-/// Returns true if G20 or G21 occurs before the first coordinate or feed, or if there is no coordinate and no feed.
+/// Returns true if G20 or G21 occurs before the first coordinate or feed, if there is no coordinate and no feed, or if
+/// a line before them cannot be read.
 fn states_unit_first(text: &str) -> bool {
     for line in text.lines() {
         let Ok(block) = block(line) else { return true };
@@ -206,8 +210,8 @@ fn states_unit_first(text: &str) -> bool {
     true
 }
 
-/// Rejects a program that already contains the map, that belongs to another part than the map, or whose correction is
-/// not the one that the map requires ([`MapBase`]).
+/// Rejects the program `text` if it already contains the map, if it belongs to another part than the map, or if its
+/// correction is not the one that the map requires ([`MapBase`]). `path` only names the program in messages.
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();
@@ -283,7 +287,11 @@ impl<'a> Rewriter<'a> {
         Self { amendment, control, text: Vec::new(), done, actual: [None; 3], beside: String::new() }
     }
 
-    /// Executes one line of the base program, and appends the corrected lines for it to the text.
+    /// Executes one line of the base program, and appends the corrected lines for it to `self.text`. `block` holds the
+    /// words of `line`.
+    ///
+    /// # Errors
+    /// A line that cannot be corrected.
     fn line(&mut self, line: &str, block: &Block) -> Result<(), Refusal> {
         self.done.lines += 1;
         if block.words.is_empty() {
@@ -320,7 +328,8 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// Writes a rapid move to its end in the base program; an axis that is `None` does not move.
+    /// Writes a rapid move to the end position `to` of the base program, in millimetres, without a correction. An axis
+    /// that is `None` does not move.
     fn rapid(&mut self, to: [Option<f64>; 3]) {
         self.text.extend_from_slice(b"G0");
         for k in 0..3 {
@@ -333,8 +342,8 @@ impl<'a> Rewriter<'a> {
         self.text.push(b'\n');
     }
 
-    /// Copies a move in machine coordinates, or to the reference point, unchanged. `by` is the number of the G word of
-    /// its motion, 0 or 1; `None` for a move to the reference point.
+    /// Copies a move in machine coordinates (G53), or to the reference point (G28, G30), unchanged. `by` is the number
+    /// of the G word of its motion, 0 or 1; `None` for a move to the reference point.
     fn machine(&mut self, block: &Block, by: Option<u8>) {
         if self.control.relative {
             self.text.extend_from_slice(b"G91\n");
@@ -355,8 +364,13 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Writes the corrected moves for one move at feed of the base program. `way` returns the position in the base
-    /// program at a share of the move, from 0 to 1; `arc` is `None` for a straight move.
+    /// Writes the corrected moves for one move at feed of the base program from `from` to `to`, of `length`
+    /// millimetres. `way` returns the position in the base program for a share of the move, from 0 at its start to 1 at
+    /// its end. `arc` is `None` for a straight move.
+    ///
+    /// # Errors
+    /// A displacement above the limit; no nominal surface under a point; a move that would be divided into too many
+    /// pieces.
     fn feed(
         &mut self,
         from: Point,
@@ -401,9 +415,11 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// Returns the displacements by the map at equally spaced points of a move, both ends included. The spacing is fine
-    /// enough for the map, the arc and the tolerance. `way` is that of [`Self::feed`]. `lateral` is the length over x
-    /// and y, `length` the length in space, in millimetres.
+    /// Returns the displacements by the map at equally spaced points of a move of the base program, both ends included.
+    /// The spacing is fine enough for the map, the arc and the tolerance.
+    ///
+    /// `way` returns the position for a share of the move, from 0 to 1. `lateral` is the length of the move over x and
+    /// y, and `length` its length in space, both in millimetres.
     fn shifts(
         &self,
         way: &dyn Fn(f64) -> Point,
@@ -432,8 +448,12 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Adds the displacement of a move, its length and its length outside the map to the summary; rejects a
-    /// displacement above the limit.
+    /// Adds a move to the summary: its largest displacement, its `length` in millimetres, and its length outside the
+    /// map. `way` returns the position for a share of the move, from 0 to 1; `shifts` are the displacements at equally
+    /// spaced shares.
+    ///
+    /// # Errors
+    /// A displacement above [`Amendment::max_shift_mm`].
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
         if largest_mm > self.amendment.max_shift_mm {
@@ -487,7 +507,8 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Copies the words that take effect after a move: stops and the program end.
+    /// Copies the words that take effect after the move of their line: stops (M0, M1, M60) and the end of the program
+    /// (M2, M30).
     fn copy_after(&mut self, block: &Block) {
         let begin = self.text.len();
         for (k, word) in block.words.iter().filter(|w| takes_effect_after(w)).enumerate() {
@@ -516,8 +537,10 @@ impl<'a> Rewriter<'a> {
     }
 }
 
-/// Returns the displacement by the map of `at`, a point of the program, in millimetres. The error is that no nominal
-/// surface is under the point.
+/// Returns the displacement, in millimetres, that the map gives to `at`, a position in the base program.
+///
+/// # Errors
+/// A position with no nominal surface under it.
 pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, Refusal> {
     let shift = amendment.shift;
     let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
@@ -531,8 +554,8 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
     })
 }
 
-/// Returns true for words of a line that are not copied: line numbers, and the words that each corrected move writes
-/// again.
+/// Returns true for words that are not copied to the corrected line: line numbers, and the words of the move, which
+/// each corrected move states anew. `act` is the action of the line.
 fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
@@ -543,7 +566,7 @@ fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     }
 }
 
-/// Returns true for G28, G30 and G53: the move of such a line goes to the reference point or is in machine coordinates.
+/// Returns true for G28 and G30 (move to the reference point) and G53 (move in machine coordinates).
 fn is_machine(word: &GcodeWord) -> bool {
     word.letter == b'G' && [28.0, 30.0, 53.0].contains(&word.value)
 }
@@ -556,8 +579,8 @@ fn takes_effect_after(word: &GcodeWord) -> bool {
     word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
 }
 
-/// Returns the indices of the points to write, without the first, so that the lines between them stay within the
-/// tolerance of all points (Douglas and Peucker).
+/// Returns the indices of the points to keep, except the first point, so that the straight lines between them stay
+/// within `tolerance` millimetres of all points (Douglas-Peucker algorithm).
 fn simplified_indices(points: &[Point], tolerance: f64) -> Vec<usize> {
     let mut kept = Vec::new();
     let mut open = vec![(0, points.len() - 1)];

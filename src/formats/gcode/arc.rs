@@ -37,10 +37,12 @@ pub(super) enum Centre {
 const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.1];
 
 impl Arc {
-    /// Computes the arc between two points.
+    /// Computes the arc from `from` to `to` in a plane; a helix if both differ along the third axis. If both are equal
+    /// in the plane, the arc is a full turn.
     ///
     /// # Errors
-    /// A radius that does not match the end points.
+    /// A radius at the end that differs from that at the start by more than [`RADIUS_TOLERANCE`]; a given radius with
+    /// which no arc joins the points.
     pub(super) fn new(plane: Plane, from: Point, to: Point, clockwise: bool, centre: Centre) -> Result<Self, Refusal> {
         let [a, b, c] = plane.0;
         let (p, q) = ([from[a], from[b]], [to[a], to[b]]);
@@ -69,7 +71,7 @@ impl Arc {
         Ok(Self { plane, from, centre, radius, end_radius: end, begins, sweep, rise: to[c] - from[c] })
     }
 
-    /// Returns the point at a share of the arc, 0 to 1.
+    /// Returns the point at `share` of the arc, from 0 at its start to 1 at its end.
     pub(super) fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.plane.0;
         let (sine, cosine) = (self.begins + self.sweep * share).sin_cos();
@@ -81,25 +83,31 @@ impl Arc {
         at
     }
 
-    /// Returns the centre relative to the start, along the two axes of the plane.
+    /// Returns the centre relative to the start, in millimetres. Each of the two pairs is an axis of the plane (0 for
+    /// x, 1 for y, 2 for z) and the distance along it.
     pub(super) fn centre_from_start(&self) -> [(usize, f64); 2] {
         let [a, b, _] = self.plane.0;
         [(a, self.centre[0] - self.from[a]), (b, self.centre[1] - self.from[b])]
     }
 
-    /// Returns the length, in millimetres.
+    /// Returns the length of the arc or helix, in millimetres.
     pub(super) fn length(&self) -> f64 {
         (self.radius * self.sweep).hypot(self.rise)
     }
 
-    /// Returns the number of chords that stay within a tolerance of the arc.
+    /// Returns the number of equal chords that stay within `tolerance` millimetres of the arc: a whole number, at least
+    /// 1.
     pub(super) fn chords(&self, tolerance: f64) -> f64 {
         let angle = 2.0 * (1.0 - (tolerance / self.radius).min(1.0)).acos();
         (self.sweep.abs() / angle.max(1e-9)).ceil().max(1.0)
     }
 }
 
-/// Returns the centre of an arc of a given radius: for the shorter arc, or with a negative radius for the longer one.
+/// Returns the centre, in the plane, of the arc from `p` to `q` with a given radius. A positive radius gives the
+/// shorter arc, a negative radius the longer one.
+///
+/// # Errors
+/// A radius less than half the distance of the points; two equal points.
 fn by_radius(p: [f64; 2], q: [f64; 2], radius: f64, clockwise: bool) -> Result<[f64; 2], Refusal> {
     let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
     let chord = dx.hypot(dy);

@@ -80,7 +80,8 @@ impl Movement {
 }
 
 impl Round {
-    /// Returns the point at a share of the move, from 0 to 1. The radius changes linearly from the start to the end.
+    /// Returns the point at `share` of the arc, from 0 at its start to 1 at its end. The radius changes linearly from
+    /// start to end.
     fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.axes;
         let [p, q] = [self.from[a] - self.centre[0], self.from[b] - self.centre[1]];
@@ -102,8 +103,11 @@ impl Round {
 }
 
 impl Machine {
-    /// Executes the words of a line, and returns its movement; `None` for a line without movement, or after the end of
-    /// the program.
+    /// Executes the words of a line: updates the state of the machine and returns the movement. Returns `None` for a
+    /// line without a movement, or after the end of the program.
+    ///
+    /// # Errors
+    /// A movement that the words do not define, such as a move at feed from an unknown position.
     fn read(&mut self, block: &Block) -> Result<Option<Movement>, String> {
         if self.over {
             return Ok(None);
@@ -213,8 +217,8 @@ impl Machine {
 }
 
 impl<'a> Check<'a> {
-    /// Creates a check. The modal words of `header`, the first lines of the corrected program, are in force at its
-    /// start.
+    /// Creates a check. `header` holds the first lines of the corrected program; its modal words, such as G90, are then
+    /// in force for the corrected program only.
     pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
         let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
         for line in header.lines() {
@@ -224,10 +228,10 @@ impl<'a> Check<'a> {
         check
     }
 
-    /// Compares a line of the base with `text`, the corrected lines for it.
+    /// Compares `line`, the next line of the base program, with `text`, the corrected lines for it.
     ///
     /// # Errors
-    /// Corrected lines that differ from base and map.
+    /// Corrected lines that do not follow from the base line and the map.
     pub(super) fn line(&mut self, line: &str, text: &[u8]) -> Result<(), Refusal> {
         self.compared(line, text).map_err(|found| {
             let found = format!("the corrected lines differ from the base and the map: {found}");
@@ -277,7 +281,8 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Checks that both machines have the same state after a line.
+    /// Checks that the base program and the corrected program have the same modal state (unit, plane, feed), and that
+    /// they know the positions of the same axes.
     fn same_state(&self) -> Result<(), String> {
         let (base, corrected) = (&self.base, &self.corrected);
         let same = base.inches == corrected.inches && base.plane == corrected.plane && base.feed == corrected.feed;
@@ -290,8 +295,8 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Checks that `found`, the corrected moves, follow the base move `way` displaced by the map, in order and without
-    /// a detour.
+    /// Checks that the moves `found` of the corrected program follow the move `way` of the base program displaced by
+    /// the map, within the tolerance, in order and without a detour. The error describes the difference.
     fn along(&self, way: &Movement, found: &[Movement]) -> Result<(), String> {
         let allowed = self.amendment.tolerance_mm + DIGITS_MM;
         let at = |share: f64| {
@@ -347,7 +352,8 @@ fn distance_to_segment(from: Point, to: Point, point: Point) -> f64 {
     (arm - along * share).norm()
 }
 
-/// Returns true if a P word in this line is the number of turns of an arc.
+/// Returns true if a P word in the line would be the number of turns of an arc, because the line has I, J, K or R and
+/// no other word that takes a P.
 fn is_turn(block: &Block) -> bool {
     let has = |letter: u8, of: &[f64]| block.words.iter().any(|w| w.letter == letter && of.contains(&w.value));
     block.words.iter().any(|w| matches!(w.letter, b'I' | b'J' | b'K' | b'R'))
@@ -355,7 +361,8 @@ fn is_turn(block: &Block) -> bool {
         && !has(b'G', &[4.0, 64.0])
 }
 
-/// Adds `by` to the count of each word of a line, except for words that move the tool and line numbers.
+/// Adds `by` to the count of each word of a line in `counts`. Words that move the tool, and line numbers, are not
+/// counted.
 fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
     for word in &block.words {
         let moves = match word.letter {

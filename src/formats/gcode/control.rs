@@ -93,7 +93,10 @@ impl Control {
         }
     }
 
-    /// Reads a line, updates the state and returns the action of the line.
+    /// Executes a line: updates the modal state and the position, and returns the action of the line.
+    ///
+    /// # Errors
+    /// A line that moves the tool in a way that the text does not define, or that has a word without a meaning.
     pub(super) fn execute_block(&mut self, block: &Block) -> Result<Act, Refusal> {
         let asked = self.states(block)?;
         (0..3).filter(|&k| asked.forgets[k]).for_each(|k| self.at[k] = None);
@@ -139,8 +142,11 @@ impl Control {
         Ok(Act::Feed { from, to, arc })
     }
 
-    /// Applies the modal words of a line and returns the effects that the line requests; rejects words that move the
-    /// tool in a way that the program does not show.
+    /// Applies the modal words of a line, and returns the other effects that its words request.
+    ///
+    /// # Errors
+    /// An unknown word; a word that moves the tool in a way that the program does not show; words that exclude each
+    /// other.
     fn states(&mut self, block: &Block) -> Result<BlockRequests, Refusal> {
         let mut asked = BlockRequests::default();
         let is_move = |word: &&GcodeWord| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
@@ -244,11 +250,11 @@ impl Control {
         Ok(())
     }
 
-    /// Processes the rotary axes, which turn the part or the tool: they can only move to 0, where a map over x and y is
-    /// valid.
+    /// Processes the words of rotary axes (A, B, C), which turn the part or the tool. They can only turn to 0, and only
+    /// before the first move at feed, because a map over x and y is valid only there.
     ///
-    /// Returns the word of the first rotary axis of the line, with true if one of its rotary axes can turn in this
-    /// line; `None` if the line names no rotary axis.
+    /// Returns the word of the first rotary axis in the line, and true if a rotary axis can turn in this line. Returns
+    /// `None` if the line has no word of a rotary axis.
     fn turning<'w>(
         &mut self,
         block: &'w Block,
@@ -269,7 +275,11 @@ impl Control {
         Ok(first)
     }
 
-    /// Processes a move that the program gives in machine coordinates: the positions of its axes are unknown after it.
+    /// Processes a move in machine coordinates or to the reference point. After it, the positions of the moved axes are
+    /// unknown. `named` holds the values of X, Y and Z in the line, and `axes` is true if one of them occurs.
+    ///
+    /// # Errors
+    /// G53 without an axis, with an arc, without a motion, or in G91.
     fn machine(&mut self, asked: &BlockRequests, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
         if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
             return Err((
@@ -286,7 +296,10 @@ impl Control {
     }
 
     /// Returns the end position of a move, in millimetres; `None` for an axis whose position is unknown. `named` holds
-    /// the values of X, Y and Z in the line.
+    /// the values of X, Y and Z in the line, in the unit of the program.
+    ///
+    /// # Errors
+    /// A position beyond [`MAX_COORDINATE_MM`]; a relative move (G91) of an axis whose position is unknown.
     fn target(&self, named: [Option<f64>; 3]) -> Result<[Option<f64>; 3], Refusal> {
         let mut target = self.at;
         for k in 0..3 {
@@ -347,7 +360,7 @@ pub(super) fn all(of: [Option<f64>; 3]) -> Option<Point> {
     Some(Point::new(of[0]?, of[1]?, of[2]?))
 }
 
-/// Returns ten times the number of a word; `None` if the number has more than one decimal.
+/// Returns ten times the number of a word, such as 901 for G90.1; `None` if the number has more than one decimal.
 pub(super) fn tenths(word: &GcodeWord) -> Option<i64> {
     let tenths = (word.value * 10.0).round();
     ((word.value * 10.0 - tenths).abs() <= 1e-6).then_some(tenths as i64)
@@ -361,7 +374,8 @@ fn axis_refused(word: &GcodeWord) -> Refusal {
     )
 }
 
-/// Rejects words that occur twice, and two words of a group of which a line can have only one.
+/// Rejects a line that has the same letter twice (except G and M), or two words of a modal group ([`GROUPS`],
+/// [`M_GROUPS`]).
 fn check_once(block: &Block) -> Result<(), Refusal> {
     for (k, word) in block.words.iter().enumerate() {
         let before = &block.words[..k];
@@ -389,7 +403,8 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Rejects words that have no meaning in their line, such as I without an arc or P without a dwell.
+/// Rejects words that have no meaning in their line, such as I without an arc or P without a dwell. `moves` is true if
+/// the line moves the tool, and `is_arc` if this move is an arc.
 fn check_uses(block: &Block, asked: &BlockRequests, moves: bool, is_arc: bool) -> Result<(), Refusal> {
     for word in &block.words {
         let used = match word.letter {

@@ -442,11 +442,13 @@ pub struct Exactness {
 }
 
 impl Dialect {
-    /// Returns the dialect with its words for a program of the given accuracy.
+    /// Returns the texts of this dialect for a program with the accuracy `exactness`: the lines for its path mode and
+    /// the words for its arcs.
     ///
     /// # Errors
-    /// A path mode without words; a tolerance that the dialect cannot express and that the control is not known to
-    /// keep; too few decimals.
+    /// A dialect without words for the path mode; a path tolerance that the dialect cannot express and that the control
+    /// is not known to keep; decimals that round points by more than the chord error; arcs that the dialect does not
+    /// have, or with a tolerance out of range.
     pub fn post(&self, exactness: &Exactness) -> Result<Post<'_>, DialectError> {
         let dialect = || self.dialect.name.clone();
         let (mode, word, key) = match exactness.mode {
@@ -473,10 +475,10 @@ impl Dialect {
         Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)], arcs })
     }
 
-    /// Returns the words for arcs that stay within `within_mm` of the path, and the other limits of arcs.
+    /// Returns the words of this dialect for arcs, and the limits for arcs that stay within `within_mm` of the path.
     ///
     /// # Errors
-    /// A dialect without words for arcs; a tolerance smaller than the rounding by its decimals.
+    /// A dialect without words for arcs; a `within_mm` below the rounding error of the dialect's decimals.
     pub fn arcs(&self, within_mm: f64) -> Result<(&ArcWords, ArcOptions), DialectError> {
         let dialect = || self.dialect.name.clone();
         let words = self.arcs.as_ref().ok_or_else(|| DialectError::NoArcs { dialect: dialect() })?;
@@ -496,16 +498,17 @@ impl Dialect {
         Ok((words, options))
     }
 
-    /// Returns the maximum rounding error of a point, from half a step of the last decimal in each of three
-    /// coordinates.
+    /// Returns the largest distance, in micrometres, by which rounding to the decimals of this dialect moves a point.
     fn rounding_um(&self) -> f64 {
         1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
     }
 
-    /// Returns the lines that set up the control for a head that tilts the wheel.
+    /// Returns the lines with which a program prepares the control for a head that tilts the wheel, and ends this
+    /// state.
     ///
     /// # Errors
-    /// A way of tilting for which the dialect has no words.
+    /// A dialect without words for this head: with a pivot, `[rotary.slides]` is required; without one,
+    /// `[rotary.tool_centre]`.
     pub fn turning(&self, rotary: &RotaryAxis) -> Result<&Turning, DialectError> {
         let dialect = || self.dialect.name.clone();
         match rotary.pivot_mm {
@@ -533,10 +536,11 @@ impl Dialect {
         }
     }
 
-    /// Returns the number of the program of a cycle, if programs have numbers.
+    /// Returns the program number for a cycle: the first number of the range for cycle 1, and so on. Returns `None` if
+    /// programs of this dialect have no numbers.
     ///
     /// # Errors
-    /// A cycle beyond the last number.
+    /// A cycle for which the range of numbers is too short.
     pub fn number(&self, cycle: u16) -> Result<Option<u32>, DialectError> {
         let Some([least, most]) = self.program.numbers else { return Ok(None) };
         let number = least.saturating_add(u32::from(cycle.max(1)) - 1);
@@ -546,7 +550,8 @@ impl Dialect {
         Ok(Some(number))
     }
 
-    /// Returns the name of the program of a part and a cycle: capital letters, digits and `_`, a letter first.
+    /// Returns the program name for a part and a cycle, such as `LENS_C3`. It has only capital letters, digits and `_`,
+    /// and begins with a letter. A long name of the part is cut to the length that the control allows.
     pub fn name(&self, part: &str, cycle: u16) -> String {
         let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
         let cycle = format!("_C{cycle}");
@@ -556,7 +561,8 @@ impl Dialect {
         part.chars().map(plain).take(room).collect::<String>() + &cycle
     }
 
-    /// Returns the faults of the dialect that its schema does not detect.
+    /// Returns the faults of the dialect that the JSON schema of its file cannot detect, such as a longest line that is
+    /// too short for a move.
     pub fn faults(&self) -> Vec<DialectProblem> {
         let mut faults = Vec::new();
         let mut fault = |key: &str, found: String, allowed, remedy| {
@@ -606,7 +612,7 @@ impl Dialect {
         faults
     }
 
-    /// Returns all fixed words and lines of the dialect with their keys.
+    /// Returns all fixed texts of the dialect (words and lines), each with its key, such as `program.begin[0]`.
     fn lines(&self) -> impl Iterator<Item = (String, &String)> {
         let of = |key: &'static str, lines: &'static str| move |(k, line)| (format!("{key}{lines}[{k}]"), line);
         let frame = &self.program;
@@ -652,7 +658,8 @@ impl Dialect {
             .chain(of_arcs)
     }
 
-    /// Returns the fault of a fixed line, if it has one.
+    /// Returns the fault of `line`, the fixed text with the key `key`: what was found, what is allowed, and the remedy.
+    /// Returns `None` if it has no fault.
     fn fault_of(&self, key: &str, line: &str) -> Option<(String, &'static str, &'static str)> {
         if !line.chars().all(|c| matches!(c, ' '..='~')) {
             return Some((
@@ -689,7 +696,7 @@ impl Dialect {
         })
     }
 
-    /// Returns the length of the longest possible block of a move, in characters.
+    /// Returns the largest number of characters that the block of one move can have.
     fn longest_move(&self) -> usize {
         let words = &self.words;
         let digits = |largest: f64| largest.log10().floor().max(0.0) as usize + 1;
@@ -709,7 +716,8 @@ impl Dialect {
 }
 
 impl ArcWords {
-    /// Returns the faults of the arc words: key, text found, allowed values, remedy.
+    /// Returns the faults of the words for arcs. Each fault has the key, what was found, what is allowed, and the
+    /// remedy.
     fn faults(&self) -> impl Iterator<Item = (&'static str, String, &'static str, &'static str)> {
         let missing = || "is missing".to_owned();
         let allowed = "an arc requires its end and its centre";
@@ -751,7 +759,7 @@ impl ArcWords {
         .flatten()
     }
 
-    /// Returns all fixed words with their keys.
+    /// Returns all fixed words for arcs, each with its key, such as `arcs.clockwise`.
     fn words(&self) -> impl Iterator<Item = (&'static str, &String)> {
         [
             ("arcs.clockwise", &self.clockwise),
@@ -765,7 +773,8 @@ impl ArcWords {
         .chain(self.centre_block.iter().map(|word| ("arcs.centre_block", word)))
     }
 
-    /// Returns the maximum number of characters of an arc in addition to the positions of a line.
+    /// Returns the largest number of characters that an arc adds to the block of a straight move, without the
+    /// coordinates of its centre.
     fn longest(&self) -> usize {
         let longest = |words: &Option<[String; 3]>| words.iter().flatten().map(String::len).max().unwrap_or(0);
         self.clockwise.len().max(self.counter_clockwise.len())

@@ -37,7 +37,8 @@ pub enum GcodeError {
 }
 
 impl GcodeError {
-    /// Returns the error with its move number increased by `moves`, the number of moves before this track.
+    /// Returns the error for a track that follows `moves` earlier moves: its move number, which counts within the
+    /// track, becomes the number in the program.
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },

@@ -55,7 +55,7 @@ pub struct ProgramMap {
 }
 
 impl ProgramMap {
-    /// Returns true if a position lies over a node with enough measured points around it.
+    /// Returns true if the node nearest to a position exists and has enough measured points around it.
     pub fn covers(&self, place_mm: [f64; 2]) -> bool {
         let counts = self.grid.counts();
         let [column, row] = [0, 1].map(|k| ((place_mm[k] - self.grid.first_mm[k]) / self.grid.spacing_mm[k]).round());
@@ -64,14 +64,15 @@ impl ProgramMap {
     }
 }
 
-/// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, optionally with more columns, and one row
-/// for every node of a regular grid. A 0 in the column `valid` marks a node with too few measured points around it.
-/// Maps that Regrind wrote already have extrapolated (levelled off) values there. In other maps these values are not
-/// used, and the nearest valid ones replace them. Comments can state `part: sha256 ...`, `map: sha256 ...`, `ground
+/// Reads a map. It has a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, optionally with more columns, and
+/// one row for every node of a regular grid. A 0 in the column `valid` marks a node with too few measured points around
+/// it. In maps that Regrind wrote, these nodes already have extrapolated values. In other maps their values are
+/// replaced by those of the nearest valid nodes. Comments can state `part: sha256 ...`, `map: sha256 ...`, `ground
 /// with: sha256 ...` and `SIMULATION`.
 ///
 /// # Errors
-/// A file that cannot be read; other columns; rows that are not numbers; nodes that do not form a complete grid.
+/// A file that cannot be read; other columns; rows that are not numbers; nodes that do not form a complete grid; a map
+/// without a valid node.
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
     let file = crate::system::open_to_read(path).map_err(unreadable)?;
@@ -113,7 +114,10 @@ struct MapLines {
 }
 
 impl MapLines {
-    /// Reads one line; the error describes the fault.
+    /// Reads the next line of the map.
+    ///
+    /// # Errors
+    /// The description of the fault of the line.
     fn read_line(&mut self, line: &[u8]) -> Result<(), String> {
         self.hash.update(line);
         let text = std::str::from_utf8(line).map_err(|_| "the line is not text")?.trim_start_matches('\u{feff}').trim();
@@ -138,7 +142,10 @@ impl MapLines {
         Ok(())
     }
 
-    /// Arranges the nodes on their grid after all lines were read.
+    /// Creates the map from all lines that were read.
+    ///
+    /// # Errors
+    /// Nodes that do not form a complete grid; no header; no valid node.
     fn into_map(self, path: &Path) -> Result<ProgramMap, GcodeError> {
         let remedy = "give a row for every node of a regular grid of at least three rows and three columns";
         let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
@@ -181,15 +188,15 @@ fn columns(header: &str) -> Option<MapKind> {
     }
 }
 
-/// Returns x, y and the value of a row; `None` if one of them is not a number. The value of an invalid node can be any
-/// text and becomes NaN.
+/// Returns x, y and the value of a row as a point; `None` if one of them is not a number. If `valid` is false, a value
+/// that is not a number becomes NaN instead.
 fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
     Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(f64::NAN))?))
 }
 
-/// Returns the grid of the nodes, and the index of the point at each node of the grid; `None` if the points do not form
-/// a complete grid.
+/// Returns the regular grid on which the points lie, and for each node of the grid the index of its point. Returns
+/// `None` if the points do not form a complete grid.
 fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     let order = recognise_grid(points)?;
     if order.point_indices.contains(&NO_POINT) {
@@ -202,7 +209,8 @@ fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     Some((grid, (0..grid.len()).map(|k| order.point_indices[k] as usize).collect()))
 }
 
-/// Gives each node with an unknown value the value of the nearest known node, by steps along rows and columns.
+/// Replaces each value that is not `known` by the value of the nearest known node. The distance counts steps along rows
+/// and columns.
 fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     let mut known = known.to_vec();
     let mut next: std::collections::VecDeque<usize> = (0..known.len()).filter(|&k| known[k]).collect();
@@ -223,7 +231,8 @@ fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     }
 }
 
-/// Returns the SHA-256 after `name` in a comment such as `map: sha256 5f3c...`; `None` if there is none.
+/// Returns the SHA-256 that follows `name` in a comment: with the name `map:`, that of `map: sha256 5f3c...`. Returns
+/// `None` if there is none.
 pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
     let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
     let mut bytes = [0; 32];

@@ -5,13 +5,13 @@ pub(super) const PER_MM: f64 = 1e6;
 /// Largest coordinate that is written, in millimetres.
 pub(super) const MAX_COORDINATE_MM: f64 = 1e9;
 
-/// Rounds a length to the written decimals; returns millionths of a millimetre.
+/// Returns a length in millimetres as a whole number of millionths of a millimetre, rounded to the nearest.
 #[inline]
 pub(super) fn rounded(value_mm: f64) -> i64 {
     (value_mm * PER_MM).round() as i64
 }
 
-/// Appends a number, given in millionths, with six decimals.
+/// Appends a number with six decimals to `text`. `millionths` is one million times the number.
 #[inline]
 pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
     // At most nineteen digits, a point and a sign; filled from the end.
@@ -41,7 +41,7 @@ pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
     text.extend_from_slice(&digits[at..]);
 }
 
-/// Appends the number `count` / 10^`decimals` with all its decimals.
+/// Appends the number `count` / 10^`decimals` to `text`, with all its decimals.
 #[inline]
 pub(super) fn push_decimals(text: &mut Vec<u8>, count: i64, decimals: u8) {
     if decimals == 6 {
@@ -77,7 +77,7 @@ const PAIRS: [[u8; 2]; 100] = {
     pairs
 };
 
-/// Returns a number rounded to six decimals, without trailing zeros, for headers and feeds.
+/// Formats a number with at most six decimals, without zeros at the end, for headers of programs.
 pub(super) fn short(value: f64) -> String {
     let mut text = Vec::new();
     push_fixed(&mut text, rounded(value));

@@ -25,10 +25,11 @@ pub(super) type Refusal = (String, &'static str);
 /// Longest line that LinuxCNC accepts.
 const LONGEST_LINE: usize = 255;
 
-/// Splits a line into words and comments.
+/// Splits a line of a program into words and comments.
 ///
 /// # Errors
-/// Block delete, variables and expressions, O-words, a letter without a number, a comment without an end.
+/// A slash at the beginning (block delete); variables, expressions and O-words; a letter without a number; a comment
+/// without an end; any other character; a line of more than 255 characters.
 pub(super) fn block(line: &str) -> Result<Block<'_>, Refusal> {
     if line.len() > LONGEST_LINE {
         let found = format!("the line has {} characters, and controllers read at most {LONGEST_LINE}", line.len());
@@ -75,7 +76,10 @@ fn expression() -> Refusal {
     ("the line has a variable or an expression; only the controller knows its value".into(), remedy)
 }
 
-/// Returns the word that begins at the byte `at`, and the index of the byte after the word.
+/// Returns the word that begins at the byte `at` of `line`, and the index of the byte after the word.
+///
+/// # Errors
+/// A letter without a number; an O-word; a variable or an expression in place of the number.
 fn word(line: &str, at: usize) -> Result<(GcodeWord<'_>, usize), Refusal> {
     let bytes = line.as_bytes();
     let letter = bytes[at].to_ascii_uppercase();

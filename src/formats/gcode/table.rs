@@ -7,7 +7,8 @@ use crate::FormatError;
 use crate::registration::write_rows;
 use regrind_core::geometry::Grid;
 
-/// Writes `toolpath_z.csv`: `x_mm,y_mm,dz_mm`, one row per node, row by row with x fastest.
+/// Writes `toolpath_z.csv` to `path`: `x_mm,y_mm,dz_mm`, one row per node of `grid`, row by row with x fastest. dz are
+/// the `offsets_mm`. The header states `map_identity`, the SHA-256 of the map.
 ///
 /// x and y are the positions of the wheel's centre on the axes; the controller adds dz to Z. The table corrects a
 /// program of the nominal surface at the same level, as in sag compensation over two axes or with levelling meshes. Do

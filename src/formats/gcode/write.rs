@@ -55,7 +55,7 @@ pub struct ProgramHeader {
     pub exactness: Exactness,
 }
 
-/// Writes a program: the header, the moves track by track, the end.
+/// Writes the program of a tool path to `file`: the header, the moves track by track, the end.
 ///
 /// Frame: the model frame; the work offset must have its zero there. Units: mm, mm/min. A coordinate that does not
 /// change within a track is omitted. Every track states its complete start again, so that a program can be resumed at
@@ -64,7 +64,7 @@ pub struct ProgramHeader {
 ///
 /// # Errors
 /// A request that the dialect cannot express; a coordinate that is not finite or exceeds the limit of the dialect; a
-/// feed that rounds to 0; a number of moves that differs from the summary; a file that cannot be written.
+/// feed that rounds to 0; a number of moves that differs from `summary`; a file that cannot be written.
 pub fn write_program(
     file: &Path,
     header: &ProgramHeader,
@@ -167,7 +167,8 @@ const MIN_LENGTH_MM: f64 = 1e-6;
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
-    /// Creates an empty state, after `count` moves and `numbered` numbered blocks.
+    /// Creates an empty text with no modal state. `count` moves and `numbered` blocks with a number precede it in the
+    /// program.
     fn new(dialect: &'a Dialect, rotary: Option<&'a RotaryAxis>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let numbers = &dialect.numbers;
@@ -177,7 +178,10 @@ impl<'a> Lines<'a> {
         Self { dialect, rotary, text, last, turned, motion, plane, feed, count, numbered, per_mm, per_deg, feed_per }
     }
 
-    /// Formats the lines of a whole track.
+    /// Formats all moves of one track into a new text.
+    ///
+    /// # Errors
+    /// A coordinate or a feed that the dialect cannot express. Its move number counts within the track.
     fn format_track<T: Iterator<Item: Into<ProgramBlock>> + Clone>(
         dialect: &'a Dialect,
         rotary: Option<&'a RotaryAxis>,
@@ -188,7 +192,7 @@ impl<'a> Lines<'a> {
         Ok(lines)
     }
 
-    /// Resets the modal state, so that the next block states its motion, position and feed.
+    /// Clears the modal state, so that the next block states its motion, position and feed again.
     fn begin(&mut self) {
         (self.last, self.turned, self.feed) = ([NOTHING; 3], NOTHING, NOTHING);
         (self.motion, self.plane) = (None, None);
@@ -203,7 +207,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the number of a block, if blocks have one.
+    /// Writes the number of the next block, if the dialect numbers blocks.
     #[inline]
     fn number(&mut self) {
         number(&mut self.text, self.dialect, self.numbered);
@@ -235,9 +239,9 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Returns the feed in the form that the control uses. If the control keeps the wheel's centre, this is the feed of
-    /// the centre, in mm/min. If the program moves the slides, it is the inverse of the time of the block, in 1/min,
-    /// and is valid for this block only. `centre_mm` is the length of the move of the centre.
+    /// Returns the feed as the control expects it. If the control keeps the wheel's centre in place, this is
+    /// `feed_mm_min`, the feed of the centre. If the program moves the slides, it is the inverse of the duration of the
+    /// block, in 1/min, and valid for this block only. `centre_mm` is the length of the move of the centre.
     fn feed_of(&mut self, feed_mm_min: f64, centre_mm: f64) -> f64 {
         if !self.moves_slides() {
             return feed_mm_min;
@@ -250,8 +254,11 @@ impl<'a> Lines<'a> {
         self.rotary.is_some_and(|rotary| rotary.pivot_mm.is_some())
     }
 
-    /// Writes the block of a rapid or straight move: the words that changed, or all known words if none changed. `None`
-    /// leaves an axis, the tilt or the feed unchanged.
+    /// Writes the block of a rapid or straight move. An axis, a tilt or a feed that is `None` stays unchanged. Words
+    /// that did not change are omitted; if nothing changed, all known axes are written.
+    ///
+    /// # Errors
+    /// A value that is not finite or exceeds the limit of the dialect; a feed that rounds to 0.
     #[inline]
     fn block(
         &mut self,
@@ -287,8 +294,11 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Writes the block of an arc, or two blocks if the centre has its own block; the end point and the centre are
-    /// always written.
+    /// Writes the block of an arc, after a block for its centre if the dialect has one. The end point in the plane and
+    /// the centre are always written.
+    ///
+    /// # Errors
+    /// A value that is not finite or exceeds the limit of the dialect; a feed that rounds to 0.
     fn arc(&mut self, arc: &Arc) -> Result<(), GcodeError> {
         let dialect = self.dialect;
         let (words, Some(arcs)) = (&dialect.words, &dialect.arcs) else { return Ok(()) };
@@ -325,7 +335,7 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Writes the start of an arc: its plane, if that changed, and the direction of rotation.
+    /// Writes the words that begin an arc: the plane, if it changed, and the direction of rotation.
     fn turn(&mut self, arc: &Arc, arcs: &ArcWords) {
         if let Some(planes) = arcs.planes.as_ref().filter(|_| self.plane != Some(arc.plane)) {
             let known = [Plane::XY, Plane::ZX, Plane::YZ].iter().position(|plane| *plane == arc.plane);
@@ -338,8 +348,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the coordinates of the centre along the two axes of a plane, with their words from `letters`, in the
-    /// order x, y, z. `first` is true until a word of the block is written.
+    /// Writes the two coordinates `centre` of an arc's centre in its plane, in the order of the axes. `letters` are the
+    /// words for x, y and z. `first` is true until a word of the block is written, and is updated.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
         for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
@@ -348,8 +358,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes `words`, the text that begins a motion, unless this motion is in force and the dialect does not repeat it
-    /// in each block.
+    /// Writes `words`, the text that begins the motion `motion`. Omits it if this motion is already in force, unless
+    /// the dialect repeats it in each block.
     #[inline]
     fn begins(&mut self, motion: Motion, words: &str) {
         if self.dialect.words.each_block || self.motion != Some(motion) {
@@ -358,7 +368,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes a coordinate: its word, and `value` in units of the last written digit.
+    /// Writes the word of an axis and its coordinate. `value` counts units of the last written digit. `first` is true
+    /// until a word of the block is written, and is updated.
     #[inline]
     fn place(&mut self, word: &str, value: i64, first: &mut bool) {
         self.between(first);
@@ -370,7 +381,8 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, value, numbers.decimals);
     }
 
-    /// Writes a feed, given in units of the last written digit, unless it is in force.
+    /// Writes the feed, unless the same feed is already in force. `feed` counts units of the last written digit.
+    /// `first` is true until a word of the block is written, and is updated.
     #[inline]
     fn feed(&mut self, feed: i64, first: &mut bool) {
         if feed != self.feed {
@@ -388,7 +400,10 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Returns a coordinate in units of the last written digit.
+    /// Returns a coordinate as a number of units of the last written digit. `axis` is 0 for x, 1 for y, 2 for z.
+    ///
+    /// # Errors
+    /// A value that is not finite or exceeds the limit of the dialect.
     #[inline]
     fn rounded(&self, axis: usize, value_mm: f64) -> Result<i64, GcodeError> {
         let largest_mm = self.dialect.numbers.largest_mm;
@@ -411,7 +426,10 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, turned, numbers.angle_decimals);
     }
 
-    /// Returns the reading of the rotary axis for a tilt of the wheel, in units of the last written digit.
+    /// Returns the position of the rotary axis for a tilt of the wheel, as a number of units of the last written digit.
+    ///
+    /// # Errors
+    /// A tilt that is not finite; a program without a rotary axis.
     fn rounded_turn(&self, tilt_rad: f64) -> Result<i64, GcodeError> {
         let Some(rotary) = self.rotary.filter(|_| tilt_rad.is_finite()) else {
             return Err(GcodeError::NotFinite { axis: 'A', value_mm: tilt_rad, number: self.count });
@@ -419,7 +437,10 @@ impl<'a> Lines<'a> {
         Ok((rotary.scale_reading_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
     }
 
-    /// Returns a feed in units of the last written digit.
+    /// Returns a feed as a number of units of the last written digit.
+    ///
+    /// # Errors
+    /// A feed that rounds to 0.
     fn rounded_feed(&self, feed_mm_min: f64) -> Result<i64, GcodeError> {
         match (feed_mm_min * self.feed_per).round() as i64 {
             0 => {
@@ -430,7 +451,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// Writes a feed without trailing zeros.
+/// Appends a feed to `text` without zeros at the end. `feed` counts units of the last written digit.
 fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     let before = text.len();
     push_decimals(text, feed, dialect.numbers.feed_decimals);
@@ -447,7 +468,8 @@ fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     }
 }
 
-/// Writes the number of a block, if blocks have one.
+/// Appends the number of a block to `text`, if the dialect numbers blocks. `numbered` is the number of numbered blocks
+/// before it.
 #[inline]
 fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
     let Some(blocks) = &dialect.blocks else { return };
@@ -499,7 +521,8 @@ impl<'a> Frame<'a> {
         })
     }
 
-    /// Appends a line, with a block number if `has_number` is true.
+    /// Appends `line` to `text`. If `has_number` is true, the line gets a block number and `numbered`, the count of
+    /// numbered blocks, increases by 1.
     fn line(&self, text: &mut Vec<u8>, line: &str, has_number: bool, numbered: &mut u64) {
         // A percent sign is not a block and has no number.
         if has_number && line != "%" {
@@ -510,8 +533,8 @@ impl<'a> Frame<'a> {
         end_line(text, self.dialect);
     }
 
-    /// Returns the lines before the moves, which state the total number of lines, and the number of numbered blocks
-    /// among them.
+    /// Returns the lines of the program before the moves, and the number of numbered blocks among them. A comment
+    /// states the number of lines of the whole program.
     fn head(&self, header: &ProgramHeader, summary: &PathSummary, arcs: Option<&ArcSummary>) -> (String, u64) {
         let lines = |count: u64| {
             let (mut text, mut numbered) = (Vec::new(), 0);
@@ -534,14 +557,14 @@ impl<'a> Frame<'a> {
         lines(count)
     }
 
-    /// Returns the lines after the moves.
+    /// Returns the lines of the program after the moves. `numbered` is the number of numbered blocks before them.
     fn tail(&self, mut numbered: u64) -> String {
         let mut text = Vec::new();
         self.end.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
         String::from_utf8_lossy(&text).into_owned()
     }
 
-    /// Returns a text as comments: as many lines as its length requires.
+    /// Formats `words` as comments of the dialect: as many lines as the longest line of the dialect requires.
     fn comments(&self, words: &str) -> Vec<String> {
         let text = &self.dialect.text;
         // A block number before the comment takes space too.
@@ -564,7 +587,8 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// Returns the texts of the header, one for each comment. `lines` is the number of lines of the program.
+/// Returns the texts for the comments at the beginning of a program. `h` is the content of the header, `s` the summary
+/// of the path, and `lines` the number of lines of the program.
 fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
@@ -610,7 +634,7 @@ fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, l
     said
 }
 
-/// Returns the header's text about the tilt of the wheel and about the resulting meaning of X, Y and Z.
+/// Returns two texts for the header: about the tilt of the wheel, and about the point that X, Y and Z describe.
 fn tilt_in_words(rotary: &RotaryAxis, h: &ProgramHeader, s: &PathSummary) -> [String; 2] {
     let about = if rotary.axis == RotationAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
@@ -631,8 +655,8 @@ fn tilt_in_words(rotary: &RotaryAxis, h: &ProgramHeader, s: &PathSummary) -> [St
     [format!("{}, {} turns about {about} {sense}{reached}", h.lean, rotary.letter), of]
 }
 
-/// Returns text that is allowed in a comment: without brackets, which would end the comment or begin another, and in
-/// plain characters.
+/// Returns the first 200 characters of `words` as they are allowed in a comment: round brackets, which would begin or
+/// end a comment, become square brackets, and characters other than printable ASCII become `?`.
 pub(super) fn comment(words: &str) -> String {
     let plain = |c: char| match c {
         '(' => '[',

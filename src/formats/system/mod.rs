@@ -23,7 +23,8 @@ pub struct OpenToOthers {
     pub remedy: String,
 }
 
-/// Returns how users other than the owner can read a file, and the remedy; `None` if they cannot.
+/// Returns the permission by which other users than the owner can read a file, and the remedy. Returns `None` if no
+/// other user can read it.
 ///
 /// # Errors
 /// A file that does not exist, or whose permissions the system does not report.
@@ -31,12 +32,13 @@ pub fn readable_by_others(path: &Path) -> std::io::Result<Option<OpenToOthers>> 
     here::readable_by_others(path)
 }
 
-/// Returns true if two paths lead to the same existing file.
+/// Returns true if both paths lead to the same file. Returns false if one of them does not exist.
 pub fn is_same_file(one: &Path, other: &Path) -> bool {
     here::is_same_file(one, other).unwrap_or(false)
 }
 
-/// Returns the name of the user with a number; `None` if the system has no list of users or no entry.
+/// Returns the name of the user with the number `uid`; `None` if the system has no list of users, or the list no such
+/// user.
 pub fn user_name(uid: u32) -> Option<String> {
     here::user_name(uid)
 }

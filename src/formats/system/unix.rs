@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::OpenToOthers;
 
-/// Creates a file that only its owner can read, for writing.
+/// Creates a file that only its owner can read and write, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
@@ -30,8 +30,9 @@ pub(super) fn user_name(uid: u32) -> Option<String> {
     users.find(|user| user[2].parse() == Ok(uid) && !user[0].is_empty()).map(|user| user[0].clone())
 }
 
-/// Opens a file for reading. Opening a named pipe waits for its writer, and a device can have no end. Both are opened
-/// only under `/dev/fd` and similar folders, where a shell places the input of a program.
+/// Opens a file for reading. Rejects a named pipe, which could block until a program writes, and a device, which can
+/// have no end. They are accepted only under `/dev/fd` and similar folders, where a shell places the input of a
+/// program.
 pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     let kind = fs::metadata(path)?.file_type();
     let is_given =
@@ -42,17 +43,20 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Returns true if the entry at a path is a socket; a link is not followed.
+/// Returns true if the entry at `path` is a socket. A symbolic link to a socket is not a socket.
+///
+/// # Errors
+/// No entry at `path`.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())
 }
 
-/// Creates another name (a link) for a device.
+/// Creates the symbolic link `link` to `device`.
 pub(crate) fn link_to(device: &Path, link: &Path) -> io::Result<()> {
     std::os::unix::fs::symlink(device, link)
 }
 
-/// Flushes the names in a folder to the disk.
+/// Flushes a folder to the disk, so that the names of its files last after a power failure.
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }

@@ -7,12 +7,15 @@ use std::path::Path;
 
 use super::OpenToOthers;
 
-/// Creates a file that only its owner can read, for writing.
+/// Creates a file that only its owner can read, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// Returns true if two paths are the same full path. A hard link, which is a second name of a file, is not detected.
+/// Returns true if both paths lead to the same full path. A hard link (a second name of a file) is not detected.
+///
+/// # Errors
+/// A path that does not exist.
 pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
     Ok(one.canonicalize()? == other.canonicalize()?)
 }

@@ -50,7 +50,7 @@ impl Kind {
         }
     }
 
-    /// Reads a value from as many bytes as the type has.
+    /// Parses a number of this type (little-endian) from the bytes `at`; NaN if there are too few bytes.
     pub(super) fn value(self, at: &[u8]) -> f64 {
         match self {
             Self::Int16 => at.first_chunk().map_or(f64::NAN, |b| i16::from_le_bytes(*b).into()),
@@ -69,7 +69,10 @@ pub(super) enum Extent {
 }
 
 impl Extent {
-    /// Returns the number of samples, if it is within the limits.
+    /// Returns the number of samples.
+    ///
+    /// # Errors
+    /// No samples, or more than a map can have.
     pub(super) fn count(self, path: &Path) -> Result<usize, FormatError> {
         let [columns, rows] = match self {
             Self::Matrix(size) => size,
@@ -126,7 +129,10 @@ impl Place<'_> {
         number.ok_or_else(|| self.unexpected(node, "a finite number", &text))
     }
 
-    /// Returns the number in an element, or a default if the element is missing or empty.
+    /// Returns the number in the child `name` of `parent`, or `default` if the child does not exist or is empty.
+    ///
+    /// # Errors
+    /// A text that is not a finite number.
     fn number_or(&self, parent: Node<'_, '_>, name: &str, default: f64) -> Result<f64, FormatError> {
         match child(parent, name).filter(|node| !text(*node).is_empty()) {
             Some(node) => self.number(node),
@@ -140,7 +146,8 @@ impl Place<'_> {
     }
 }
 
-/// Returns the first child with a name, in any namespace: writers use different ones.
+/// Returns the first child element with this name, in any namespace: programs use different ones. `None` if there is
+/// none.
 fn child<'a, 'd>(node: Node<'a, 'd>, name: &str) -> Option<Node<'a, 'd>> {
     node.children().find(|c| c.is_element() && c.tag_name().name() == name)
 }
@@ -150,7 +157,11 @@ fn text(node: Node<'_, '_>) -> String {
 }
 
 impl Main {
-    /// Parses the document; also returns the samples, or the entry that contains them.
+    /// Parses `main.xml` from its `bytes`; `entry` is its name in the container. Returns its content, and the samples
+    /// or the names of the entries that contain them.
+    ///
+    /// # Errors
+    /// A document that is not valid, that describes a profile or several layers, or that has a rotated frame.
     pub(super) fn parse(path: &Path, entry: &str, bytes: &[u8]) -> Result<(Self, Samples), FormatError> {
         let place = Place { path, entry };
         let source = std::str::from_utf8(bytes).map_err(|error| {
@@ -191,7 +202,7 @@ impl Main {
     }
 }
 
-/// Rejects a frame that is rotated against the axes of the data.
+/// Returns an error if the rotation matrix of the document is not the identity.
 fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatError> {
     let Some(rotation) = child(axes, "Rotation") else { return Ok(()) };
     for element in rotation.children().filter(Node::is_element) {
@@ -206,7 +217,11 @@ fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Returns true if the rows begin at the top; the standard has no element for this, but some writers use one.
+/// Returns true if the first row of the data is the northern one (largest y). The standard has no element for this, but
+/// some programs write one. Then a note is added to `notes`.
+///
+/// # Errors
+/// A value other than SW or NW.
 fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>) -> Result<bool, FormatError> {
     let Some(origin) = child(axes, "Origin") else { return Ok(false) };
     match text(origin).as_str() {
@@ -308,8 +323,8 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
     Ok(Samples::Inline(records))
 }
 
-/// Reads a sample in XML: the values of the absolute axes, separated by semicolons, or empty text if it was not
-/// measured.
+/// Parses a sample in XML: a number for each absolute axis, separated by semicolons. Returns `None` for an empty text,
+/// which means that the sample was not measured.
 fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Record, FormatError> {
     let text = text(datum);
     if text.is_empty() {
@@ -329,7 +344,7 @@ fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Resul
     Ok(values.iter().all(|v| v.is_finite()).then_some(values))
 }
 
-/// Returns true if a word is an MD5 checksum in hexadecimal digits.
+/// Returns true if a word can be an MD5 checksum: 32 hexadecimal digits.
 pub(super) fn is_sum(word: &str) -> bool {
     word.len() == 32 && word.bytes().all(|b| b.is_ascii_hexdigit())
 }

@@ -66,8 +66,8 @@ impl From<X3pFile> for MapPoints {
 ///
 /// # Errors
 /// A file that is not readable, not a zip container, damaged or encrypted; a file without `main.xml` or its data; a
-/// checksum that differs from the recorded one; an amount of data that differs from the stated size; a profile, layers,
-/// a rotated frame.
+/// checksum that differs from the recorded one; an amount of data that differs from the stated size; a profile, several
+/// layers, or a rotated frame.
 pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
@@ -110,12 +110,16 @@ pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
     assembled(path, &main, &records)
 }
 
-/// Returns true if a file begins like a zip container, even an empty one.
+/// Returns true if `head`, the beginning of a file, is that of a zip container, even an empty one.
 fn is_zip(head: &[u8]) -> bool {
     head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06")
 }
 
-/// Reads the binary parts.
+/// Reads `count` samples from the binary entry `data`, and from the entry `valid` the mask of the measured samples. A
+/// sample that was not measured, or is not finite, is `None`.
+///
+/// # Errors
+/// An entry that is missing, damaged, or of another length.
 fn linked(
     container: &mut Container<'_>,
     axes: &[Axis; 3],
@@ -139,7 +143,7 @@ fn linked(
     Ok(bytes.chunks_exact(width).enumerate().map(|(k, at)| if is_valid(k) { record(at) } else { None }).collect())
 }
 
-/// Creates a map or points from the samples.
+/// Creates a map from samples on a regular grid, or else points from samples that have positions of their own.
 fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, FormatError> {
     let [x, y, z] = &main.axes;
     let mm = |axis: &Axis, raw: f64| 1e3 * (axis.offset_m + raw * axis.increment);
@@ -202,7 +206,10 @@ struct Container<'a> {
 }
 
 impl<'a> Container<'a> {
-    /// Opens a container and finds the one `main.xml` in it.
+    /// Opens the zip container in `bytes`, and finds the folder of its only `main.xml`.
+    ///
+    /// # Errors
+    /// A damaged container; too many entries; no `main.xml`, or more than one.
     fn open(path: &'a Path, bytes: &'a [u8]) -> Result<Self, FormatError> {
         let zip = ZipArchive::new(Cursor::new(bytes))
             .map_err(|source| FormatError::Container { path: path.to_owned(), source })?;
@@ -239,7 +246,7 @@ impl<'a> Container<'a> {
         }
     }
 
-    /// Returns the full name of an entry.
+    /// Returns the name of an entry in the container: the folder of `main.xml`, then `entry`.
     fn name(&self, entry: &str) -> String {
         format!("{}{entry}", self.folder)
     }
@@ -251,7 +258,10 @@ impl<'a> Container<'a> {
         (0..self.zip.len()).find(is_it)
     }
 
-    /// Decompresses an entry up to a limit; its length stated in the container is not trusted.
+    /// Decompresses an entry. The length that the container states for it is not trusted.
+    ///
+    /// # Errors
+    /// An entry that is missing or damaged, or that has more than `limit` bytes.
     fn entry(&mut self, entry: &str, limit: u64) -> Result<Vec<u8>, FormatError> {
         let missing = || FormatError::Missing { path: self.path.to_owned(), expected: entry.to_owned() };
         let index = self.find(entry).ok_or_else(missing)?;
@@ -267,7 +277,10 @@ impl<'a> Container<'a> {
         Ok(bytes)
     }
 
-    /// Decompresses an entry of a known length and verifies its checksum.
+    /// Decompresses an entry that must have `length` bytes, and verifies its MD5 checksum, if one is recorded.
+    ///
+    /// # Errors
+    /// An entry that is missing or damaged, or that has another length or checksum.
     fn sealed(&mut self, sealed: &Sealed, length: u64) -> Result<Vec<u8>, FormatError> {
         let bytes = self.entry(&sealed.entry, length)?;
         if bytes.len() as u64 != length {
@@ -281,8 +294,11 @@ impl<'a> Container<'a> {
         }
     }
 
-    /// Compares the MD5 checksum of `main.xml` with the one in the entry `seal`. A missing entry, or an entry without a
-    /// checksum, is ignored.
+    /// Compares the MD5 checksum of `main.xml`, whose bytes are `xml`, with the one in the entry `seal`. A missing
+    /// entry, or an entry without a checksum, is accepted.
+    ///
+    /// # Errors
+    /// Another checksum.
     fn check_sealed(&mut self, seal: &str, xml: &[u8]) -> Result<(), FormatError> {
         if self.find(seal).is_none() {
             return Ok(());

@@ -26,8 +26,8 @@ pub struct MapRecord {
     pub comment: String,
 }
 
-/// Writes the map of a part's error as X3P: heights are errors in metres over x and y of the model frame, positive
-/// where material is proud.
+/// Writes the error map of a part as X3P. Its heights are the errors, in metres, over x and y of the model frame;
+/// positive where material is proud. `date` is the time for the header, as in `2026-03-01T12:00:00Z`.
 ///
 /// Nodes that were not measured are NaN and marked in the mask. The same map and date give the same bytes.
 ///
@@ -120,7 +120,7 @@ fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> Stri
     )
 }
 
-/// Replaces characters that XML and HTML reserve or forbid in a text.
+/// Returns `text` for use in XML or HTML: `<`, `>` and `&` become entities, and forbidden characters become U+FFFD.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

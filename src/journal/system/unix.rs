@@ -15,14 +15,14 @@ use super::OpenToOthers;
 /// `TMPDIR` is not.
 const PLACES: [&str; 4] = ["/run/lock", "/var/lock", "/var/tmp", "/tmp"];
 
-/// Creates a folder that only its owner can read, and its missing parents.
+/// Creates a folder that only its owner can read, and its missing parents. An existing folder is accepted unchanged.
 pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)
 }
 
-/// Creates the folder of a run, which only its owner can read: a reader can block the writing of its record. If the
-/// parent folder passes its group on to new files (`chmod g+s`), that group can read too. An existing folder keeps its
-/// mode.
+/// Creates the folder of a run, which only its owner can read, because a reader can block the writing of the record. If
+/// the parent folder passes its group on to new files (`chmod g+s`), that group can read too. An existing folder keeps
+/// its mode.
 pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     fs::create_dir_all(above)?;
@@ -37,12 +37,13 @@ pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     }
 }
 
-/// Returns true if every user of the computer can read or enter a folder.
+/// Returns true if every user of the computer can read or enter a folder; false if it does not exist.
 pub(crate) fn is_open_to_all(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|found| found.mode() & 0o005 != 0)
 }
 
-/// Returns how users other than the owner can exchange files in a folder, or `None` if they cannot.
+/// Returns the permission by which other users can replace files in a folder, and the remedy. Returns `None` if they
+/// cannot.
 pub(crate) fn changeable_by_others(folder: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(folder)?.mode() & 0o7777;
     let open = || OpenToOthers {
@@ -52,24 +53,25 @@ pub(crate) fn changeable_by_others(folder: &Path) -> io::Result<Option<OpenToOth
     Ok((mode & 0o022 != 0 && mode & 0o1000 == 0).then(open))
 }
 
-/// Creates a file that only its owner can read, and opens it for writing.
+/// Creates a file that only its owner can read, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
-/// Returns how users other than the owner can read a file, or `None` if they cannot.
+/// Returns the permission by which other users than the owner can read a file, and the remedy. Returns `None` if they
+/// cannot.
 pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(path)?.mode() & 0o777;
     let open = || OpenToOthers { how: format!("mode {mode:03o}, at most 600"), remedy: "`chmod 600` it".into() };
     Ok((mode & 0o077 != 0).then(open))
 }
 
-/// Syncs the content of a file to the disk, whoever wrote it.
+/// Flushes the content of a file to the disk, even if another process wrote it.
 pub(crate) fn sync_file(path: &Path) -> io::Result<()> {
     File::open(path)?.sync_all()
 }
 
-/// Syncs the names in a folder to the disk.
+/// Flushes a folder to the disk, so that the names of its files last after a power failure.
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
@@ -77,7 +79,7 @@ pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
 /// Device and inode: identify a file on this computer, whatever its name.
 pub(crate) type FileIdentity = [u64; 2];
 
-/// Returns the identity of the file at a path.
+/// Returns the device and the inode of the file at a path.
 pub(crate) fn identity(path: &Path) -> io::Result<FileIdentity> {
     fs::metadata(path).map(|found| [found.dev(), found.ino()])
 }
@@ -88,14 +90,14 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     Ok(room.f_bavail.saturating_mul(room.f_frsize))
 }
 
-/// Returns true if the path is a regular file (not a link) of the user of this program or of root.
+/// Returns true if `path` is a regular file, and no link, that belongs to the user of this program or to root.
 pub(crate) fn is_own_file(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
 }
 
-/// Returns the parent of the lock folder named `folder`, one of [`PLACES`]. Prefers a parent in which root has created
-/// this folder. Otherwise returns the first existing parent that every user can write, and where nobody can remove the
-/// files of others. Returns `None` if no parent qualifies.
+/// Returns the folder in which the lock folder named `folder` is or should be created, one of [`PLACES`]. Prefers one
+/// in which root has created the lock folder. Otherwise returns the first that every user can write, and where nobody
+/// can remove the files of others. Returns `None` if there is none.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
     // A folder that root has created, as the package does, comes before any other.
     let by_root =
@@ -129,7 +131,11 @@ pub(crate) struct BadFolder {
 }
 
 impl LockFolder {
-    /// Opens the folder, and creates it if it does not exist.
+    /// Opens the lock folder `name` in `place`, or creates it.
+    ///
+    /// # Errors
+    /// A link or file in its place; a folder of another user, or one in which users can remove the files of others; a
+    /// folder that cannot be opened.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let path = place.join(name);
         let bad = |what: String| {
@@ -175,14 +181,19 @@ impl LockFolder {
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
 
-    /// Opens the lock file of a machine, which every user of the folder can lock. Returns an error text if something
-    /// else is in its place.
+    /// Opens the lock file `name`, or creates it so that every user of the folder can lock it.
+    ///
+    /// # Errors
+    /// The reason why something in its place cannot be used as a lock file.
     pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         self.file(name, if self.is_for_all { 0o666 } else { 0o660 })
     }
 
-    /// Opens the lock file of a machine for this user only. No other user can open it, so no other user can hold or
-    /// damage it.
+    /// Opens the lock file `name`, or creates it for this user only. No other user can open it, so no other user can
+    /// hold or damage it.
+    ///
+    /// # Errors
+    /// The reason why something in its place cannot be used as a lock file.
     pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
         let file = self.file(name, 0o600)?;
         if file.owner != rustix::process::geteuid().as_raw() {
@@ -229,7 +240,7 @@ impl LockFolder {
         Ok(LockFile { lock, holder_file, is_spoiled, owner: found.st_uid, identity })
     }
 
-    /// Creates a file with its mode. Succeeds also if another process creates it first.
+    /// Creates the file `name` with the permissions `mode`. If another process creates it first, that file is accepted.
     fn make(&self, name: &str, mode: u32) -> Result<(), Errno> {
         let draft = format!(".{:016x}", rand::random::<u64>());
         let flags = AS_FILE | OFlags::RDWR | OFlags::CREATE | OFlags::EXCL;
@@ -241,13 +252,13 @@ impl LockFolder {
         if made == Err(Errno::EXIST) { Ok(()) } else { made }
     }
 
-    /// Returns true if a file still has its name. A file that was removed in the meantime locks nothing.
+    /// Returns true if `name` still leads to the open `file`. A file that was removed in the meantime locks nothing.
     pub(crate) fn is_still(&self, name: &str, file: &LockFile) -> bool {
         let found = rustix::fs::statat(&self.folder, name, AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| [found.st_dev, found.st_ino] == file.identity)
     }
 
-    /// Returns the part of a file name that identifies the files of this user.
+    /// Returns the mark of this user in the names of lock files: the number of the user.
     pub(crate) fn own_mark() -> String {
         rustix::process::geteuid().as_raw().to_string()
     }
@@ -256,8 +267,8 @@ impl LockFolder {
 const AS_FOLDER: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
 const AS_FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::NONBLOCK).union(OFlags::CLOEXEC).union(OFlags::NOCTTY);
 
-/// Creates a folder in which each user can create files and remove only their own. Succeeds also if another process
-/// creates it first.
+/// Creates the folder `name` in `place`, in which each user can create files and remove only their own. If another
+/// process creates it first, that folder is accepted.
 fn make_folder(place: &OwnedFd, name: &str) -> Result<(), Errno> {
     let draft = format!(".{name}-{:016x}", rand::random::<u64>());
     rustix::fs::mkdirat(place, &draft, Mode::from_raw_mode(0o700))?;
@@ -292,7 +303,8 @@ pub(crate) struct LockFile {
 }
 
 impl LockFile {
-    /// Returns the process that holds the lock and its user, or `None` if the system does not report it.
+    /// Returns the number of the process that holds the lock, and its user, in words; `None` if the system does not
+    /// report them.
     pub(crate) fn holder(&self) -> Option<String> {
         let locks = fs::read_to_string("/proc/locks").ok()?;
         let [device, inode] = self.identity;

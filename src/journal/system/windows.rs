@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use super::OpenToOthers;
 
-/// Creates a folder that only its owner can read, and its missing parents.
+/// Creates a folder that only its owner can read, and its missing parents. An existing folder is accepted unchanged.
 pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     if folder.is_dir() {
         return Ok(());
@@ -22,27 +22,27 @@ pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     }
 }
 
-/// Creates the folder of a run. Its access rights are inherited from the parent folder.
+/// Creates the folder of a run with the access rights of its parent folder. An existing folder is accepted unchanged.
 pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     std::fs::create_dir_all(folder)
 }
 
-/// Returns false: a folder passes on the rights that its creator gave it.
+/// Returns false: on Windows the person who created the parent folder has chosen who can read a run folder.
 pub(crate) fn is_open_to_all(_: &Path) -> bool {
     false
 }
 
-/// Returns `None`: a folder passes on the rights that its creator gave it.
+/// Returns `None`: on Windows the person who created the parent folder has chosen who can change its files.
 pub(crate) fn changeable_by_others(_: &Path) -> io::Result<Option<OpenToOthers>> {
     Ok(None)
 }
 
-/// Creates a file that only its owner can read, and opens it for writing.
+/// Creates a file that only its owner can read, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// Returns how users other than the owner can read a file, or `None` if they cannot.
+/// Returns the users other than the owner who can read a file, and the remedy. Returns `None` if there are none.
 pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let others = regrind_windows::others_who_read(&File::open(path)?)?;
     let own_name = regrind_windows::own_name().unwrap_or_else(|_| "%USERNAME%".into());
@@ -53,12 +53,13 @@ pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>
     Ok((!others.is_empty()).then(open))
 }
 
-/// Syncs the content of a file to the disk, whoever wrote it. Windows requires that the file is open for writing.
+/// Flushes the content of a file to the disk, even if another process wrote it. Windows requires that the file is open
+/// for writing.
 pub(crate) fn sync_file(path: &Path) -> io::Result<()> {
     OpenOptions::new().write(true).open(path)?.sync_all()
 }
 
-/// Does nothing: the file system keeps its own journal of names, and a program cannot sync a folder to the disk.
+/// Does nothing: on Windows the file system keeps a journal of names, and a program cannot flush a folder.
 pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
     Ok(())
 }
@@ -66,7 +67,7 @@ pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
 /// Identity of a file. An open file cannot be deleted or renamed on Windows, so its existence is sufficient.
 pub(crate) type FileIdentity = ();
 
-/// Checks that a file exists at a path.
+/// Returns an error if there is no file at `path`.
 pub(crate) fn identity(path: &Path) -> io::Result<FileIdentity> {
     std::fs::metadata(path).map(drop)
 }
@@ -76,14 +77,14 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     regrind_windows::free_bytes(folder)
 }
 
-/// Returns the parent of the lock folder: `%ProgramData%`, where each user can create files and read those of others.
-/// Returns `None` if it does not exist.
+/// Returns the folder that contains the lock folder: `%ProgramData%`, where each user can create files and read those
+/// of others. Returns `None` if it does not exist.
 pub(crate) fn place_of_locks(_: &str) -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }
 
-/// Returns false: on Windows no control socket is next to a lock, because a named pipe is used, which cannot be
-/// removed.
+/// Returns false: on Windows no control socket is next to a lock file. A named pipe is used instead, which nobody can
+/// remove.
 pub(crate) fn is_own_file(_: &Path) -> bool {
     false
 }
@@ -98,7 +99,10 @@ pub(crate) struct BadFolder {
 }
 
 impl LockFolder {
-    /// Opens the folder, and creates it if it does not exist.
+    /// Opens the lock folder `name` in `place`, or creates it.
+    ///
+    /// # Errors
+    /// A folder that cannot be created.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let folder = place.join(name);
         let made = std::fs::create_dir_all(&folder);
@@ -112,7 +116,10 @@ impl LockFolder {
         }
     }
 
-    /// Opens the lock file of a machine, which every user can lock.
+    /// Opens the lock file `name`, or creates it so that every user can lock it.
+    ///
+    /// # Errors
+    /// The text of the error of the system.
     pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         let path = self.0.join(name);
         let words = |error: io::Error| error.to_string();
@@ -127,17 +134,20 @@ impl LockFolder {
         Ok(LockFile { lock, holder_file, is_spoiled: false })
     }
 
-    /// Opens the lock file of a machine for this user.
+    /// Opens the lock file `name` of this user, or creates it.
+    ///
+    /// # Errors
+    /// The text of the error of the system.
     pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
         self.shared(name)
     }
 
-    /// Returns true: an open file keeps its name on Windows.
+    /// Returns true: on Windows an open file cannot be removed or renamed.
     pub(crate) fn is_still(&self, _: &str, _: &LockFile) -> bool {
         true
     }
 
-    /// Returns the part of a file name that identifies the files of this user.
+    /// Returns the mark of this user in the names of lock files.
     pub(crate) fn own_mark() -> String {
         regrind_windows::own_name().unwrap_or_default().chars().filter(char::is_ascii_alphanumeric).collect()
     }

@@ -55,7 +55,7 @@ const RUN_ENDED: EventKind = EventKind {
 pub(super) const KINDS: [&EventKind; 3] = [&RESULT, &ALARM, &RUN_ENDED];
 
 impl EventKind {
-    /// Returns the node of the type, in the namespace of the cell.
+    /// Returns the node id of this type of event. `own` is the index of the cell's namespace.
     pub(super) fn node(&self, own: u16) -> NodeId {
         NodeId::new(own, self.name)
     }
@@ -68,8 +68,9 @@ pub(super) struct CellEvent {
     fields: Vec<(&'static str, Variant)>,
 }
 
-/// Returns the events between two published states. `on` is the last published state with an active run, so that a run
-/// that was interrupted and continues repeats no event.
+/// Returns the events that lead from the published status `before` to the status `now`. `on` is the last published
+/// status with an active run: an interrupted run that continues is compared with it, and repeats no event. `own` is the
+/// index of the cell's namespace, `cell` the name of the cell.
 pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)
@@ -119,7 +120,8 @@ fn if_known(name: &str) -> Variant {
     if name.is_empty() { Variant::Empty } else { name.into() }
 }
 
-/// Returns the cycles that are new or whose results have changed; for a run not seen before, all its cycles.
+/// Returns the rows of `now`, one per cycle, that are not in the snapshot `earlier` or have changed since. Without
+/// `earlier`, returns all rows.
 fn new_rows<'a>(earlier: Option<&'a Snapshot>, now: &'a Snapshot) -> impl Iterator<Item = &'a CycleRow> {
     let known = move |row: &CycleRow| earlier.is_some_and(|then| then.cycles.contains(row));
     now.cycles.iter().filter(move |row| !known(row))

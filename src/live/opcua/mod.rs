@@ -48,7 +48,8 @@ pub struct UaServer {
 }
 
 impl UaServer {
-    /// Creates a server for the cell of this name. It does not listen yet.
+    /// Creates an OPC UA server for the cell with the name `cell`. It publishes each status that arrives in `told`.
+    /// Does not listen yet.
     ///
     /// # Errors
     /// The address is open to other computers.
@@ -66,7 +67,7 @@ impl UaServer {
         Ok(Self { listen, cell: cell.to_owned(), pki_folder: turn.folder().join("opcua"), status: told, notes })
     }
 
-    /// Serves the state of the cell until its source closes.
+    /// Serves the status of the cell to OPC UA clients until the source of the status closes.
     ///
     /// # Errors
     /// The OPC UA server cannot be built, or ends with an error.
@@ -94,7 +95,8 @@ impl UaServer {
         Ok(())
     }
 
-    /// Waits until the port can be bound; `None` if the source closes before.
+    /// Opens the listener, and retries while the port cannot be bound. Returns `None` if the source of the cell's
+    /// status closes before that.
     async fn listener(&mut self) -> Option<TcpListener> {
         loop {
             match TcpListener::bind(self.listen).await {
@@ -142,7 +144,8 @@ impl UaServer {
     }
 }
 
-/// Writes each new status to the nodes and sends its events to the clients, until the source closes.
+/// Writes each new status from `told` to the nodes, and sends the events that it causes to the clients. Returns when
+/// the source of the status closes.
 async fn show(told: &mut watch::Receiver<CellStatus>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
     let mut before: Option<CellStatus> = None;

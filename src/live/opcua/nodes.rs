@@ -83,7 +83,7 @@ impl CellNodes {
     }
 }
 
-/// Returns the id of the node of the cell itself.
+/// Returns the node id of the object that represents the cell. `own` is the index of the cell's namespace.
 pub(super) fn cell_node(own: u16) -> NodeId {
     NodeId::new(own, "Cell")
 }
@@ -124,7 +124,7 @@ impl InMemoryNodeManagerImpl for CellNodes {
         self.metadata.clone()
     }
 
-    /// Refuses every write, and reports the attempt.
+    /// Refuses every write of a client, and reports the attempt.
     async fn write(
         &self,
         context: &RequestContext,
@@ -165,7 +165,8 @@ impl Tree<'_> {
         NodeId::new(self.namespaces.own, path)
     }
 
-    /// Adds the types of the objects: only their identifiers, not the other content of the companion specification.
+    /// Adds the object types of PackML (OPC 30050). They have their identifiers and names only, without the members
+    /// that the specification defines.
     fn types(&mut self) {
         use packml::*;
         let machine: NodeId = ObjectTypeId::FiniteStateMachineType.into();
@@ -249,7 +250,7 @@ impl Tree<'_> {
             .insert(self.space);
     }
 
-    /// Adds the three state machines, each nested in a state of the one above it.
+    /// Adds the three state machines of PackML below the node `root`. Each is nested in a state of the one above it.
     fn state_machines(&mut self, root: &NodeId) {
         let mut above = root.clone();
         for machine in MACHINES {
@@ -325,7 +326,8 @@ fn kind_of(figure: &Figure) -> DataTypeId {
     }
 }
 
-/// Returns a unit by its code in UNECE Recommendation 20; the unit id is made of the characters of the code.
+/// Returns a unit for OPC UA, by its code in UNECE Recommendation 20. The unit id consists of the bytes of this code.
+/// Unknown units have an empty code.
 fn unit_of(unit: &str) -> EUInformation {
     let (code, name) = match unit {
         "um" => ("4H", "micrometre"),
@@ -343,7 +345,8 @@ fn unit_of(unit: &str) -> EUInformation {
 
 // ---- values -------------------------------------------------------------------------------------------------------------------------
 
-/// Writes the values that have changed to the nodes.
+/// Writes to the nodes all values that differ between the published status `before` and the new status `now`. Without
+/// `before`, writes all values.
 pub(super) fn set(
     shown: &InMemoryNodeManager<CellNodes>,
     subscriptions: &SubscriptionCache,
@@ -393,7 +396,7 @@ fn unknown(then: DateTime) -> DataValue {
     DataValue { status: Some(StatusCode::BadNoData), ..good(Variant::Empty, then) }
 }
 
-/// Returns the state of the cell; `None` if it is unknown.
+/// Returns the PackML state of the cell: Idle without a run, and `None` if the run does not answer.
 fn state(told: &CellStatus) -> Option<StateName> {
     match &told.run_status {
         RunStatus::NoRun => Some(StateName::Idle),
@@ -414,8 +417,9 @@ const MACHINES: [Machine; 3] = [
     Machine { path: "BaseStateMachine/MachineState/ExecuteState", of_type: packml::EXECUTE_STATE_MACHINE_TYPE },
 ];
 
-/// Returns the current state of each machine: name, identifier and number. A machine nested in a state that is not the
-/// current one has none.
+/// Returns the values of the three nested PackML state machines: name, node id and number of the current state of each,
+/// by the path of the node. A state machine that is nested in another state than the current one has no value. `packml`
+/// is the index of the PackML namespace.
 fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>)> {
     let own = state.map(|state| (state.to_string(), identifier(state), Some(state_number(state))));
     let cleared = Some(("Cleared".to_owned(), packml::CLEARED, Some(CLEARED_NUMBER)));
@@ -439,7 +443,7 @@ fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>
     values
 }
 
-/// Returns the identifier of a state in the namespace of PackML.
+/// Returns the identifier of a state's node in the OPC UA namespace of PackML (OPC 30050).
 fn identifier(state: StateName) -> u32 {
     match state {
         StateName::Idle => 28,

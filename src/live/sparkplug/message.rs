@@ -11,8 +11,8 @@ use crate::figures::{Figure, FigureKind, FigureValue};
 /// Values of the figures, in their order.
 pub(super) type Values = Vec<Option<FigureValue>>;
 
-/// Encodes a birth: all figures with kinds and units. Its sequence number is 0. `connection` is the number of the
-/// connection (bdSeq).
+/// Encodes a birth certificate (NBIRTH): the current values of all figures, with their types and units. Its sequence
+/// number is 0. `connection` is the number of the connection (bdSeq).
 pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
     let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
     let mut metrics = vec![number_of(connection), rebirth];
@@ -22,7 +22,8 @@ pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<
     encoded(metrics, Some(0))
 }
 
-/// Encodes the figures whose values differ from the published ones; `None` if all are the same.
+/// Encodes a data message (NDATA) with the figures whose new `values` differ from the published values `told`. Returns
+/// `None` if no value differs.
 pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequence: u8) -> Option<Vec<u8>> {
     let all = figures.iter().zip(values).zip(told);
     let changed: Vec<_> =
@@ -30,12 +31,14 @@ pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequen
     (!changed.is_empty()).then(|| encoded(changed, Some(sequence)))
 }
 
-/// Encodes a death: the values published by this connection are no longer valid.
+/// Encodes a death certificate (NDEATH) of the connection with this number (bdSeq). It tells hosts that the published
+/// values are no longer valid.
 pub(super) fn death(connection: u8) -> Vec<u8> {
     encoded(vec![number_of(connection)], None)
 }
 
-/// Decodes a command of a host. Returns true if it requests a rebirth, and the texts of all other requests.
+/// Decodes a command of a host application. The flag is true if the command requests a rebirth. The list describes each
+/// other request in it.
 pub(super) fn read_requests(payload: &[u8]) -> (bool, Vec<String>) {
     let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
         return (false, vec!["a message that is not a Sparkplug B command".into()]);
@@ -62,7 +65,7 @@ fn in_words(metric: &Metric) -> String {
         Some(Value::DoubleValue(value)) => format!("{name} = {value}"),
         Some(Value::BooleanValue(value)) => format!("{name} = {value}"),
         Some(Value::StringValue(value)) => format!("{name} = {value:?}"),
-        Some(_) => format!("{name} = a value that is no number and no text"),
+        Some(_) => format!("{name} = a value that is neither a number nor a text"),
         None => format!("{name} = nothing"),
     }
 }
@@ -95,7 +98,8 @@ fn plain(name: &str, kind: DataType) -> Metric {
     metric
 }
 
-/// Returns the properties of the metric of a figure: `readOnly`, `documentation` and, if it has a unit, `engUnit`.
+/// Returns the properties of a figure for its Sparkplug metric: `readOnly`, `documentation` and, if it has a unit,
+/// `engUnit`.
 fn properties(figure: &Figure) -> PropertySet {
     let text = |text: &str| {
         let value = Some(property_value::Value::StringValue(text.to_owned()));

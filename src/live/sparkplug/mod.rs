@@ -80,7 +80,8 @@ enum SessionEnd {
 }
 
 impl Node {
-    /// Creates a node for the cell of this name. It does not connect yet.
+    /// Creates a Sparkplug node for the cell with the name `cell`. It publishes each status that arrives in `told`.
+    /// Does not connect yet.
     ///
     /// # Errors
     /// A name is not valid in a topic, a password or a certificate cannot be read, or the broker is on another computer
@@ -105,7 +106,8 @@ impl Node {
         })
     }
 
-    /// Publishes the state of the cell until its source closes, whether or not the broker can be reached.
+    /// Publishes the status of the cell until the source of the status closes. Connects again whenever the connection
+    /// to the broker is lost.
     ///
     /// # Errors
     /// The number of the connection (bdSeq) cannot be written to its file.
@@ -133,7 +135,8 @@ impl Node {
         }
     }
 
-    /// Runs one connection, from its beginning to its end.
+    /// Connects to the broker, and publishes until the connection is lost or the source of the status closes.
+    /// `connection` is the number of the connection (bdSeq). Returns why it ended.
     async fn session(&mut self, connection: u8) -> SessionEnd {
         let options = self.broker.with_last_will(&self.topics.death, message::death(connection));
         let (client, mut broker) = AsyncClient::new(options, WAITING);
@@ -169,7 +172,7 @@ impl Node {
     }
 }
 
-/// Forwards the events of the broker until there are no more.
+/// Receives the events of the MQTT client `broker` and sends them to `to`, until the connection ends.
 async fn poll(mut broker: EventLoop, to: mpsc::Sender<Result<Event, ConnectionError>>) {
     loop {
         let event = broker.poll().await;
@@ -197,7 +200,10 @@ struct Session<'a> {
 }
 
 impl Session<'_> {
-    /// Handles an event of the broker.
+    /// Handles an event of the MQTT connection; `None` means that the connection is closed.
+    ///
+    /// # Errors
+    /// The connection is lost.
     fn handle_event(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), SessionEnd> {
         self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
         let stood = self.stood;
@@ -231,7 +237,7 @@ impl Session<'_> {
         }
     }
 
-    /// Publishes a birth with all values.
+    /// Publishes a birth certificate (NBIRTH), which contains all values.
     fn birth(&mut self) {
         let values = current(&mut self.node.status);
         let birth = message::birth(FIGURES, &values, self.connection);
@@ -243,7 +249,7 @@ impl Session<'_> {
         (self.values, self.sequence, self.due, self.began) = (Some(values), 0, None, Instant::now());
     }
 
-    /// Publishes the values that have changed.
+    /// Publishes the values that differ from the last published ones.
     fn publish_changes(&mut self) -> Result<(), SessionEnd> {
         let Some(told) = &self.values else { return Ok(()) };
         let values = current(&mut self.node.status);
@@ -257,7 +263,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Publishes the deferred birth, or the changed values if the birth was published before.
+    /// Publishes what was postponed: the birth certificate if it is due, otherwise the changed values.
     fn catch_up(&mut self) -> Result<(), SessionEnd> {
         self.due = None;
         match self.values {
@@ -267,7 +273,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Handles a command of a host. A host may request a birth; every other request is refused and reported.
+    /// Handles a command of a host application. Publishes a new birth certificate if the command requests a rebirth,
+    /// but not too often. Refuses and reports every other request.
     fn handle_command(&mut self, publish: &Publish) {
         let by = format!("somebody at the broker {}", self.node.broker.place);
         let (wants_birth, others) = message::read_requests(&publish.payload);
@@ -286,7 +293,8 @@ impl Session<'_> {
         }
     }
 
-    /// Publishes the death and disconnects.
+    /// Publishes the death certificate (NDEATH) and disconnects. If this takes too long, the broker publishes the
+    /// certificate.
     async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> SessionEnd {
         let said = async {
             let death = message::death(self.connection);
@@ -307,7 +315,7 @@ fn current(told: &mut watch::Receiver<CellStatus>) -> Values {
     FIGURES.iter().map(|figure| figure.value(&told)).collect()
 }
 
-/// Returns the message of an error of the client, with its causes.
+/// Returns the message of an error of the MQTT client, followed by the messages of its causes.
 fn in_words(error: &ConnectionError) -> String {
     let mut words = error.to_string();
     let mut behind = std::error::Error::source(error);

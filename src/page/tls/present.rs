@@ -26,12 +26,12 @@ pub struct Tls {
 }
 
 impl Tls {
-    /// Reads a certificate (followed by those of its issuers) and its private key, both in PEM. TLS 1.3 only, which all
-    /// browsers have supported since 2018.
+    /// Reads the file of a certificate, followed by those of its issuers, and the file of its private key, both in PEM.
+    /// Connections then use TLS 1.3 only, which all browsers have supported since 2018.
     ///
     /// # Errors
-    /// Fails if a file cannot be read or contains no certificate or key, if others can read the key, or if the
-    /// certificate and the key do not match.
+    /// A file that cannot be read, or has no certificate or key; a key that other users of the computer can read; a
+    /// certificate and a key that do not match.
     pub fn read(certificate: &Path, key: &Path) -> Result<Self, TlsError> {
         let unread = |what: String| TlsError::Certificate { path: certificate.to_owned(), what };
         let chain = CertificateDer::pem_file_iter(certificate).and_then(Iterator::collect);
@@ -48,7 +48,8 @@ impl Tls {
         Ok(Self { acceptor: TlsAcceptor::from(Arc::new(config)), certificate: first })
     }
 
-    /// Returns true if the certificate is valid for a name or an address. A browser refuses the page under any other.
+    /// Returns true if the certificate is valid for `host`, a name or an address. A browser shows no page under a host
+    /// for which it is not valid.
     pub(crate) fn is_for(&self, host: &str) -> bool {
         let host = host.trim_start_matches('[').trim_end_matches(']');
         let (Ok(name), Ok(certificate)) = (ServerName::try_from(host), EndEntityCert::try_from(&self.certificate))
@@ -58,7 +59,7 @@ impl Tls {
         certificate.verify_is_valid_for_subject_name(&name).is_ok()
     }
 
-    /// Returns the first name of the certificate without a wildcard.
+    /// Returns the first host name in the certificate that has no wildcard (`*`); `None` if there is none.
     pub(crate) fn name(&self) -> Option<String> {
         let certificate = EndEntityCert::try_from(&self.certificate).ok()?;
         certificate.valid_dns_names().find(|name| !name.contains('*')).map(str::to_owned)

@@ -25,7 +25,8 @@ pub(super) struct Count {
     pub(super) at_once: i64,
 }
 
-/// Draws the bars.
+/// Draws a bar for each day, with the numbers of parts that were accepted at the first measurement, accepted later, and
+/// not accepted.
 pub(super) fn bars(days: &[Day]) -> Markup {
     let most = days.iter().map(|day| day.count.ended).max().unwrap_or(0).max(1);
     let step = (super::control_chart::round_step(most as f64 / 4.0) as i64).max(1);

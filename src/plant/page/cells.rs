@@ -65,7 +65,8 @@ impl DisplayState {
         }
     }
 
-    /// Returns the SVG path of a symbol that shows the state in addition to the colour.
+    /// Returns the SVG path of the symbol for this state. Symbols differ in shape, so that the state can be seen
+    /// without colours.
     fn shape(self) -> &'static str {
         match self {
             Self::Runs => "M6 3 L21 12 L6 21 Z",
@@ -77,7 +78,7 @@ impl DisplayState {
     }
 }
 
-/// Reads the states of the cells, those that need attention first.
+/// Reads the reported states of all cells. Cells that need attention come first.
 pub(super) async fn read(link: &DatabaseLink) -> Result<Vec<CellSummary>, PlantError> {
     let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
             coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
@@ -134,7 +135,7 @@ impl CellSummary {
     }
 }
 
-/// Returns the number of cells in each state, in words.
+/// Returns a text with the number of cells in each state. States without a cell are omitted.
 pub(super) fn tally(cells: &[CellSummary]) -> String {
     let of = |look: DisplayState| (cells.iter().filter(|cell| cell.display_state() == look).count(), look);
     let told = DisplayState::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
@@ -162,7 +163,7 @@ fn card(cell: &CellSummary) -> Markup {
             }
             @if look == DisplayState::Silent {
                 p .state { strong { (cell.heard()) } }
-                p { "What it does now is not known." @if !cell.words.is_empty() { " Then it said: " (shown(&cell.words)) } }
+                p { "Its present state is unknown." @if !cell.words.is_empty() { " Last report: " (shown(&cell.words)) } }
                 (of_part(cell))
             } @else {
                 p .state { strong { (shown(if cell.words.is_empty() { &cell.state } else { &cell.words })) } }

@@ -63,17 +63,18 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
             @if cells.is_empty() { p { "No cell has made such a part." } } @else { div .wide { (table(&cells, &chances, &selection)) } }
             @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { "Further cells" } } }
             p .quiet {
-                "Whether a cell differs: its PV against those of all other cells that are shown, by the rank sum of Mann and Whitney (two-sided, " (ENOUGH) " parts at least \
-                 on either side), corrected for the number of cells (Holm); below " (format!("{:.0} %", 100.0 * CHANCE)) " a difference is reported as more than chance. \
-                 The test assumes independent parts: a drift within a cell looks like a difference too. The box holds the middle half, its line is the median, \
-                 the whiskers reach to the least and the largest."
+                "The last column compares the PV of a cell with those of all other cells that are shown: rank-sum test of Mann and Whitney (two-sided, at \
+                 least " (ENOUGH) " parts in each group), p-value corrected for the number of cells (Holm-Bonferroni). A p-value below "
+                (format!("{:.0} %", 100.0 * CHANCE)) " is reported as more than chance. The test assumes independent parts: a drift within a cell looks like a \
+                 difference too. The box shows the middle half of the values, its line the median; the whiskers reach from the minimum to the maximum."
             }
         }
     };
     Ok(PageContent { title: "Cells".into(), again_s: None, main })
 }
 
-/// Reads the newest parts of each cell. Skips the first `after` cells, and reads one cell more than the page shows.
+/// Reads the newest parts of each cell that match the selection, in the order of the cell names. Skips the first
+/// `after` cells. Returns up to one cell more than a page shows, so that the caller knows whether there is a next page.
 async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
     let (condition, values) = selection.condition();
     let n = values.len();
@@ -109,8 +110,9 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
     Ok(cells)
 }
 
-/// Returns for each cell the probability that it differs so much from the others by chance, corrected for the number of
-/// cells.
+/// Returns the p-value of each cell: the probability of a difference at least this large from all other cells, if all
+/// cells are equal. The p-values are of the [`rank_sum`] test, with the correction [`holm`] for the number of cells.
+/// `None` for a cell with too few parts.
 fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     let others = |k: usize| -> Vec<f64> {
         cells
@@ -170,7 +172,7 @@ fn probability(p: f64) -> String {
     if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
 }
 
-/// Draws the box plot of sorted values, on a scale common to all cells.
+/// Draws the box plot of sorted values in µm. The axis goes from `from` to `to` and is the same for all cells.
 fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
     let [Some(least), Some(low), Some(median), Some(high), Some(largest)] =
         [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| quantile(sorted, share))

@@ -46,7 +46,8 @@ pub(super) struct Limits {
 }
 
 impl Limits {
-    /// Computes the limits; `None` for fewer than two values.
+    /// Computes the control limits of individual values and of their moving ranges. Returns `None` for fewer than two
+    /// values.
     pub(super) fn from_values(values: &[f64]) -> Option<Self> {
         let ranges = ranges(values);
         if ranges.is_empty() {
@@ -63,13 +64,13 @@ impl Limits {
         })
     }
 
-    /// Returns true if a value is out of control.
+    /// Returns true if a value is above the upper or below the lower control limit.
     pub(super) fn is_out(&self, value: f64) -> bool {
         value > self.upper || self.lower.is_some_and(|lower| value < lower)
     }
 }
 
-/// Returns the moving ranges, one fewer than the values.
+/// Returns the moving ranges: the absolute differences of consecutive values. They are one fewer than the values.
 pub(super) fn ranges(values: &[f64]) -> Vec<f64> {
     values.windows(2).map(|pair| (pair[1] - pair[0]).abs()).collect()
 }
@@ -81,7 +82,8 @@ struct Across {
     at: f64,
 }
 
-/// Draws the values with their control limits, and the tolerance of each part as a stepped line.
+/// Draws the control chart of individual values in µm: the values, their mean and control limits, and the tolerance of
+/// each part. `name` is that of the figure, and `class` the CSS class of the chart.
 pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let mut lines = vec![
@@ -101,7 +103,8 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
     drawn(&format!("{name}, µm"), class, values, &all, &lines, &scale, |value| limits.is_out(value), &steps)
 }
 
-/// Draws the moving ranges with their limit.
+/// Draws the control chart of the moving ranges in µm, with their mean and upper limit. `name` is that of the figure,
+/// and `class` the CSS class of the chart.
 pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let all = ranges(&all);
@@ -115,7 +118,8 @@ pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &
     drawn(&format!("Moving range of {name}, µm"), class, &values[1..], &all, &lines, &scale, is_out, &[])
 }
 
-/// Returns the tolerance of each part as the points of a stepped line.
+/// Returns the tolerance of each part as stepped lines, each in the notation of SVG points. A part without a tolerance
+/// interrupts the line.
 fn tolerance_line(values: &[Value], scale: &Scale) -> Vec<String> {
     let half = 0.5 * (scale.x(1) - scale.x(0));
     let mut parts: Vec<String> = vec![String::new()];
@@ -184,13 +188,15 @@ fn drawn(
     }
 }
 
-/// Returns the tooltip of a point.
+/// Returns the tooltip of a point of a chart: serial number, cell, time and value. `is_out` is true for a value outside
+/// the control limits.
 fn tooltip(value: &Value, um: f64, is_out: bool) -> Markup {
     let out = if is_out { ", OUT OF LIMITS" } else { "" };
     html! { title { (shown(&value.serial)) ", " (shown(&value.cell)) ", " (value.when) ": " (format!("{um:.3}")) " µm" (out) } }
 }
 
-/// Moves overlapping labels apart, the lowest first.
+/// Moves labels upwards until they do not overlap. `at` are their y coordinates in the drawing, from the top. The
+/// lowest label keeps its position.
 fn apart(mut at: Vec<f64>) -> Vec<f64> {
     let mut order: Vec<usize> = (0..at.len()).collect();
     order.sort_by(|a, b| at[*b].total_cmp(&at[*a]));
@@ -218,7 +224,7 @@ impl Scale {
         self.height - BOTTOM - share * (self.height - TOP - BOTTOM - 8.0)
     }
 
-    /// Returns the ticks: about four round values.
+    /// Returns the values of the ticks on the y axis: about four round numbers, from 0.
     fn ticks(&self) -> Vec<f64> {
         let step = round_step(self.max / 4.0);
         // Rounds, so that a tick is 0.6 and not 0.6000000000000001.
@@ -227,7 +233,7 @@ impl Scale {
         (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.max).map(round).collect()
     }
 
-    /// Returns the indices of the values whose day is written on the axis.
+    /// Returns the indices of the values whose dates are written on the x axis: at most six, evenly spaced.
     fn marked(&self) -> Vec<usize> {
         let most = 6.min(self.count);
         let mut marked: Vec<usize> = (0..most).map(|k| k * (self.count - 1) / (most - 1).max(1)).collect();
@@ -236,7 +242,8 @@ impl Scale {
     }
 }
 
-/// Returns the smallest of 1, 2 and 5 times a power of ten that is not below `least`.
+/// Returns the smallest number of the form 1, 2 or 5 times a power of ten that is at least `least`. Returns 1 if
+/// `least` is not a finite number above 0.
 pub(super) fn round_step(least: f64) -> f64 {
     if !(least > 0.0 && least.is_finite()) {
         return 1.0;

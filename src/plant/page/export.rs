@@ -104,8 +104,8 @@ fn line(file: &mut String, row: &Row) {
     file.push_str("\r\n");
 }
 
-/// Quotes a text as a CSV field (RFC 4180). A text that a spreadsheet would read as a formula gets an apostrophe in
-/// front, which makes it a text.
+/// Quotes a text as a field of a CSV file (RFC 4180). Puts an apostrophe before a text that a spreadsheet would execute
+/// as a formula.
 fn quoted(text: &str) -> String {
     let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r']);
     format!("\"{}{}\"", if formula { "'" } else { "" }, text.replace('"', "\"\""))

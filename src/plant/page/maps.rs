@@ -108,7 +108,8 @@ async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<
     })
 }
 
-/// Returns the entry of a run that has no map, for display next to runs that have one.
+/// Returns the entry for a run without an error map, so that the page can show it next to runs with a map. Returns an
+/// error if the plant does not have the run.
 async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;
@@ -128,7 +129,8 @@ async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageErro
     })
 }
 
-/// Reads a map from the files of a run. The inner `Err` is a text why there is no map.
+/// Reads the error map `name` from the files of a run, as `[x, y, error]` with x and y in mm and the error in µm. The
+/// inner `Err` is a text for people about why the map is missing; the outer one means that the plant did not answer.
 async fn samples(
     plant: &Shared,
     link: &DatabaseLink,
@@ -153,7 +155,8 @@ async fn samples(
     Ok(parsed.await.unwrap_or_else(|_| Err("it could not be read".into())))
 }
 
-/// Draws the maps on one scale, from minus to plus the largest absolute error of all maps.
+/// Draws error maps next to each other with one colour scale. The scale goes from minus to plus the largest absolute
+/// value of all maps.
 fn side_by_side(maps: &[Map]) -> Markup {
     let all = maps.iter().filter_map(|map| map.samples.as_ref().ok()).flatten();
     let limit = all.fold(0.0_f64, |most, sample| most.max(sample[2].abs()));

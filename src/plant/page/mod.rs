@@ -83,7 +83,7 @@ impl PlantPage {
             .with_state(Arc::new(self))
     }
 
-    /// Takes a connection from the pool for a few queries.
+    /// Takes a database connection for a few queries. It returns to the pool when the lease is dropped.
     async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         self.pool.lease().await
     }
@@ -117,7 +117,7 @@ impl From<PlantError> for PageError {
     }
 }
 
-/// Answers with a page, within the time limit.
+/// Returns the page whose content `making` computes. If it fails or takes too long, returns a page with the reason.
 async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
     match within(making).await {
         Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
@@ -125,7 +125,7 @@ async fn page(session: &Session, making: impl Future<Output = Result<PageContent
     }
 }
 
-/// Runs a future within the time limit.
+/// Returns the result of `making`, or an error if it is not there within the time limit of the page.
 async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result<T, PageError> {
     let late = || {
         let what = format!("no answer within {} s", PATIENCE.as_secs());
@@ -134,7 +134,8 @@ async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
-/// Renders the reason why there is no page. If the reason can pass, the browser retries.
+/// Returns a page with the reason why the requested page cannot be shown. If the plant cannot be reached, the browser
+/// requests the page again after a while.
 fn unmade(session: &Session, why: &PageError) -> Response {
     let (status, again_s, title, words) = match why {
         PageError::Plant(error) if error.may_pass() => (

@@ -61,8 +61,9 @@ async fn made(plant: &Shared, asked: &PartsQuery) -> Result<PageContent, PageErr
 
 const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";
 
-/// Reads one row more than a page shows, in the order of an index. The database sorts nothing, however many serial
-/// numbers match.
+/// Reads runs of parts whose serial number begins with `serial`. Begins after the run with the id `after`. Returns up
+/// to one row more than a page shows, so that the caller knows whether there is a next page. The rows come in the order
+/// of an index, so that the database need not sort them.
 async fn read(link: &DatabaseLink, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
     let most = MAX_ROWS as i64 + 1;
     let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);

@@ -37,7 +37,8 @@ impl Pool {
         Self { database, places: Semaphore::new(LINKS), idle: Mutex::default() }
     }
 
-    /// Takes a connection that answers: one from the pool, or a new one.
+    /// Takes a working connection from the pool, or opens a new one if the pool is empty. Returns an error if all
+    /// connections stay in use for too long.
     pub(super) async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         let busy = || PlantError::Unreachable {
             place: "the other end".into(),

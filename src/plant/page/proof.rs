@@ -54,7 +54,8 @@ impl Default for Proofs {
 }
 
 impl Proofs {
-    /// Returns the recent proof of a run for this head hash; `None` if there is no such proof.
+    /// Returns the stored result of a recent verification of the run `id`; `None` if there is none. `head` is the hash
+    /// of the last record: a result for another hash does not count.
     pub(super) fn known(&self, id: i32, head: &str) -> Option<Arc<Proof>> {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.retain(|_, (since, ..)| since.elapsed() < LASTS);
@@ -71,7 +72,8 @@ impl Proofs {
     }
 }
 
-/// Verifies the plant's copy of a run, or returns the recent proof from the cache.
+/// Verifies the plant's copy of a run, or returns a recent result from the cache. `id` is the id of the run, `head` the
+/// hash of its last record.
 ///
 /// # Errors
 /// The plant cannot be reached, or has no such run. Faults of the copy are in the proof, not an error.
@@ -134,7 +136,8 @@ impl Proof {
     }
 }
 
-/// Replaces the path of the temporary folder in a message by "the copy": a reader cannot open that folder.
+/// Replaces the path of the temporary folder in a message by "the copy", because a reader of the page cannot open this
+/// folder.
 fn without(folder: &Path, words: &str) -> String {
     words.replace(&folder.display().to_string(), "the copy")
 }
@@ -143,7 +146,7 @@ fn now() -> String {
     Timestamp::now().strftime("%Y-%m-%d %H:%M:%S").to_string()
 }
 
-/// Returns a random word. Nobody can guess it, so a folder of that name belongs to this program only.
+/// Returns a random name for a folder. Nobody can guess it, so no other program can have created this folder.
 fn random_word() -> Result<String, PlantError> {
     let mut bytes = [0; 16];
     let failed = |error: getrandom::Error| FormatError::Unwritable {

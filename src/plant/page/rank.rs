@@ -7,8 +7,9 @@
 /// Minimum number of figures on each side; the normal approximation needs them.
 pub(super) const ENOUGH: usize = 8;
 
-/// Returns the two-sided probability of a rank sum at least this extreme if both samples come from one process, with
-/// the corrections for ties and for continuity. `None` if there are too few figures, or if all are equal.
+/// Returns the two-sided p-value of the Wilcoxon rank-sum test (Mann-Whitney U) for two samples, by the normal
+/// approximation with corrections for ties and for continuity. Returns `None` if a sample has fewer than [`ENOUGH`]
+/// values, or if all values are equal.
 pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     if one.len() < ENOUGH || other.len() < ENOUGH {
         return None;
@@ -37,7 +38,8 @@ pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     Some(erfc(z / std::f64::consts::SQRT_2).min(1.0))
 }
 
-/// Corrects the probabilities for the number of tests (Holm).
+/// Corrects p-values for the number of tests by the Holm-Bonferroni method. The order stays; a missing p-value stays
+/// `None` and does not count as a test.
 pub(super) fn holm(found: &[Option<f64>]) -> Vec<Option<f64>> {
     let mut order: Vec<usize> = (0..found.len()).filter(|k| found[*k].is_some()).collect();
     order.sort_by(|a, b| found[*a].partial_cmp(&found[*b]).unwrap_or(std::cmp::Ordering::Equal));

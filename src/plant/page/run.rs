@@ -46,7 +46,7 @@ impl Run {
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
 
-    /// Returns a text of the row by the index of its column.
+    /// Returns the text in column `k` of the row; empty if the column has no value.
     fn text(&self, k: usize) -> &str {
         self.row.get::<_, Option<&str>>(k).unwrap_or_default()
     }
@@ -151,7 +151,7 @@ fn about(run: &Run) -> Markup {
     }
 }
 
-/// Describes the proof in words.
+/// Describes the result of a verification in words. `None` means that the verification has not ended yet.
 fn proof_text(proof: Option<&Proof>) -> Markup {
     let Some(proof) = proof else {
         return html! { p role="status" { "The copy is being fetched and verified; this page then shows the result by itself." } };
@@ -217,7 +217,7 @@ async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
     })
 }
 
-/// Returns the cycles that have an error map.
+/// Returns the numbers of the cycles of run `id` that have an error map.
 async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     let rows = link
         .query("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
@@ -225,7 +225,8 @@ async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }
 
-/// Returns a run and its proof. Waits until the proof is made.
+/// Returns the run whose id is `id`, with the result of the verification of the plant's copy. Waits for the
+/// verification if there is no recent result.
 async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), PageError> {
     let run = {
         let link = plant.lease().await?;
@@ -290,13 +291,14 @@ async fn results(
     }
 }
 
-/// Returns a file for download. Its name consists of letters and digits only.
+/// Returns a response that the browser saves as the file `name`, which must consist of letters, digits and dots only.
+/// `kind` is the media type of `content`.
 pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response {
     ([(CONTENT_TYPE, kind.to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))], content)
         .into_response()
 }
 
-/// Returns the response (status 422) for a document that cannot be made from the plant's copy, with the reason.
+/// Returns a page with status 422 and the reason `why` a document cannot be created from the plant's copy.
 fn not_made(session: &Session, why: &str) -> Response {
     let mut response = unmade(session, &PageError::NotHere(why.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;

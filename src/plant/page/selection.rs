@@ -57,8 +57,8 @@ pub(super) struct Selection {
 }
 
 impl Selection {
-    /// Builds the selection from an address. Defaults: real parts if there are any, the recipe of the newest part, and
-    /// the last days.
+    /// Builds the selection of parts from the query of an address. Defaults: real parts if there are any, the recipe of
+    /// the newest part, and the last [`DAYS`] days.
     pub(super) async fn from_query(link: &DatabaseLink, asked: &SelectionQuery) -> Result<Self, PageError> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
@@ -74,7 +74,7 @@ impl Selection {
         Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
     }
 
-    /// Returns the condition on the columns of a view, and its values, from `$1` on.
+    /// Returns the SQL condition of the selection, and the values of its parameters, which begin with `$1`.
     pub(super) fn condition(&self) -> (String, Vec<String>) {
         let end = self.until.checked_add(1.day()).unwrap_or(Date::MAX);
         let mut values = vec![format!("{} 00:00Z", self.since), format!("{end} 00:00Z")];
@@ -87,13 +87,13 @@ impl Selection {
         (text, values)
     }
 
-    /// Returns the recipe; empty means any.
+    /// Returns the name of the selected recipe. An empty name selects all recipes.
     pub(super) fn recipe(&self) -> &str {
         &self.names[0]
     }
 
-    /// Returns the query of an address for this selection. It states both days and all filters, so it still selects the
-    /// same parts when the defaults change.
+    /// Returns the query part of an address for this selection. It states all filters and both dates. So the same parts
+    /// are selected later, when the defaults have changed.
     pub(super) fn query(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|((kind, _), name)| *kind == "recipe" || !name.is_empty());
         let mut query: Vec<String> = named.map(|((kind, _), name)| format!("{kind}={}", encoded(name))).collect();
@@ -112,7 +112,8 @@ impl Selection {
         format!("{named}, begun {} to {}", self.since, self.until)
     }
 
-    /// Renders the form that sets the selection.
+    /// Renders the form in which a person changes the selection. `action` is the address of the page, and `kinds` are
+    /// the filters that it shows.
     pub(super) async fn form(&self, link: &DatabaseLink, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
         let rows = link.query("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
@@ -154,7 +155,8 @@ impl Selection {
 /// Keys of all filters that a form can have.
 pub(super) const ALL_KINDS: [&str; 6] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0, KINDS[4].0, KINDS[5].0];
 
-/// Returns true if the selection is of simulated parts: as requested, or by default if no real part exists.
+/// Returns true if simulated parts are selected. `asked` is `real` or `simulated`. For any other text, returns true if
+/// the plant has no real part.
 pub(super) async fn is_simulated(link: &DatabaseLink, asked: &str) -> Result<bool, PlantError> {
     match asked {
         "real" => Ok(false),
@@ -173,7 +175,7 @@ async fn newest_recipe(link: &DatabaseLink, simulated: bool) -> Result<String, P
     Ok(rows.first().map_or_else(String::new, |row| row.get(0)))
 }
 
-/// Renders the mark of simulated parts.
+/// Renders the mark SIMULATION for simulated parts, and nothing for real parts.
 pub(super) fn mark(simulated: bool) -> Markup {
     html! { @if simulated { span .simulation { "SIMULATION" } } }
 }
@@ -182,7 +184,8 @@ pub(super) fn today() -> Date {
     Timestamp::now().to_zoned(TimeZone::UTC).date()
 }
 
-/// Parses a day that a person wrote; `None` for an empty text.
+/// Parses a date that a person wrote, such as 2026-07-04. Returns `None` for an empty text, and an error for an invalid
+/// date.
 fn day(text: &str) -> Result<Option<Date>, PageError> {
     let text = text.trim();
     if text.is_empty() {
@@ -190,7 +193,7 @@ fn day(text: &str) -> Result<Option<Date>, PageError> {
     }
     // Accepts only days that the database can represent.
     let found = text.parse::<Date>().ok().filter(|day| (1970..=9000).contains(&day.year()));
-    let bad = || PageError::Nonsense(format!("{text:?} is no day; write it as 2026-07-04"));
+    let bad = || PageError::Nonsense(format!("{text:?} is not a date; write it as 2026-07-04"));
     found.map(Some).ok_or_else(bad)
 }
 

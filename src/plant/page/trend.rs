@@ -54,7 +54,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
     Ok(PageContent { title: "Trend".into(), again_s: None, main })
 }
 
-/// Reads the newest parts of a selection, in order from the oldest to the newest.
+/// Reads the newest parts of a selection, at most `most`, and returns them from the oldest to the newest.
 pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
     // The two views have different names for the id of the run.

@@ -4,13 +4,13 @@ use std::fmt::Write;
 
 use regrind_document::visible;
 
-/// Returns a text from a cell or a person, with characters that reorder or hide letters replaced by their number. Maud
-/// escapes the rest.
+/// Returns a text from a cell or a person for display. Characters that reorder or hide letters are replaced by their
+/// code numbers. The template engine Maud escapes HTML.
 pub(super) fn shown(text: &str) -> String {
     visible(text)
 }
 
-/// Encodes a value for an address.
+/// Percent-encodes a value for the query of an address.
 pub(super) fn encoded(text: &str) -> String {
     text.bytes().fold(String::new(), |mut out, byte| {
         match byte {
@@ -21,7 +21,7 @@ pub(super) fn encoded(text: &str) -> String {
     })
 }
 
-/// Formats how long ago something was, rounded as a reader needs it.
+/// Formats a duration in seconds, rounded, in s, min, h or days, whichever suits its length.
 pub(super) fn ago(seconds: f64) -> String {
     match seconds {
         s if s < 90.0 => format!("{:.0} s", s.max(0.0)),
@@ -31,7 +31,7 @@ pub(super) fn ago(seconds: f64) -> String {
     }
 }
 
-/// Formats a range of seconds.
+/// Formats the range from `least` to `most` seconds, in s, min or h. Gives one number if both are equal after rounding.
 pub(super) fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -48,7 +48,7 @@ pub(super) fn um(value: Option<f64>, digits: usize) -> String {
     value.filter(|value| value.is_finite()).map_or("–".to_owned(), |value| format!("{value:.digits$}"))
 }
 
-/// Formats a share as a percentage; a dash if the total is zero.
+/// Formats `of` as a percentage of `all`; a dash if `all` is 0.
 pub(super) fn share(of: i64, all: i64) -> String {
     if all <= 0 {
         return "–".to_owned();
@@ -56,7 +56,7 @@ pub(super) fn share(of: i64, all: i64) -> String {
     format!("{:.0} %", 100.0 * of as f64 / all as f64)
 }
 
-/// Formats the 95 % Wilson score interval of a share.
+/// Formats the 95 % Wilson score interval of the proportion `of` / `all`, in per cent; empty if `all` is 0.
 pub(super) fn interval(of: i64, all: i64) -> String {
     if all <= 0 {
         return String::new();
@@ -65,7 +65,7 @@ pub(super) fn interval(of: i64, all: i64) -> String {
     format!("{:.0} – {:.0} %", 100.0 * low, 100.0 * high)
 }
 
-/// Computes the 95 % Wilson score interval of a share (E. B. Wilson, JASA 22, 1927).
+/// Computes the 95 % Wilson score interval of the proportion `of` / `all`, from 0 to 1 (E. B. Wilson, JASA 22, 1927).
 fn wilson(of: f64, all: f64) -> [f64; 2] {
     const Z: f64 = 1.959_964;
     let (p, z2) = (of / all, Z * Z);

@@ -290,7 +290,7 @@ fn broker_certificate_is_verified() {
     refused("plant.example is another computer, and no certificates to authenticate it are given");
     plant("broker = \"localhost\"\ncertificates = \"its.pem\"\n");
     readable(0o644);
-    refused("other users of this computer may read the password");
+    refused("other users of this computer can read the password");
     readable(0o600);
 
     plant("broker = \"localhost\"\ncertificates = \"foreign.pem\"\n");

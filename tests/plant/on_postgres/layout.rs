@@ -55,7 +55,7 @@ fn connection_errors_name_remedy() {
     std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o644))
         .unwrap();
     let (_, told) = plant.ends(&ship, 2);
-    assert!(told.contains("other users of this computer may read the password"), "{told}");
+    assert!(told.contains("other users of this computer can read the password"), "{told}");
     std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o600))
         .unwrap();
     plant.does(&ship);

@@ -193,7 +193,7 @@ fn overview_shows_cells_and_yield() {
         "{said}"
     );
     assert!(
-        said.contains("cell-2 not heard of for 3 h What it does now is not known. Then it said: grinding SN-0043"),
+        said.contains("cell-2 not heard of for 3 h Its present state is unknown. Last report: grinding SN-0043"),
         "{said}"
     );
     assert!(said.contains("cell-3 never heard of"), "{said}");

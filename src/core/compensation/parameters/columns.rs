@@ -37,26 +37,27 @@ pub struct Extent {
 }
 
 impl Extent {
-    /// Returns the extent of some places.
+    /// Returns the extent (bounding box) of the places `[x, y]`.
     pub fn from_places(places_mm: impl Iterator<Item = [f64; 2]>) -> Self {
         let [low, high] = bounds(places_mm);
         let of = |sign: f64| std::array::from_fn(|k| 0.5 * (high[k] + sign * low[k]));
         Self { middle_mm: of(1.0), half_mm: of(-1.0) }
     }
 
-    /// Returns the larger of its sides, in millimetres.
+    /// Returns the length of the longer side, along x or along y, in millimetres.
     pub(super) fn size_mm(&self) -> f64 {
         2.0 * self.half_mm[0].max(self.half_mm[1])
     }
 
-    /// Returns the position of a contact in the extent, from -1 to 1 along x and along y.
+    /// Returns the position of a point within the extent along x and along y, scaled so that the borders are -1 and 1.
     fn relative_position(&self, contact: &SurfacePoint) -> [f64; 2] {
         [0, 1].map(|k| (contact.point[k] - self.middle_mm[k]) / self.half_mm[k].max(f64::MIN_POSITIVE))
     }
 }
 
-/// Returns the change of the deviation at a contact by one unit of a motion of the part. `motion` is 0 to 2 for a shift
-/// along x, y, z, and 3 to 5 for a rotation about x, y, z through the origin of the model frame.
+/// Returns the change of the deviation at a point per unit of a motion of the part. `motion` is 0 to 2 for a shift
+/// along x, y, z (per millimetre), and 3 to 5 for a rotation about x, y, z through the origin of the model frame (per
+/// radian, in millimetres).
 pub(super) fn motion_effect(contact: &SurfacePoint, motion: usize) -> f64 {
     match motion {
         0..3 => contact.normal[motion],
@@ -69,8 +70,9 @@ pub(super) fn motions(contacts: &[SurfacePoint], free: [bool; 6]) -> Vec<Column<
     (0..6).filter(|&k| free[k]).map(of).collect()
 }
 
-/// Returns the effects of slides, guided in z, that are not straight: the second and the third Legendre polynomial
-/// along x and along y.
+/// Returns the effects of bent guideways (slides) of the machine on the deviations, one column for each kind of bend:
+/// the height of a guideway follows the second or the third Legendre polynomial, along x or along y. `extent` is the
+/// extent of the part.
 pub(super) fn slides(contacts: &[SurfacePoint], extent: &Extent) -> Vec<Column<&'static str>> {
     let of =
         |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
@@ -83,8 +85,9 @@ pub(super) fn slide_effect(contact: &SurfacePoint, extent: &Extent, k: usize) ->
 }
 
 impl ParameterKind {
-    /// Returns the effect of one unit of the parameter on the deviation at a contact; 0 for wear, which depends on the
-    /// progress along the path and not on the place.
+    /// Returns the change of the deviation at a point per unit of this parameter (millimetre or radian). `term` selects
+    /// the effect of the wheel radius. Returns 0 for wear, because wear depends on the progress along the path and not
+    /// on the place.
     pub(super) fn effect(self, contact: &SurfacePoint, term: WheelTerm) -> f64 {
         let n = contact.normal;
         match self {
@@ -131,7 +134,8 @@ pub(super) fn rms(values: &[f64]) -> f64 {
 }
 
 impl OrthonormalBasis {
-    /// Builds the basis by Gram-Schmidt, applied twice; columns that add nothing are left out.
+    /// Builds an orthonormal basis of the columns by Gram-Schmidt, applied twice for accuracy. A column that is a
+    /// linear combination of the columns before it is left out.
     pub(super) fn new<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
         let mut basis = Self { columns: Vec::new() };
         for column in columns {
@@ -146,7 +150,7 @@ impl OrthonormalBasis {
         basis
     }
 
-    /// Returns the part of a column that is orthogonal to the basis.
+    /// Returns `column` minus its projection onto the basis.
     pub(super) fn orthogonal_part(&self, column: &[f64]) -> Vec<f64> {
         let mut own = column.to_vec();
         for _ in 0..2 {

@@ -43,18 +43,20 @@ impl ExplainedDeviation {
         slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
     }
 
-    /// Returns the part of the deviation at a contact that parameters and slides explain, after shrinkage and without
-    /// the motion of the part that it contains, in millimetres.
+    /// Returns how much of the deviation at a point the machine parameters and bent guideways explain, in millimetres.
+    /// The estimates are shrunk towards 0 by their priors. A motion of the part that is contained in the sum is
+    /// removed.
     pub fn at(&self, contact: &SurfacePoint) -> f64 {
         self.deviation_with_motion_mm(contact) - self.motion.at(contact)
     }
 }
 
-/// Returns the part of values at the nodes of a correction that parameters and slides explain, estimated at the
-/// places where the part was measured; 0 everywhere if it cannot be estimated.
+/// Returns how much of a map the machine parameters and bent guideways explain, in millimetres; 0 at every node if they
+/// cannot be estimated.
 ///
-/// Shapes: `values_mm` at the nodes of `grid`; `contacts` where the part was measured; `nodes` the places of the
-/// surface under the nodes. The result is at the same nodes.
+/// Shapes: `values_mm` is the map at the nodes of `grid`. `contacts` are the points at which the part was measured; the
+/// estimate uses the map at these points. `nodes` are the surface points under the nodes of `grid`; the result has one
+/// value for each of them.
 pub fn explained_by_parameters(
     values_mm: &[f64],
     grid: &Grid,
@@ -115,11 +117,11 @@ pub struct ParameterCorrections {
 }
 
 impl ParameterCorrections {
-    /// Returns the corrections that compensate these values from the pass `since_cycle` on; `None` if all values are
-    /// 0.
+    /// Returns the parameter corrections that compensate the estimated values of the parameters from the pass
+    /// `since_cycle` on. Returns `None` if all values are 0.
     ///
-    /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the
-    /// correction. Units: millimetres, radians.
+    /// Shapes: `values` in the order of [`ParameterKind::ALL`]; `contacts` are the points at which the part was
+    /// measured, `nodes` the surface points under the nodes of the correction. Units: millimetres, radians.
     pub fn from_values(
         values: [f64; ParameterKind::COUNT],
         since_cycle: u16,
@@ -140,12 +142,13 @@ impl ParameterCorrections {
         Some(Self { values, since_cycle, displaced_mm, setting_mm, seen_mm })
     }
 
-    /// Returns the difference of a parameter from the value stated in the recipe.
+    /// Returns the correction of one parameter: its difference from the value stated in the recipe, in millimetres or
+    /// radians.
     pub fn value(&self, kind: ParameterKind) -> f64 {
         ParameterKind::ALL.iter().position(|of| *of == kind).map_or(0.0, |k| self.values[k])
     }
 
-    /// Returns true if every number is finite and each vector has one value per node.
+    /// Returns true if every number is finite and each vector has `nodes` values.
     pub fn is_valid(&self, nodes: usize) -> bool {
         let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
         self.values.iter().all(|v| v.is_finite())
@@ -154,7 +157,8 @@ impl ParameterCorrections {
 }
 
 impl SurfacePoint {
-    /// Returns the places of a surface under the nodes of a grid; outside the known surface, the nearest known place.
+    /// Returns the point of `surface`, with its normal, at the x and y of each node of `grid`. For a node outside the
+    /// known surface, returns the nearest known point. The deviations of the returned points are 0.
     pub fn under_nodes(surface: &HeightField, grid: &Grid) -> Vec<Self> {
         let at = |k: usize| {
             let [x, y] = grid.place_mm(k);

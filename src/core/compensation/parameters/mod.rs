@@ -101,7 +101,8 @@ pub struct ParameterOptions {
 }
 
 impl ParameterOptions {
-    /// Returns the options with all six motions free and no parameter to compensate.
+    /// Returns options with all six motions of the part free and no tolerances, so that parameters are only reported
+    /// and none is compensated. `wheel_radius_mm` is the radius as stated to the grinder.
     pub fn new(wheel_radius_mm: f64) -> Self {
         Self {
             wheel_radius_mm,
@@ -112,8 +113,8 @@ impl ParameterOptions {
         }
     }
 
-    /// Returns true if only a datum separates the parameter from a motion, and the uncertainty of this datum is not
-    /// stated.
+    /// Returns true if the parameter with the index `k` in [`ParameterKind::ALL`] cannot be told from a motion of the
+    /// part that a datum locks, because the uncertainty of the datum is not stated.
     fn lacks_locked_sigma(&self, k: usize) -> bool {
         let held = |motion: usize| !self.free_motions[motion];
         ParameterKind::ALL[k].motion().is_some_and(held) && self.locked_sigmas.is_none()
@@ -149,8 +150,8 @@ impl ParameterKind {
     pub const ALL: [Self; Self::COUNT] =
         [Self::WheelRadius, Self::SettingX, Self::SettingY, Self::SettingZ, Self::TiltX, Self::TiltY, Self::Wear];
 
-    /// Returns the index of the motion of the part that has exactly the same effect; `None` if there is no such
-    /// motion.
+    /// Returns the index (0 to 5) of the motion of the part that changes the deviations in exactly the same way as this
+    /// parameter, apart from the sign. Returns `None` if there is no such motion.
     fn motion(self) -> Option<usize> {
         match self {
             Self::SettingX => Some(0),
@@ -162,7 +163,7 @@ impl ParameterKind {
         }
     }
 
-    /// Returns true if the value is an angle, in radians; otherwise it is a length, in millimetres.
+    /// Returns true if the parameter is an angle, in radians, and false if it is a length, in millimetres.
     pub fn is_angle(self) -> bool {
         matches!(self, Self::TiltX | Self::TiltY)
     }
@@ -237,16 +238,17 @@ pub enum ParameterError {
     Field(#[from] ModelError),
 }
 
-/// Estimates the parameters from deviations, by generalised least squares together with a field.
+/// Estimates the machine parameters from the deviations of the part, by generalised least squares together with a
+/// Gaussian random field for the form error.
 ///
-/// Shapes: contacts in any order; `progress` from 0 to 1 along the path at each, or `None` for a raster whose tracks
-/// follow each other along y. Frames: the model frame. Units: millimetres, radians. Equation:
-/// deviation = motion + slides + sum of parameters times their columns + field + noise.
+/// Shapes: contacts in any order; `progress` is the progress along the path at each contact, from 0 to 1. `None` stands
+/// for a raster whose tracks follow each other along y. Frames: the model frame. Units: millimetres, radians. Equation:
+/// deviation = motion of the part + bent guideways + sum of (parameter times its effect) + field + noise.
 ///
 /// # Errors
-/// Too few points, values that are not finite, a number of `progress` values other than that of the contacts, normals
-/// that do not point up, a radius or a tolerance that is not above 0, a negative uncertainty of the datum, and points
-/// that do not determine a field.
+/// Returns an error if there are fewer than 30 points, if a value is not finite, if `progress` has another length than
+/// `contacts`, if the z component of a normal is below 0.05, if the radius or a tolerance is not above 0, if an
+/// uncertainty of the datum is negative, or if the points do not determine the field.
 pub fn estimate_parameters(
     contacts: &[SurfacePoint],
     progress: Option<&[f64]>,
@@ -353,8 +355,11 @@ impl Columns {
         self.motions.iter().chain(&self.slides).map(|c| &c.values)
     }
 
-    /// Returns for each candidate whether it is separable from motions, slides and the other separable candidates, and
-    /// the share of it that is independent of these. Of two candidates with the same effect, the first is separable.
+    /// Returns two lists with an entry for each candidate parameter. The first is true if the candidate is separable
+    /// from motions, guideways and the other separable candidates. The second is the share of the effect of the
+    /// candidate, from 0 to 1, that these others cannot imitate.
+    ///
+    /// Of two candidates with the same effect, only the first is separable.
     fn separability(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
@@ -373,7 +378,12 @@ impl Columns {
         (told.iter().zip(&shares).map(|(told, share)| *told && *share > MIN_OWN_SHARE).collect(), shares)
     }
 
-    /// Fits slides and candidates together with the motions and a field. `told[k]` is true if candidate k is separable.
+    /// Fits guideways and candidate parameters together with the motions of the part and a random field. `told[k]` is
+    /// true if candidate k is separable; other candidates are not fitted. `rms_mm` is the rms of the deviations without
+    /// motions.
+    ///
+    /// # Errors
+    /// Returns an error if the points do not determine the field.
     fn fitted(
         &self,
         contacts: &[SurfacePoint],
@@ -416,8 +426,12 @@ impl Columns {
         Ok(ColumnFit { values, covariance, sizes, rms_mm, slides })
     }
 
-    /// Returns the estimates for the motions in `unseen`, an orthonormal basis, and for the chosen columns, in units of
-    /// these columns.
+    /// Estimates the values of the `chosen` columns and of the motions, with their covariance. `unseen` is an
+    /// orthonormal basis of the motions of the part. The result lists the motions first; values of chosen columns are
+    /// in units of these columns.
+    ///
+    /// # Errors
+    /// Returns an error if the points do not determine the field of the model.
     fn effects(
         &self,
         contacts: &[SurfacePoint],
@@ -446,7 +460,7 @@ impl Columns {
         Ok(found)
     }
 
-    /// Returns the names of the effects that a candidate is not separable from.
+    /// Returns the names, for people, of the effects that the candidate with the index `k` cannot be separated from.
     fn inseparable_from(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
         let before = self.candidates.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| (c.kind, &c.values));
         let others = self.motions.iter().chain(&self.slides).map(|c| (c.kind.to_owned(), &c.values));
@@ -461,7 +475,9 @@ impl Columns {
 }
 
 impl ColumnFit {
-    /// Returns the estimate of each parameter, without its message and `rms_reduction_mm`.
+    /// Returns the estimate of each parameter, in the order of [`ParameterKind::ALL`]. `alike` holds for each parameter
+    /// the names of the effects that it is not separable from, `own_shares` its independent share. `message` and
+    /// `rms_reduction_mm` of the estimates stay empty.
     fn parameters(
         &self,
         alike: Vec<Vec<String>>,
@@ -498,8 +514,9 @@ impl ColumnFit {
         found
     }
 
-    /// Returns the expectation of the chosen parameters: T (T + S)^-1 b, with their fitted values b, the covariance S
-    /// of b, and the diagonal matrix T of the prior variances. `chosen` holds the index and the prior variance of each.
+    /// Returns the posterior mean of some parameters: T (T + S)^-1 b. b are the fitted values, S is the covariance of
+    /// b, and T the diagonal matrix of the prior variances. `chosen` holds the index and the prior variance of each
+    /// parameter. Returns zeros if T + S is not positive definite.
     fn expected(&self, chosen: &[(usize, f64)]) -> DVector<f64> {
         let at = |k: usize| self.slides + chosen[k].0;
         let n = chosen.len();
@@ -509,12 +526,13 @@ impl ColumnFit {
         solved.map_or_else(|| DVector::zeros(n), |solved| DVector::from_fn(n, |k, _| chosen[k].1 * solved[k]))
     }
 
-    /// Returns the expectation of all slides and parameters together. The prior of a parameter with a tolerance is this
-    /// tolerance. The others share one prior strength, which their values determine.
+    /// Returns the posterior mean of all guideway bends and parameters together. The prior of a parameter with a
+    /// tolerance is this tolerance. All others share one prior strength, which is estimated from the fitted values
+    /// (empirical Bayes, Morris 1983).
     ///
     /// Equation: T (T + S)^-1 b, with the fitted values b, their covariance S and the diagonal matrix T of the prior
-    /// variances. The result is the mean over prior strengths from a small share of the rms up to the whole rms, each
-    /// weighted by its likelihood given b (empirical Bayes, Morris 1983).
+    /// variances. The result is the mean over trial prior strengths from 0.1 % of the rms of the deviations up to the
+    /// whole rms, each weighted by its marginal likelihood given b.
     fn joint_expectation(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);

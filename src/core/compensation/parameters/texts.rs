@@ -30,17 +30,19 @@ impl ParameterKind {
         name(self)
     }
 
-    /// Returns the unit of messages, for people: "urad" for an angle, "um" for a length.
+    /// Returns the unit that messages to people use for the parameter: "urad" for an angle, "um" for a length.
     pub fn unit(self) -> &'static str {
         if self.is_angle() { "urad" } else { "um" }
     }
 
-    /// Returns the factor from the parameter's value, in radians or millimetres, to the unit of messages.
+    /// Returns the factor that converts the value of the parameter from radians or millimetres into the unit of
+    /// messages ([`Self::unit`]): 1e6 for an angle, 1e3 for a length.
     pub fn display_units_per_unit(self) -> f64 {
         if self.is_angle() { 1e6 } else { 1e3 }
     }
 
-    /// Returns the recipe key by which the parameter is compensated; `None` if it never is.
+    /// Returns the key in the table `compensation.parameters` of the recipe that turns on the compensation of this
+    /// parameter. Returns `None` for wear, which is never compensated as a parameter.
     pub fn recipe_key(self) -> Option<&'static str> {
         match self {
             Self::WheelRadius => Some("wheel_radius_um"),
@@ -54,7 +56,8 @@ impl ParameterKind {
     }
 }
 
-/// Returns the names of at most three of the `others` that contribute most to the column `target`.
+/// Returns the names of at most three of the `others` that imitate the column `target` best, the largest contribution
+/// first. If `target` has no effect, returns a text that says so.
 pub(super) fn inseparable_names(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
     let size = dot(target, target).sqrt();
     if size * size <= MIN_EFFECT_MM2 * target.len() as f64 {

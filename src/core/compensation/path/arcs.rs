@@ -105,16 +105,16 @@ pub struct ArcSummary {
 }
 
 impl ToolPath {
-    /// Returns the moves of the wheel's centre track by track. Arcs replace lines where a fit within the tolerance
-    /// exists.
+    /// Returns the moves of the wheel's centre, one list for each track. An arc replaces straight moves where it
+    /// deviates from the path by no more than the tolerance in `options`.
     ///
     /// Frame: model. Units: mm, mm/min.
     pub fn arcs_by_track(&self, options: &ArcOptions) -> Vec<ArcBlocks<MovesWithMiddles<'_>>> {
         self.moves_by_track().into_iter().map(|moves| ArcBlocks::new(MovesWithMiddles(moves), options)).collect()
     }
 
-    /// Converts the whole path into arcs, with all tracks in parallel, and returns the counts, the largest deviation
-    /// and the largest corners.
+    /// Converts the whole path into arcs and returns the numbers of moves, arcs and lines, the largest deviation, and
+    /// the largest corner angles with and without arcs. Tracks are converted in parallel.
     pub fn arc_summary(&self, options: &ArcOptions) -> ArcSummary {
         let one = |k: usize| {
             let mut one = ArcSummary::default();
@@ -205,8 +205,9 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> ArcBlocks<S> {
         }
     }
 
-    /// Returns the longest arc from the current point and the number of points that it replaces, or `None` and the
-    /// number of points that stay lines. The search doubles the number of points, then bisects.
+    /// Searches the arc from the current point that replaces the most points. Returns the number of replaced points and
+    /// the arc, or the number of points that stay lines and `None`. The search doubles the number of points, then
+    /// bisects.
     fn longest_arc(&mut self) -> (usize, Option<Arc>) {
         let least = self.options.min_lines.max(2);
         let from = self.from;
@@ -281,7 +282,8 @@ enum ArcFit {
     Neither,
 }
 
-/// Fits an arc from a point through the samples. The last sample is its end.
+/// Fits an arc, or a straight line, that begins at `from`, ends at the last sample, and follows all samples within the
+/// tolerance in `options`. Returns [`ArcFit::Neither`] if neither an arc nor a line does.
 fn fit_arc(from: Point, samples: &[PathPoint], options: &ArcOptions) -> ArcFit {
     let Some(frame) = Chord::new(from, samples, options) else { return ArcFit::Neither };
     let Some([low, high]) = frame.curvature_interval(samples, options.tolerance_mm) else { return ArcFit::Neither };
@@ -325,8 +327,8 @@ impl Chord {
         Some(Self { plane, ends, middle, along: [by[a] / length, by[b] / length], half: 0.5 * length })
     }
 
-    /// Returns the coordinates of a point relative to the middle of the chord: along the chord, then to its left, in
-    /// mm.
+    /// Returns two coordinates of a point in the plane of the arc, in mm, with the origin in the middle of the chord:
+    /// first along the chord, then to its left.
     fn coordinates(&self, p: &Point) -> [f64; 2] {
         let [a, b, _] = self.plane.0;
         let [x, y] = [p[a] - self.middle[0], p[b] - self.middle[1]];
@@ -334,13 +336,14 @@ impl Chord {
         [x * s + y * t, y * s - x * t]
     }
 
-    /// Returns the interval of the values 1 / t for which an arc over the chord is close enough to all points, or
-    /// `None` if it is empty. The centre of the arc is at a distance t to the left of the chord.
+    /// Returns the interval of the values 1 / t for which an arc over the chord passes all samples within `within_mm`.
+    /// t is the signed distance of the centre of the arc from the chord, positive to the left. Returns `None` if no
+    /// value is suitable.
     ///
-    /// A point (u, v) is at a signed distance d from the circle about (0, t) through (+-h, 0) if
-    /// u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2.
-    /// Multiplied by 1 / t, this is linear in 1 / t except for d^2 and the factor (1 + h^2 / t^2)^(1/2) of d.
-    /// The bounds omit both. The factor is at least 1 and would only make the interval wider.
+    /// With (u, v) the [`Self::coordinates`] of a point and h half of the chord, the point is at a signed distance d
+    /// from the circle about (0, t) through (+-h, 0) if u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2.
+    /// Multiplied by 1 / t, this is linear in 1 / t except for d^2 and the factor (1 + h^2 / t^2)^(1/2) of d. The
+    /// bounds omit both. The factor is at least 1 and would only make the interval wider.
     fn curvature_interval(&self, samples: &[PathPoint], within_mm: f64) -> Option<[f64; 2]> {
         let widest = MAX_CHORD_RATIO / self.half;
         let [mut low, mut high] = [-widest, widest];
@@ -360,7 +363,8 @@ impl Chord {
         Some([low, high])
     }
 
-    /// Returns true if the third axis moves in proportion to the position along the chord, within the tolerance.
+    /// Returns true if the coordinate across the plane of the arc changes linearly along the chord: no sample deviates
+    /// from this by more than `within_mm`.
     fn is_level(&self, samples: &[PathPoint], within_mm: f64) -> bool {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
@@ -370,9 +374,12 @@ impl Chord {
         })
     }
 
-    /// Returns the arc with the given value of 1 / t, rounded as it is written, with an upper bound of its deviation
-    /// from the path. Returns `None` if the centre is too far away, the radius error is too large, or a point is not
-    /// between the ends.
+    /// Returns the arc whose centre is at the signed distance 1 / `bend` to the left of the chord. The centre is
+    /// rounded to the last written digit. [`Arc::deviation_mm`] is an upper bound of the deviation of this arc from the
+    /// path.
+    ///
+    /// Returns `None` if the centre is beyond the maximum coordinate, if the difference of the radii at both ends is
+    /// too large, or if a sample is not between the ends of the arc.
     fn arc(&self, from: Point, samples: &[PathPoint], bend: f64, options: &ArcOptions) -> Option<Arc> {
         let [s, t] = self.along;
         let centre_mm = [self.middle[0] - t / bend, self.middle[1] + s / bend].map(|v| written(v, options));
@@ -426,8 +433,8 @@ impl Circle {
         self.radii[1] - self.radii[0]
     }
 
-    /// Returns the deviation of a point along the radius and across the plane, in mm, or `None` if the point is not
-    /// between the ends.
+    /// Returns two deviations of a point from the arc, in mm: along the radius, and across the plane of the arc.
+    /// Returns `None` if the point is not between the ends of the arc.
     fn deviation_mm(&self, p: &Point) -> Option<[f64; 2]> {
         let [a, b, c] = self.plane.0;
         let arm = [p[a] - self.centre_mm[0], p[b] - self.centre_mm[1]];
@@ -443,7 +450,7 @@ impl Circle {
     }
 }
 
-/// Returns the signed angle from one arm to another, in rad, positive counter-clockwise.
+/// Returns the signed angle from the vector `[x, y]` to the vector `[u, v]`, in rad, positive counter-clockwise.
 fn angle([x, y]: [f64; 2], [u, v]: [f64; 2]) -> f64 {
     (x * v - y * u).atan2(x * u + y * v)
 }
@@ -452,13 +459,14 @@ fn size([x, y]: [f64; 2]) -> f64 {
     x.hypot(y)
 }
 
-/// Returns a coordinate rounded as it is written.
+/// Rounds a coordinate to the last digit that a program writes.
 fn written(value_mm: f64, options: &ArcOptions) -> f64 {
     (value_mm * options.steps_per_mm).round() / options.steps_per_mm
 }
 
-/// Calls `tell` for every block with the angle between its start direction and the end direction of the previous
-/// block, in rad. The angle is 0 for rapid moves and for the first moves at feed of a track.
+/// Calls `tell` for every block with its corner angle, in rad: the angle between the end direction of the previous
+/// block and the start direction of this block. The angle is 0 for rapid moves and for the first two moves at feed of a
+/// track.
 fn corners(blocks: impl Iterator<Item = ProgramBlock>, mut tell: impl FnMut(&ProgramBlock, f64)) {
     let (mut from, mut heading): (Option<Point>, Option<Vector>) = (None, None);
     for block in blocks {
@@ -474,7 +482,7 @@ fn corners(blocks: impl Iterator<Item = ProgramBlock>, mut tell: impl FnMut(&Pro
 }
 
 impl Arc {
-    /// Returns the tangent directions at the start and at the end, not normalized.
+    /// Returns the tangent vectors of the arc at its start and at its end, not normalized. `from` is the start point.
     fn directions(&self, from: Point) -> [Vector; 2] {
         let [a, b, c] = self.plane.0;
         let turn = if self.clockwise { -1.0 } else { 1.0 };

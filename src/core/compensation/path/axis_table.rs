@@ -13,10 +13,12 @@ use crate::geometry::{Grid, Point};
 
 const STEPS: usize = 40;
 
-/// Returns the offset of Z at every node of a grid over the axes X and Y, in millimetres; positive leaves material.
+/// Computes a compensation table for the axes of a grinder: the offset of Z at every node of `grid`, in millimetres;
+/// positive leaves material. The nodes are positions of the axes X and Y.
 ///
-/// The grid can extend beyond the part, where the surface is extrapolated and the wheel may not fit. A node at which
-/// the wheel cannot touch takes the offset of the nearest node with a solution.
+/// `before` is the surface without the correction, `after` the surface with it. The offset is the difference of the
+/// heights at which the wheel touches them. The grid can extend beyond the part, where the surfaces are extrapolated. A
+/// node at which the wheel cannot touch takes the offset of the nearest node at which it can.
 ///
 /// # Errors
 /// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.
@@ -39,8 +41,11 @@ pub fn axis_offsets(
     Ok(nearest_known(grid, &known).into_iter().map(|node| values[node]).collect())
 }
 
-/// Computes the height z of the wheel's centre at the axis positions X and Y, in mm. Newton's method finds the contact
-/// point.
+/// Computes the height z of the wheel's centre, in mm, at which the wheel touches the surface `wanted` while the axes X
+/// and Y are at `axes`. Newton's method finds the contact point.
+///
+/// # Errors
+/// Returns [`PathError::CannotTouch`] if the wheel cannot touch, or if the method does not converge.
 fn height_mm(wanted: &TargetSurface, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, PathError> {
     let refused = |[x_mm, y_mm]: [f64; 2]| PathError::CannotTouch { x_mm, y_mm };
     let centre = |place: [f64; 2]| wheel.centre(&wanted.at(place)).ok_or_else(|| refused(place));

@@ -8,7 +8,7 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum PathError {
-    #[error("there is no surface for a path; check the nominal surface and its outline")]
+    #[error("no track can be laid, because the nominal surface or its outline covers no area; check both")]
     Empty,
     #[error(
         "the nominal surface is not a height over x and y at x {x_mm:.3}, y {y_mm:.3} mm: it is steeper than 84° or \
@@ -19,7 +19,10 @@ pub enum PathError {
     Correction { x_mm: f64, y_mm: f64 },
     #[error("{key} is {found}; it must be {allowed}")]
     Option { key: &'static str, found: f64, allowed: &'static str },
-    #[error("tracks every {track_mm} mm make {tracks:.0} tracks, more than {limit:.0}; choose a wider distance")]
+    #[error(
+        "tracks every {track_mm} mm make {tracks:.0} tracks, more than {limit:.0}; choose a larger distance between \
+         tracks"
+    )]
     TooManyTracks { tracks: f64, track_mm: f64, limit: f64 },
     #[error(
         "the surface is concave with a radius of {hollow_mm:.3} mm at x {x_mm:.3}, y {y_mm:.3} mm, at \
@@ -102,8 +105,8 @@ pub enum PathError {
 }
 
 impl PathError {
-    /// Returns true if only the path planning of this program fails. A controller that plans its own path from the
-    /// correction map may still be able to grind the part.
+    /// Returns true if the part can perhaps still be ground: only the path planning of this program fails
+    /// ([`PathError::NotAHeight`]). A controller that plans its own path from the correction map may succeed.
     pub fn is_planning_failure(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }

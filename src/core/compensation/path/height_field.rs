@@ -31,7 +31,8 @@ pub struct HeightField {
 }
 
 impl HeightField {
-    /// Fits a spline through values at the nodes. Its slope across the border is zero.
+    /// Fits a bicubic spline through `values` at the nodes of the grid `on`. At the border, its slope across the border
+    /// is 0.
     pub fn spline(on: Grid, values: &[f64]) -> Self {
         let Grid { columns, rows, .. } = on;
         let mut nodes: Vec<[f64; 4]> = values.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
@@ -49,8 +50,8 @@ impl HeightField {
         Self::new(on, nodes)
     }
 
-    /// Fits Hermite's bicubic through values and slopes at the nodes. Nodes without a value (NaN) are extrapolated
-    /// from their neighbours.
+    /// Fits Hermite's bicubic through `values` and `slopes` (along x and y) at the nodes of the grid `on`. A node
+    /// without a value (NaN) is extrapolated from its neighbours.
     pub fn hermite(on: Grid, values: &[f64], slopes: &[[f64; 2]]) -> Self {
         let h = on.spacing_mm;
         let mut nodes: Vec<[f64; 4]> =
@@ -71,7 +72,7 @@ impl HeightField {
         self
     }
 
-    /// Returns the field with the sign of every height changed.
+    /// Returns the field with the sign of every height reversed.
     #[must_use]
     pub fn mirrored(mut self) -> Self {
         self.nodes.par_iter_mut().for_each(|node| *node = node.map(|value| -value));
@@ -83,7 +84,8 @@ impl HeightField {
         self.per_mm.map(|p| 1.0 / p)
     }
 
-    /// Returns the value and its derivatives at a place.
+    /// Returns height, slopes and second derivatives at a place `[x, y]`, in millimetres. Beyond the border the field
+    /// continues linearly.
     #[inline]
     pub fn at(&self, [x, y]: [f64; 2]) -> Jet {
         let (i, u, over_u) = cell((x - self.grid.first_mm[0]) * self.per_mm[0], self.grid.columns);
@@ -99,7 +101,8 @@ impl HeightField {
         jet
     }
 
-    /// Evaluates the bicubic of a cell at (u, v) in [0, 1]. The unit of length is one cell.
+    /// Returns height and derivatives in the cell of column `i` and row `j`, at the position (`u`, `v`) within it; both
+    /// are from 0 to 1. The derivatives are per cell, not per millimetre.
     #[inline]
     fn within(&self, i: usize, j: usize, u: f64, v: f64) -> Jet {
         let below = j * self.grid.columns + i;
@@ -123,8 +126,9 @@ impl HeightField {
     }
 }
 
-/// Returns the cell of a coordinate, the position in the cell (0 to 1), and the signed distance of the coordinate
-/// beyond the border (0 inside). All are in cells.
+/// Finds the cell of the coordinate `at` on an axis with `nodes` nodes. Returns the index of the cell, the position in
+/// the cell (0 to 1), and how far the coordinate is beyond the border (signed, 0 inside). `at` and all results are in
+/// cells.
 #[inline]
 fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     let kept = at.clamp(0.0, (nodes - 1) as f64);
@@ -132,7 +136,8 @@ fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     (i, kept - i as f64, at - kept)
 }
 
-/// Continues a jet at the border along its tangents, by (du, dv) cells beyond the border.
+/// Extrapolates height and derivatives from the border: `[du, dv]` is the signed distance beyond the border along both
+/// axes, in cells. The continuation is linear along each axis.
 #[cold]
 fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
     let ([su, sv], twist) = (jet.slope, jet.second_derivatives[1]);
@@ -167,7 +172,8 @@ impl HermiteBasis {
         }
     }
 
-    /// Returns value, slope and second derivative of the cubic with these values and slopes at its ends.
+    /// Returns value, slope and second derivative, at the parameter of this basis, of the cubic with the value `z0` and
+    /// the slope `m0` at 0, and the value `z1` and the slope `m1` at 1.
     #[inline]
     fn curve(&self, z0: f64, m0: f64, z1: f64, m1: f64) -> [f64; 3] {
         let sum = |w: &[f64; 4]| w[0] * z0 + w[1] * m0 + w[2] * z1 + w[3] * m1;
@@ -175,8 +181,8 @@ impl HermiteBasis {
     }
 }
 
-/// Computes the slopes of the cubic spline through equally spaced values, with zero slope at both ends, by Thomas's
-/// algorithm.
+/// Returns the slopes at the nodes of the cubic spline through `count` equally spaced values, per step. The slopes at
+/// both ends are 0. The tridiagonal system is solved by the Thomas algorithm.
 fn spline_slopes(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     // m[i-1] + 4 m[i] + m[i+1] = 3 (f[i+1] - f[i-1]), m[0] = m[n-1] = 0.
     let (mut slope, mut factor) = (vec![0.0; count], vec![0.0; count]);
@@ -191,8 +197,8 @@ fn spline_slopes(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     slope
 }
 
-/// Fills nodes without a value, ring by ring outwards. Each new value is the weighted mean of the tangent
-/// extrapolations from the neighbours that have a value.
+/// Fills nodes without a value, ring by ring outwards. A new height is the weighted mean of the linear extrapolations
+/// from the neighbours that have a value.
 fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let near = |k: usize| {
         let (i, j) = (k % columns, k / columns);
@@ -233,7 +239,8 @@ fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     }
 }
 
-/// Sets the twist of every node to the mean of two differences: of the x slope along y, and of the y slope along x.
+/// Sets the twist (mixed derivative by x and y) of every node to the mean of two differences: of the x slope along y,
+/// and of the y slope along x.
 fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let twists: Vec<f64> = (0..nodes.len())
         .into_par_iter()
@@ -248,8 +255,9 @@ fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     nodes.iter_mut().zip(twists).for_each(|(node, twist)| node[3] = twist);
 }
 
-/// Returns the derivative at one of equally spaced values: central difference inside, one-sided at the ends, both of
-/// second order. With two values it is their difference; with one it is 0.
+/// Returns the derivative per step at the index `at` of `count` equally spaced values: the central difference inside, a
+/// one-sided difference at both ends, all of second order. With two values, returns their difference; with one value,
+/// 0.
 fn difference(at: usize, count: usize, value: impl Fn(usize) -> f64) -> f64 {
     match at {
         _ if count < 2 => 0.0,

@@ -90,19 +90,19 @@ struct SpanWalk {
 }
 
 impl ToolPath {
-    /// Returns all moves of the path, from the first rapid move to the last.
+    /// Returns an iterator over all moves of the path. The first and the last move are rapid moves to the safe height.
     pub fn moves(&self) -> Moves<'_> {
         Moves::new(self, 0, self.track_count())
     }
 
-    /// Returns all moves of the path, track by track. Each track ends at the safe height.
+    /// Returns one iterator over moves for each track. The moves of a track end with a rapid move to the safe height.
     pub fn moves_by_track(&self) -> Vec<Moves<'_>> {
         (0..self.track_count()).map(|k| Moves::new(self, k, k + 1)).collect()
     }
 }
 
 impl<'a> Moves<'a> {
-    /// Returns the moves of the spans `from..to`. They begin and end at the safe height.
+    /// Returns an iterator over the moves of the tracks with the indices `from..to`. The moves end at the safe height.
     pub(super) fn new(path: &'a ToolPath, from: usize, to: usize) -> Self {
         let (state, bend, on_span, middle, centre_mm) = (State::Above, 0.0, false, None, 0.0);
         Self { path, next: from, end: to, state, curvature_per_mm: bend, on_span, middle, centre_mm }
@@ -115,7 +115,8 @@ impl<'a> Moves<'a> {
         SpanWalk { span, to, t: from, step, at: self.path.wheel_position(&span, from) }
     }
 
-    /// Converts a move from the frame of the wheel's side, mirrored for a wheel from below, into the model frame.
+    /// Converts a move into the model frame. For a wheel from below, `given` is mirrored in z; otherwise the move is
+    /// unchanged.
     #[inline]
     fn to_model_frame(&self, given: Move) -> Move {
         let upright = |z| self.path.flipped_height_mm(z);
@@ -126,7 +127,8 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Advances by the longest step that the chord error allows, and proposes the length of the next step.
+    /// Advances `walk` along its track by the longest step that the chord error allows. The returned state also holds
+    /// the length of the step to try next.
     #[inline]
     fn along(&mut self, mut walk: SpanWalk) -> SpanWalk {
         let path = self.path;
@@ -173,7 +175,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the move at feed to a point.
+    /// Returns the move at feed to the position `stand` of the wheel; with a tilt if the head rotates.
     #[inline]
     fn feed(&self, stand: &WheelPosition) -> Move {
         let (at, feed_mm_min) = (stand.programmed_point, self.feed_mm_min());
@@ -185,7 +187,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the rapid move, at the safe height, to the place above the first point of a track.
+    /// Returns the rapid move, at the safe height, to the place above the start of the track of `walk`.
     fn over(&self, walk: &SpanWalk) -> Move {
         let to_mm = [walk.at.programmed_point.x, walk.at.programmed_point.y];
         match self.path.options().tilt {
@@ -194,8 +196,9 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the feed at the last point, in mm/min. On a spiral the acceleration limit lowers it to
-    /// (share * limit / curvature)^(1/2), rounded down to two digits so that it seldom changes.
+    /// Returns the feed at the last point, in mm/min: the feed of the options, but on a spiral with an acceleration
+    /// limit a at most (0.8 a / k)^(1/2), where k is the curvature of the path. A reduced feed is rounded down to two
+    /// digits so that it seldom changes.
     fn feed_mm_min(&self) -> f64 {
         let options = self.path.options();
         let (TrackPattern::Spiral, Some(limit)) = (options.pattern, options.spiral_acceleration_mm_s2) else {

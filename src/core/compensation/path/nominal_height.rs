@@ -15,11 +15,11 @@ const STEPS: usize = 8;
 /// Minimum z component of a normal: 84° of slope. A steeper surface is not a height over x and y.
 const MIN_NZ: f64 = 0.1;
 
-/// Returns the nominal surface as a height field, and the outline of the part: the given outline, or the bounding box
-/// of the points.
+/// Returns the nominal surface as a height field over x and y, and the outline of the part. If `nominal` has no
+/// outline, the outline is the bounding box of its points.
 ///
 /// A grid that is regular in x and y becomes the field directly, with slopes from its normals. Any other surface is
-/// sampled with the density of its points.
+/// sampled on a new grid with about as many nodes as it has points.
 ///
 /// # Errors
 /// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° at some point or faces away from +z, and
@@ -34,7 +34,10 @@ pub fn nominal_height_field(nominal: &Nominal) -> Result<(HeightField, Aperture)
     Ok((field, outline))
 }
 
-/// Returns the field of a surface whose nodes already form a regular grid, or `None` if they do not.
+/// Returns the height field of a surface whose nodes form a regular grid in x and y. Returns `Ok(None)` if they do not.
+///
+/// # Errors
+/// Returns [`PathError::NotAHeight`] if the surface is too steep at a node or faces away from +z.
 fn regular(nominal: &Nominal) -> Result<Option<HeightField>, PathError> {
     let (NominalKind::Grid { columns, rows }, [patch]) = (nominal.kind(), nominal.patches()) else { return Ok(None) };
     let nodes = patch.nodes();
@@ -85,7 +88,12 @@ fn regular(nominal: &Nominal) -> Result<Option<HeightField>, PathError> {
 /// Height and slopes at a node.
 type HeightAndSlopes = (f64, [f64; 2]);
 
-/// Returns the field of a surface that is not a regular grid. The height at each node is found by Newton's method.
+/// Samples a surface whose nodes do not form a regular grid, and returns its height field over the rectangle from `low`
+/// to `high`. Newton's method finds the height at each node.
+///
+/// # Errors
+/// Returns [`PathError::NotAHeight`] if the surface is too steep, and [`PathError::Empty`] if the rectangle has no area
+/// or the points give no surface.
 fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<HeightField, PathError> {
     let surface = OffsetSurface::new(nominal, 0.0, Side::Normal).map_err(|_| PathError::Empty)?;
     let size = [high[0] - low[0], high[1] - low[1]];
@@ -121,8 +129,12 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<HeightField,
     Ok(HeightField::hermite(on, &heights, &slopes))
 }
 
-/// Finds the height and the slopes at a place by Newton's method along z. The height is NaN off the part or without
-/// convergence.
+/// Finds the height and the slopes of a surface at `[x, y]` by Newton's method along z. `start_mm` is the first height
+/// to try; `place` is the facet near which the search begins, and is updated. The height is NaN if the place is off the
+/// part or the method does not converge.
+///
+/// # Errors
+/// Returns [`PathError::NotAHeight`] if the surface is too steep or faces away from +z.
 fn height_at(
     surface: &OffsetSurface,
     [x, y]: [f64; 2],

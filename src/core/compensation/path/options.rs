@@ -86,7 +86,8 @@ pub struct PathOptions {
 }
 
 impl PathOptions {
-    /// Returns options with a chord error of 0.1 µm and with overrun, leads and safe height for an ordinary machine.
+    /// Returns the default options for a raster path with the wheel `wheel`, the distance `track_mm` between tracks and
+    /// the feed `feed_mm_min`: chord error 0.1 µm, overrun 2 mm, leads 2 mm, safe height 10 mm, no tilt.
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
@@ -107,7 +108,10 @@ impl PathOptions {
         }
     }
 
-    /// Rejects options that are invalid for every surface.
+    /// Checks the options that do not depend on the surface.
+    ///
+    /// # Errors
+    /// Returns [`PathError::Option`] for a number outside its range, and an error for a tilt that is not possible.
     pub(super) fn check(&self) -> Result<(), PathError> {
         let (spacing, height) = match self.spacing {
             TrackSpacing::Distance(mm) => (mm, 1.0),
@@ -143,8 +147,12 @@ impl PathOptions {
         self.check_tilt()
     }
 
-    /// Rejects a tilt that is not possible: without a rotary axis, for a wheel from below, at an angle that is not
-    /// finite, or with a lead at which a ball touches the surface with its pole.
+    /// Checks if the tilt of the wheel is possible; without a tilt there is nothing to check.
+    ///
+    /// # Errors
+    /// Returns an error if there is no rotary axis, if the wheel comes from below, if the angle is not finite, or if a
+    /// ball whose tilt follows the normal leads by less than 2°: it would touch with its pole, which has no cutting
+    /// speed.
     fn check_tilt(&self) -> Result<(), PathError> {
         let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {

@@ -38,8 +38,9 @@ pub struct Scallops {
 }
 
 impl Scallops {
-    /// Computes the scallops on a target surface. `wheel_at` returns the wheel in its orientation at a contact. Places
-    /// where the wheel does not fit the surface count as zero height; no path is laid for them.
+    /// Computes the scallops (ridges between tracks) that a pass leaves on the surface `wanted`. `track_mm` is the
+    /// distance between tracks. `wheel_at` returns the wheel in its orientation at a contact. A place where the wheel
+    /// does not fit counts as height 0; [`ToolPath::new`] rejects such a path.
     pub fn compute(
         wanted: &TargetSurface,
         outline: &Aperture,
@@ -66,15 +67,15 @@ impl Scallops {
         }
     }
 
-    /// Returns the largest distance between tracks, in millimetres, that keeps the scallops within this height and
-    /// this rms. It is infinite if no distance leaves scallops.
+    /// Returns the largest distance between tracks, in millimetres, at which the scallops exceed neither `height_mm`
+    /// nor `rms_mm`. Returns infinity if there are no scallops at any distance.
     pub fn max_track_mm(&self, height_mm: f64, rms_mm: f64) -> f64 {
         let by = |most: f64, found: f64| if found > 0.0 { (most / found).sqrt() } else { f64::INFINITY };
         self.track_mm * by(height_mm, self.height_mm).min(by(rms_mm, self.rms_mm))
     }
 
-    /// Returns the scallops for another distance between tracks. Heights are proportional to the square of the
-    /// distance.
+    /// Returns the scallops for the distance `track_mm` between tracks. Heights, rms and mean are proportional to the
+    /// square of the distance.
     #[must_use]
     pub fn with_track_mm(&self, track_mm: f64) -> Self {
         let times = (track_mm / self.track_mm).powi(2);
@@ -84,7 +85,8 @@ impl Scallops {
 }
 
 impl ToolPath {
-    /// Returns the scallops that this path leaves between its tracks.
+    /// Returns height, rms and mean of the scallops that this path leaves on the part. Scallops are the ridges between
+    /// tracks.
     pub fn scallops(&self) -> Scallops {
         let options = self.options();
         let wheel_at = |contact: &Contact| options.wheel_at(contact);
@@ -100,13 +102,14 @@ pub(super) struct Groove {
     pub(super) stretch: f64,
 }
 
-/// Returns a place relative to the middle of the part, about which a spiral winds, in mm.
+/// Returns `place` minus the middle of the bounding box of the part, in mm. A spiral winds about this middle.
 pub(super) fn relative_to_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2] {
     let [low, high] = outline.bounds();
     std::array::from_fn(|k| place[k] - 0.5 * (low[k] + high[k]))
 }
 
-/// Returns the groove at a place. `[x, y]` is the place relative to the middle of the part.
+/// Returns the groove that the wheel leaves at a place. `bend` are the curvatures of the surface there, and `[x, y]` is
+/// the place relative to the middle of the part ([`relative_to_middle`]).
 pub(super) fn groove(bend: &SurfaceCurvature, [x, y]: [f64; 2], wheel: &Wheel, pattern: TrackPattern) -> Groove {
     // Direction of the track over x and y; the next track is at a right angle to it.
     let radius = x.hypot(y);

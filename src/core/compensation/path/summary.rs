@@ -22,9 +22,10 @@ pub struct MachineLimits {
 }
 
 impl MachineLimits {
-    /// Returns the distance from standstill to a feed, in millimetres. The acceleration rises and falls within the
-    /// jerk limit: the distance is v / 2 (v / a + a / j), or v (v / j)^(1/2) if the acceleration a is not reached.
-    /// Without a jerk limit it is v^2 / (2 a). Without either limit it is 0.
+    /// Returns the distance that the machine needs from standstill to a feed, in millimetres.
+    ///
+    /// v is the feed, a the limit of the acceleration and j the limit of the jerk. The distance is v / 2 (v / a + a /
+    /// j), or v (v / j)^(1/2) if a is not reached. Without a jerk limit it is v^2 / (2 a). With neither limit it is 0.
     pub fn run_up_mm(&self, feed_mm_min: f64) -> f64 {
         let speed = feed_mm_min / 60.0;
         match (self.acceleration_mm_s2, self.jerk_mm_s3) {
@@ -35,7 +36,7 @@ impl MachineLimits {
         }
     }
 
-    /// Returns the highest feed that is reached from standstill within this distance, in mm/min.
+    /// Returns the highest feed, in mm/min, that the machine reaches from standstill within the distance `way_mm`.
     fn feed_for_run_up(&self, way_mm: f64) -> f64 {
         let (mut low, mut high) = (0.0, 1.0);
         while self.run_up_mm(high) < way_mm && high < 1e9 {
@@ -107,7 +108,8 @@ pub struct PathSummary {
 }
 
 impl ToolPath {
-    /// Walks the whole path once, with all tracks in parallel, and returns its extents, lengths, time and peaks.
+    /// Computes the summary of the whole path: numbers of moves and points, extent, lengths, time, and the largest
+    /// speed, acceleration, jerk and tilt. Tracks are computed in parallel.
     ///
     /// # Errors
     /// Returns [`PathError::TooManyPoints`] for more than 2e8 points.
@@ -146,7 +148,7 @@ impl ToolPath {
 }
 
 impl PathSummary {
-    /// Adds the moves of one track.
+    /// Adds the moves of one track to the summary. `safe_z_mm` is the height at which the track begins.
     fn add_track(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
         let mut before: Option<ChordCurvature> = None;
@@ -180,8 +182,9 @@ impl PathSummary {
         }
     }
 
-    /// Adds a move at feed. `centre_mm` is the distance that the wheel's centre moves; with `None` it is the distance
-    /// of the slides.
+    /// Adds a move at feed to the point `at`. `last` is the point before, and `before` the curvature of the chord
+    /// before; both are updated. `centre_mm` is the distance that the wheel's centre moves; with `None` it is the
+    /// distance between the two points.
     #[inline]
     fn add_feed(
         &mut self,
@@ -223,7 +226,7 @@ impl PathSummary {
         }
     }
 
-    /// Updates the largest jerk from two successive chords, at the place between them.
+    /// Updates the largest jerk with two successive chords, `before` and `now`. `at` is the point between them.
     #[inline]
     fn update_jerk(&mut self, before: ChordCurvature, now: ChordCurvature, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
@@ -253,12 +256,12 @@ impl PathSummary {
         }
     }
 
-    /// Checks a path against the limits of a machine.
+    /// Checks the path against the limits of a machine. An unknown limit is not checked.
     ///
     /// # Errors
-    /// Returns an error if the path exceeds, in this order: the travel of an axis, the speed of an axis, the range or
-    /// the angular speed of the head, the acceleration across the path, the jerk on the part, or if the run-up is
-    /// longer than the distance to the part.
+    /// Returns an error for the first excess, checked in this order: travel of an axis, speed of an axis, range of the
+    /// head, angular speed of the head, acceleration across the path, jerk on the part, and run-up: the distance to
+    /// reach the feed must not be longer than overrun plus lead.
     pub fn check(&self, limits: &MachineLimits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {

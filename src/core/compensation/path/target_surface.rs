@@ -45,8 +45,8 @@ pub(super) struct SurfaceCurvature {
 }
 
 impl TargetSurface {
-    /// Creates the target surface from a nominal surface and a correction. Beyond its grid the correction levels off
-    /// within `level_off_mm`.
+    /// Creates the target surface: the nominal surface, shifted along its normals by the level of the correction plus
+    /// the correction. Beyond the grid of the correction, the correction becomes constant within `level_off_mm`.
     ///
     /// # Errors
     /// Returns [`PathError::Correction`] if a value of the correction is not finite.
@@ -58,21 +58,24 @@ impl TargetSurface {
         Ok(Self { nominal, correction: correction_spline(correction, level_off_mm), level_mm: correction.level_mm })
     }
 
-    /// Returns the point and the normal of the target surface that belong to x and y of the nominal surface.
+    /// Returns a point of the target surface and its unit normal: the nominal point at `place_mm` (x and y), shifted
+    /// along the nominal normal. So x and y of the returned point can differ from `place_mm`.
     #[inline]
     pub fn at(&self, place_mm: [f64; 2]) -> Contact {
         let (point, tangents) = self.tangents(place_mm);
         Contact { point, normal: tangents[0].cross(&tangents[1]).normalize() }
     }
 
-    /// Returns the point and its derivatives by x and y.
+    /// Returns the point of the target surface for x and y of the nominal surface, and the derivatives of this point by
+    /// x and by y.
     #[inline]
     fn tangents(&self, place_mm: [f64; 2]) -> (Point, [Vector; 2]) {
         let e = self.correction.at(place_mm);
         self.offset_point(place_mm, &Jet { value: self.level_mm + e.value, ..e })
     }
 
-    /// Returns the nominal point shifted along its normal by `e`, and its derivatives by x and y.
+    /// Returns the nominal point at `place_mm`, shifted along its normal by the value of `e`, and the derivatives of
+    /// the shifted point by x and by y. `e` holds the shift with its slopes, in millimetres.
     #[inline]
     fn offset_point(&self, place_mm: [f64; 2], e: &Jet) -> (Point, [Vector; 2]) {
         let s = self.nominal.at(place_mm);
@@ -88,8 +91,8 @@ impl TargetSurface {
         (Point::new(place_mm[0], place_mm[1], s.value) + normal * d, [by_x, by_y])
     }
 
-    /// Returns the curvatures of the surface at x and y, from central differences of its normals with a step of a
-    /// thousandth of a cell.
+    /// Returns the curvatures of the target surface at x and y. They come from central differences of the normals, with
+    /// a step of a thousandth of the node spacing of the nominal field.
     pub(super) fn curvature_at(&self, place_mm: [f64; 2]) -> SurfaceCurvature {
         let (point, [by_x, by_y]) = self.tangents(place_mm);
         let normal = by_x.cross(&by_y).normalize();
@@ -119,27 +122,28 @@ impl TargetSurface {
         }
     }
 
-    /// Returns the factor for a tangent-plane step towards the projection of a point at height h above the surface:
-    /// 1 / (1 - h k), with the mean curvature k, positive in a hollow. The factor is limited to 1.9.
+    /// Returns the factor by which a step in the tangent plane is multiplied when a point is projected onto the curved
+    /// surface: 1 / (1 - h k). `height_mm` (h) is the height of the point above the surface; k is the mean curvature at
+    /// `place_mm`, positive in a hollow. The factor is at most 1.9.
     fn projection_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
         let [a, _, c] = self.curvature_at(place_mm).second_form_per_mm;
         (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)
     }
 
-    /// Returns the smallest node spacing of the nominal field and the correction field, in millimetres. The surface
-    /// has no finer detail.
+    /// Returns the smallest node spacing, along x or y, of the nominal field and of the correction field, in
+    /// millimetres. The surface has no finer detail.
     pub(super) fn min_node_spacing_mm(&self) -> f64 {
         let [a, b] = [self.nominal.spacing_mm(), self.correction.spacing_mm()].map(|[x, y]| x.min(y));
         a.min(b)
     }
 }
 
-/// Returns the displacement of the centre of a ball that touches the nominal surface, when the surface is shifted
-/// along its normals.
+/// Returns by how much the centre of a ball moves when the surface that the ball touches is shifted along its normals,
+/// in mm. Returns `None` if the projection of the centre does not converge.
 ///
-/// The ball's radius R is the distance of its centre from the surface. Let P be the projection of the centre onto the
-/// nominal surface, n the normal there, e the shift, and n' the normal of the shifted surface. The result is
-/// P + e n + R n' minus the centre, in mm. Returns `None` if the projection does not converge.
+/// `centre` is the centre of the ball in contact with `nominal`, and `shift` is the shift along the normals. Let P be
+/// the projection of the centre onto the nominal surface, R the distance from P to the centre, n the normal at P, e the
+/// shift there, and n' the normal of the shifted surface. The result is P + e n + R n' minus the centre.
 pub fn ball_displacement(nominal: &TargetSurface, shift: &HeightField, centre: &Point) -> Option<Vector> {
     let mut place = [centre.x, centre.y];
     for _ in 0..STEPS {
@@ -172,12 +176,12 @@ pub fn ball_displacement(nominal: &TargetSurface, shift: &HeightField, centre: &
 /// for the curvature.
 const STEPS: usize = 100;
 
-/// Fits a spline through a correction and continues it beyond its grid with a slope that falls to zero within
-/// `length_mm`.
+/// Fits a spline through the values of a correction and extends it beyond its grid, where it becomes constant within
+/// `length_mm` (L).
 ///
-/// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at a distance s
-/// beyond the border, for t = s / L from 0 to 1. The slope is continuous at the border and zero at L, and the
-/// correction is constant beyond L.
+/// At a distance s beyond the border the correction differs from its value at the border by g L (t - t^3 + t^4 / 2),
+/// where g is the slope across the border and t = s / L is at most 1. So the slope is continuous at the border and 0
+/// from L on.
 pub fn correction_spline(correction: &Correction, length_mm: f64) -> HeightField {
     let grid = correction.grid;
     let spacing_mm = [0, 1].map(|k| {

@@ -85,7 +85,7 @@ pub(super) struct StepDeviation {
 }
 
 impl RotaryAxis {
-    /// Returns a vector of the upright head after a rotation of the head.
+    /// Returns the vector `v`, given with the head upright, after a right-handed rotation of the head by `angle_rad`.
     #[inline]
     pub fn rotated(&self, v: &Vector, angle_rad: f64) -> Vector {
         let (s, c) = angle_rad.sin_cos();
@@ -95,18 +95,21 @@ impl RotaryAxis {
         }
     }
 
-    /// Converts a right-handed angle into the reading of the axis' scale, in rad.
+    /// Converts a right-handed angle about the axis into the angle that the scale of the axis shows, in rad.
     pub fn scale_reading_rad(&self, angle_rad: f64) -> f64 {
         if self.reversed { 0.0 - angle_rad } else { angle_rad }
     }
 
-    /// Returns the offset of the slides that keeps the wheel's centre in place when the head tilts: (R - 1) v, in mm.
+    /// Returns the offset, in mm, that the linear axes must add to keep the wheel's centre in place when the head tilts
+    /// by `angle_rad`: (R - 1) v, where R is the rotation and v the vector from the wheel's centre to the pivot with
+    /// the head upright. Returns 0 if the control itself keeps the centre in place.
     #[inline]
     pub fn pivot_shift_mm(&self, angle_rad: f64) -> Vector {
         self.pivot_mm.map_or_else(Vector::zeros, |pivot| self.rotated(&pivot, angle_rad) - pivot)
     }
 
-    /// Returns the rotation that brings z onto a normal, seen along the axis, in rad.
+    /// Returns the angle, in rad, by which the head must rotate to bring its upright axis z onto a surface normal. Only
+    /// the component of the normal across the rotary axis counts.
     #[inline]
     fn normal_tilt_rad(&self, normal: &Vector) -> f64 {
         match self.axis {
@@ -120,7 +123,8 @@ impl RotaryAxis {
         if self.step_rad > 0.0 { (angle_rad / self.step_rad).round() * self.step_rad } else { angle_rad }
     }
 
-    /// Returns the largest rise of the slides over all angles in the range, in mm.
+    /// Returns the largest height, in mm, that [`Self::pivot_shift_mm`] adds to the linear axes at any angle in the
+    /// range of the axis.
     fn max_lift_mm(&self) -> f64 {
         let [a, b] = self.range_rad.map(|angle| self.scale_reading_rad(angle));
         // The height is a sine of the angle: this number of samples finds its maximum to a millionth of the distance
@@ -132,7 +136,8 @@ impl RotaryAxis {
 }
 
 impl PathOptions {
-    /// Returns the tilt of the head at a contact, in rad, right-handed; 0 for a wheel without tilt.
+    /// Returns the tilt of the head when the wheel touches at `contact`, in rad, right-handed. Returns 0 if the wheel
+    /// is not tilted.
     #[inline]
     pub fn tilt_rad(&self, contact: &Contact) -> f64 {
         match (self.tilt, &self.rotary) {
@@ -144,13 +149,13 @@ impl PathOptions {
         }
     }
 
-    /// Returns the wheel in its orientation at a contact.
+    /// Returns the wheel with its spindle in the direction that it has when the wheel touches at `contact`.
     #[inline]
     pub fn wheel_at(&self, contact: &Contact) -> Wheel {
         if self.tilt.is_none() { self.wheel } else { self.wheel_turned(self.tilt_rad(contact)) }
     }
 
-    /// Returns the direction of the head's axis at a contact: z rotated by the tilt.
+    /// Returns the direction of the head when the wheel touches at `contact`: the z axis, rotated by the tilt.
     #[inline]
     pub fn head_at(&self, contact: &Contact) -> Vector {
         let turned = |rotary: &RotaryAxis| rotary.rotated(&Vector::z(), self.tilt_rad(contact));
@@ -166,14 +171,15 @@ impl PathOptions {
         wheel
     }
 
-    /// Returns the rotary axis if the wheel is tilted by it.
+    /// Returns the rotary axis of the head; `None` if there is none, or if the path does not tilt the wheel.
     #[inline]
     pub fn tilting_axis(&self) -> Option<&RotaryAxis> {
         self.tilt.and(self.rotary.as_ref())
     }
 
-    /// Returns position and tilt of the wheel at a contact, lifted off by `lifted_mm` along the normal, or `None` if a
-    /// rim cannot touch there.
+    /// Returns position and tilt of the wheel for a contact. If `lifted_mm` is above 0, the wheel is lifted off by this
+    /// distance along the normal. Returns `None` if the rim of the wheel cannot touch there, because the normal is too
+    /// near to the spindle.
     #[inline]
     pub(super) fn wheel_position(&self, contact: &Contact, lifted_mm: f64) -> Option<WheelPosition> {
         let centre = |wheel: Wheel| {
@@ -196,8 +202,9 @@ impl PathOptions {
         })
     }
 
-    /// Computes the deviation of a step at its middle. The control moves slides and head in proportion. An error of
-    /// the tilt counts as the distance that it moves the points of the ring.
+    /// Computes how far a straight step `from` - `to` is from the path at the middle of the step, where the wheel
+    /// should be at `middle`. During a step the control moves linear axes and head in proportion. An error of the tilt
+    /// angle counts as the distance by which it moves the ring of the wheel.
     #[inline]
     pub(super) fn step_deviation(
         &self,
@@ -226,14 +233,15 @@ impl PathOptions {
         StepDeviation { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
     }
 
-    /// Returns the largest rise of the slides above the wheel's centre for any angle of the head, in mm; 0 for a wheel
-    /// without tilt.
+    /// Returns the largest height, in mm, by which the linear axes can be above the wheel's centre because of the tilt,
+    /// at any angle in the range of the axis. Returns 0 if the path does not tilt the wheel.
     pub(super) fn lift_mm(&self) -> f64 {
         self.tilting_axis().map_or(0.0, RotaryAxis::max_lift_mm)
     }
 
-    /// Returns the height that rapid moves must clear at a contact, in mm. It is the height of the wheel's centre. If
-    /// the wheel rotates in the air, it is at least the height of the contact plus the reach of the wheel.
+    /// Returns the height that rapid moves must clear at a contact, in mm: the height of the wheel's centre at the
+    /// position `stand`. If the wheel is tilted, it is at least the height of the contact, lifted by `lifted_mm`, plus
+    /// the reach of the wheel.
     #[inline]
     pub(super) fn clearance_height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &WheelPosition) -> f64 {
         match self.tilt {
@@ -246,10 +254,12 @@ impl PathOptions {
     }
 }
 
-/// Adds the necessary tilt to the error of an upright wheel that cannot reach a place.
+/// Completes the error `refused` of an upright wheel that cannot reach a place: searches a constant tilt with which the
+/// wheel can grind the part, and adds it to the error.
 ///
-/// Tries constant tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns
-/// [`PathError::NeedsTilt`] with the first tilt for which `would_do` is true; otherwise returns the error unchanged.
+/// Tries tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns [`PathError::NeedsTilt`]
+/// with the first tilt for which `would_do` returns true. Returns `refused` unchanged if there is none, if a tilt
+/// cannot help, or if the head cannot tilt.
 pub(super) fn suggest_tilt(
     refused: PathError,
     options: &PathOptions,

@@ -23,16 +23,17 @@ pub struct ToolPath {
 }
 
 impl ToolPath {
-    /// Lays tracks over a part.
+    /// Plans the tracks of a wheel over a part. `wanted` is the target surface of the pass, `outline` the outline of
+    /// the part.
     ///
     /// Checks the options and the fit of the wheel: slope of the surface, hollows in every direction, and contact of
-    /// the wheel's body with the part away from the contact point. [`super::PathSummary::check`] checks travel, speed and
-    /// acceleration.
+    /// the wheel's body with the part away from the contact point. [`super::PathSummary::check`] checks travel, speed
+    /// and acceleration.
     ///
     /// # Errors
-    /// Returns an error for invalid options and for a wheel that does not fit. Each error gives place, value, limit
-    /// and remedy. If a constant tilt of the head solves the problem, the error is [`PathError::NeedsTilt`] with that
-    /// angle.
+    /// Returns an error for invalid options, for a wheel that does not fit, and for more than 1e6 tracks. Each error
+    /// gives place, value, limit and remedy. If a constant tilt of the head solves the problem, the error is
+    /// [`PathError::NeedsTilt`] with that angle.
     pub fn new(wanted: TargetSurface, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
         let grain_mm = wanted.min_node_spacing_mm();
@@ -55,8 +56,8 @@ impl ToolPath {
         wheel_fit::check_body(&self.target, &self.outline, &self.options)
     }
 
-    /// Returns the smallest angle between the axis of the head and a normal of the part, in rad. At 0 a ball touches
-    /// with its pole, which has no cutting speed.
+    /// Returns the smallest angle between the direction of the head and a normal of the part, in rad. At the angle 0 a
+    /// ball touches with its pole, which has no cutting speed.
     pub fn min_head_angle_rad(&self) -> f64 {
         let lean = |place: [f64; 2]| {
             let contact = self.target.at(place);
@@ -65,34 +66,35 @@ impl ToolPath {
         wheel_fit::on_grid(&self.outline, wheel_fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
     }
 
-    /// Returns the distance between tracks over x and y, in millimetres.
+    /// Returns the distance between neighbouring tracks, seen along z, in millimetres.
     pub fn track_mm(&self) -> f64 {
         self.tracks.track_mm
     }
 
-    /// Returns the number of tracks. A track that leaves the part and comes back counts once for each piece.
+    /// Returns the number of tracks. If a track leaves the part and comes back, each piece counts.
     pub fn track_count(&self) -> usize {
         self.tracks.spans.len()
     }
 
-    /// Returns the height z of the rapid moves in x and y, in millimetres, in the model frame.
+    /// Returns the safe height: the z of the model frame at which rapid moves in x and y travel, in millimetres.
     pub fn safe_z_mm(&self) -> f64 {
         self.flipped_height_mm(self.safe_z_mm)
     }
 
-    /// Returns the height of the rapid moves as seen from the side from which the wheel comes, in millimetres.
+    /// Returns the safe height of rapid moves as the wheel sees it, in millimetres: for a wheel from below, z is
+    /// mirrored.
     pub(super) fn travel_mm(&self) -> f64 {
         self.safe_z_mm
     }
 
-    /// Converts a height as seen from the wheel's side into the model frame, or back. The sign changes for a wheel
-    /// from below.
+    /// Converts a height between the model frame and the frame of the wheel, in either direction. For a wheel from
+    /// below the sign changes; otherwise the height is unchanged.
     #[inline]
     pub(super) fn flipped_height_mm(&self, z_mm: f64) -> f64 {
         if self.options.from_below { -z_mm } else { z_mm }
     }
 
-    /// Returns the smallest node spacing of the surface, in millimetres.
+    /// Returns the smallest node spacing of the target surface, in millimetres; the surface has no finer detail.
     pub(super) fn min_node_spacing_mm(&self) -> f64 {
         self.min_node_spacing_mm
     }
@@ -112,8 +114,8 @@ impl ToolPath {
         &self.outline
     }
 
-    /// Returns the position and tilt of the wheel at parameter `t` of a track. They are NaN if a rim cannot touch
-    /// there; [`ToolPath::new`] rejects these paths.
+    /// Returns position and tilt of the wheel at the parameter `t` of a track ([`Span::place`]). They are NaN if the
+    /// rim of the wheel cannot touch there; [`ToolPath::new`] rejects such a path.
     #[inline]
     pub(super) fn wheel_position(&self, span: &Span, t: f64) -> WheelPosition {
         let contact = self.target.at(span.place(t));
@@ -128,7 +130,7 @@ impl ToolPath {
         self.options.wheel_position(&contact, lifted).unwrap_or(none)
     }
 
-    /// Returns the height that rapid moves must clear at parameter `t` of a track, in mm; NaN if the wheel cannot
+    /// Returns the height that rapid moves must clear at the parameter `t` of a track, in mm; NaN if the wheel cannot
     /// touch there.
     fn clearance_height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.target.at(span.place(t));
@@ -138,8 +140,11 @@ impl ToolPath {
             .map_or(f64::NAN, |stand| self.options.clearance_height_mm(&contact, lifted, &stand))
     }
 
-    /// Returns the largest height that rapid moves must clear, in mm. The search uses steps of about 1 mm on some of
-    /// the tracks; the safe height above it leaves enough room.
+    /// Returns the largest height, in mm, that rapid moves must clear. It is searched in steps of about 1 mm along some
+    /// of the tracks; the safe height that is added to it covers the places between.
+    ///
+    /// # Errors
+    /// Returns [`PathError::CannotTouch`] if the wheel cannot touch at one of these places.
     fn max_clearance_height_mm(&self) -> Result<f64, PathError> {
         let highest = |span: &Span| {
             let (from, to) = span.with_leads(&self.options);

@@ -38,7 +38,8 @@ pub(super) struct Tracks {
 }
 
 impl Span {
-    /// Returns x and y at a parameter, in mm.
+    /// Returns the place `[x, y]` on the track at the parameter `t`, in mm. On a line `t` is x in mm; on a spiral it is
+    /// the angle in rad.
     #[inline]
     pub(super) fn place(&self, t: f64) -> [f64; 2] {
         match self.curve {
@@ -50,7 +51,7 @@ impl Span {
         }
     }
 
-    /// Returns the arc length over x and y from parameter 0, in mm.
+    /// Returns the length of the curve from the parameter 0 to `t`, seen along z, in mm.
     #[inline]
     fn arc_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -59,7 +60,8 @@ impl Span {
         }
     }
 
-    /// Returns the length over x and y per unit of the parameter, in mm.
+    /// Returns the derivative of the length of the track, seen along z, by the parameter at `t`, in mm per unit of the
+    /// parameter.
     #[inline]
     pub(super) fn length_per_parameter_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -68,13 +70,13 @@ impl Span {
         }
     }
 
-    /// Returns the length over x and y between two parameters, in mm.
+    /// Returns the length of the track between the parameters `from` and `to`, seen along z, in mm.
     pub(super) fn length_mm(&self, from: f64, to: f64) -> f64 {
         (self.arc_mm(to) - self.arc_mm(from)).abs()
     }
 
-    /// Returns the parameter at a signed arc length `by_mm` from parameter `t`. On a spiral Newton's method solves for
-    /// it.
+    /// Returns the parameter of the place that is `by_mm` along the track from the parameter `t`; `by_mm` can be
+    /// negative. On a spiral, Newton's method finds it.
     fn parameter_beyond(&self, t: f64, by_mm: f64) -> f64 {
         match self.curve {
             TrackCurve::Line { .. } => t + by_mm,
@@ -93,7 +95,8 @@ impl Span {
         }
     }
 
-    /// Returns the parameters at the start of the lead-in and at the end of the lead-out.
+    /// Returns the parameters of the track at the start of the lead-in and at the end of the lead-out. In the leads the
+    /// wheel comes down onto the surface and lifts off.
     pub(super) fn with_leads(&self, options: &PathOptions) -> (f64, f64) {
         let ahead = (self.to - self.from).signum() * options.lead_mm;
         (self.parameter_beyond(self.from, -ahead), self.parameter_beyond(self.to, ahead))
@@ -101,11 +104,11 @@ impl Span {
 }
 
 impl Tracks {
-    /// Lays tracks that cover the outline.
+    /// Lays tracks over the outline of the part, `track_mm` apart.
     ///
     /// # Errors
-    /// Returns [`PathError::TooManyTracks`] for 1e6 tracks or more, and [`PathError::Empty`] if no track is on the
-    /// part.
+    /// Returns [`PathError::TooManyTracks`] if the size of the part makes 1e6 tracks or more, and [`PathError::Empty`]
+    /// if no track is on the part.
     pub(super) fn lay(outline: &Aperture, options: &PathOptions, track_mm: f64) -> Result<Self, PathError> {
         let [low, high] = outline.bounds();
         let size = [high[0] - low[0], high[1] - low[1]];
@@ -120,8 +123,9 @@ impl Tracks {
         if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }
     }
 
-    /// Returns the lift of the wheel off the surface at a parameter, in millimetres: s^2 / (2 rho) at a distance s
-    /// beyond a span's end, with the lead radius rho.
+    /// Returns how far the wheel is lifted off the surface at the parameter `t` of a track, in millimetres: s^2 / (2
+    /// rho) at a distance s beyond an end of `span`, with the lead radius rho of the options. Returns 0 between the
+    /// ends.
     #[inline]
     pub(super) fn lift_mm(&self, span: &Span, t: f64, options: &PathOptions) -> f64 {
         let ahead = (span.to - span.from).signum();
@@ -181,7 +185,8 @@ fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
     Tracks { spans, track_mm }
 }
 
-/// Returns the pieces of a curve between two parameters that are within the overrun of the outline, in ascending order.
+/// Returns the pieces of `curve` that are on the part or within `overrun_mm` of its outline, between the parameters
+/// `least` and `most`, in ascending order.
 fn on_part(curve: &Span, outline: &Aperture, overrun_mm: f64, least: f64, most: f64) -> Vec<Span> {
     let inside = |t: f64| {
         let [x, y] = curve.place(t);

@@ -58,12 +58,14 @@ pub enum Wheel {
 }
 
 impl Wheel {
-    /// Returns a cup whose spindle is tilted by an angle from z towards -x.
+    /// Returns a cup wheel whose spindle is tilted from z towards -x by `tilt_rad`. `ring_mm` is the mean radius of the
+    /// ring, `tube_mm` the radius of the profile of the face.
     pub fn tilted_cup(ring_mm: f64, tube_mm: f64, tilt_rad: f64) -> Self {
         Self::Cup { ring_mm, tube_mm, spindle: Vector::new(-tilt_rad.sin(), 0.0, tilt_rad.cos()) }
     }
 
-    /// Returns the programmed point (the wheel's centre) for a contact, or `None` if the rim cannot touch there.
+    /// Returns the wheel's centre, which is the programmed point, when the wheel touches at `contact`. Returns `None`
+    /// if a rim or ring cannot touch there, because the normal is within 2° of the spindle.
     #[inline]
     pub fn centre(&self, contact: &Contact) -> Option<Point> {
         let Contact { point, normal } = contact;
@@ -77,8 +79,8 @@ impl Wheel {
         }
     }
 
-    /// Returns the principal curvatures of the wheel at the contact, in 1/mm: around the spindle, then across. Also
-    /// returns the unit direction of the first.
+    /// Returns the principal curvatures of the wheel at the contact with this `normal`, in 1/mm: first around the
+    /// spindle, then across. The returned unit vector is the direction of the first curvature.
     pub(super) fn curvatures(&self, normal: &Vector) -> ([f64; 2], Vector) {
         match self {
             Self::Sphere { radius_mm } => ([1.0 / radius_mm; 2], normal.cross(&Vector::y()).normalize()),
@@ -90,8 +92,8 @@ impl Wheel {
         }
     }
 
-    /// Returns the signed distance of a point from the wheel's surface, in mm, negative inside. The point is relative
-    /// to the wheel's centre.
+    /// Returns the signed distance of a point from the surface of the wheel, in mm, negative inside the wheel.
+    /// `from_centre` is the vector from the wheel's centre to the point.
     pub fn distance_mm(&self, from_centre: &Vector) -> f64 {
         match self {
             Self::Sphere { radius_mm } => from_centre.norm() - radius_mm,
@@ -119,7 +121,7 @@ impl Wheel {
         }
     }
 
-    /// Returns the largest distance of a point of the rim or ball from the wheel's centre, in millimetres.
+    /// Returns the largest distance, in millimetres, from the wheel's centre to a point of its ball, rim or ring.
     pub fn reach_mm(&self) -> f64 {
         match self {
             Self::Sphere { radius_mm } => *radius_mm,
@@ -127,7 +129,7 @@ impl Wheel {
         }
     }
 
-    /// Returns the wheel mirrored in z: the z component of the spindle changes sign.
+    /// Returns the wheel mirrored in the plane z = 0: the z component of the spindle changes its sign.
     #[must_use]
     pub fn mirrored(mut self) -> Self {
         if let Self::Torus { spindle, .. } | Self::Cup { spindle, .. } = &mut self {
@@ -136,7 +138,7 @@ impl Wheel {
         self
     }
 
-    /// Returns a description of the wheel for the header of a program.
+    /// Returns shape, size and spindle of the wheel in one line, for the comment at the head of a grinding program.
     pub fn description(&self) -> String {
         let of = |v: &Vector| format!("{:.4} {:.4} {:.4}", v.x, v.y, v.z);
         match self {

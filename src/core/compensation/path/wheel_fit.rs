@@ -23,7 +23,12 @@ const MARGIN: f64 = 1.05;
 const MAX_BODY_DEPTH_MM: f64 = 1e-4;
 /// Maximum slope that a wheel can grind. On steeper slopes the machine's spindle is in the way.
 const MAX_SLOPE_RAD: f64 = 1.2;
-/// Checks the fit of the wheel at places all over the part and returns the distance between tracks over x and y, in mm.
+/// Checks at places all over the part that the wheel fits the surface `wanted`. Returns the distance between tracks,
+/// seen along z, in mm: the distance of the options, or the largest distance at which the scallops stay within their
+/// limit everywhere.
+///
+/// # Errors
+/// Returns the error at the place where the wheel fits worst.
 pub(super) fn track_mm(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let places = places(outline, PLACES);
     let one = |place: &[f64; 2]| fit_at(&wanted.curvature_at(*place), *place, outline, options);
@@ -35,15 +40,16 @@ pub(super) fn track_mm(wanted: &TargetSurface, outline: &Aperture, options: &Pat
     }
 }
 
-/// Returns true if the wheel fits at a few places of the part. This quick test finds most wheels that do not fit.
+/// Returns false if the wheel does not fit the surface `wanted` at one of a few places of the part. This quick test
+/// finds most wheels that do not fit; a wheel that passes it is not yet proven to fit.
 pub(super) fn may_fit(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> bool {
     const FEW: usize = 21;
     places(outline, FEW).iter().all(|place| fit_at(&wanted.curvature_at(*place), *place, outline, options).is_ok())
 }
 
-/// Combines the results at two places. Returns the smaller distance, or an error if there is one. Of two hollows the
-/// narrower one is returned, because it gives the wheel that fits everywhere. Of other errors the first one is
-/// returned, so that the same path always gives the same message.
+/// Combines the results of [`fit_at`] at two places: returns the smaller distance, or the error if there is one. Of two
+/// [`PathError::Hollow`] errors, returns the one that requires the greater reduction of the wheel, because that wheel
+/// fits at both places. Of two other errors, returns `a`, so that the same path always gives the same message.
 fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
     let room = |e: &PathError| match e {
         PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
@@ -56,7 +62,8 @@ fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64,
     }
 }
 
-/// Returns the points of a grid over the part and points on its border, x and y in mm.
+/// Returns places `[x, y]` on the part, in mm: the points of a `count` x `count` grid that lie on the part, and 4
+/// `count` points on its border.
 fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let mut places = on_grid(outline, count);
     places.extend(outline.outline_mm(4 * count));
@@ -71,8 +78,12 @@ pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     grid.filter(|[x, y]| outline.contains(*x, *y)).collect()
 }
 
-/// Checks slope, contact and hollows at a place. Returns the distance between tracks over x and y that leaves the
-/// requested scallop height, in mm, or infinity if no scallop height is given.
+/// Checks slope, contact and hollows at one place of the part; `bend` are the curvatures of the surface there. Returns
+/// the distance between tracks, seen along z, in mm, at which the scallops reach their maximum height. Returns infinity
+/// if the options give the distance itself.
+///
+/// # Errors
+/// Returns an error if the surface is too steep, if the rim cannot touch, or if a hollow is too narrow for the wheel.
 fn fit_at(
     bend: &SurfaceCurvature,
     place: [f64; 2],
@@ -105,15 +116,16 @@ fn fit_at(
     Ok((8.0 * height / groove.curvature_per_mm).sqrt() / groove.stretch)
 }
 
-/// Returns the wheel's curvature in the tangent directions of `bend`, in 1/mm: along the first, mixed, along the
-/// second.
+/// Returns the second fundamental form of the wheel at the contact, in 1/mm, in the two tangent directions of `bend`:
+/// curvature along the first, mixed term, curvature along the second.
 pub(super) fn wheel_curvatures(bend: &SurfaceCurvature, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
     let [c, s] = [0, 1].map(|k| direction.dot(&bend.tangents[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
 }
 
-/// Returns the error for the direction in which the wheel has the least room in the hollow.
+/// Returns the error for a hollow that is too narrow for the wheel, with the direction in which the wheel has the least
+/// room. `bend` are the curvatures of the surface at `[x_mm, y_mm]`, `wheel` those of the wheel ([`wheel_curvatures`]).
 fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
     let in_direction = |q: &[f64; 3], angle: f64| {
         let (s, c) = angle.sin_cos();
@@ -133,11 +145,15 @@ fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> 
     }
 }
 
-/// Checks the body of the wheel, in contacts all over the part, against every surface point within its reach.
+/// Checks that the body of the wheel does not cut the part away from the contact point. Places all over the part are
+/// tried as contacts, each against all surface points within reach of the wheel.
 ///
-/// The curvatures show that a wheel fits at the contact. This check shows that it does not touch elsewhere: the far
-/// side of a cup, the flank of a disc, the opposite wall of a valley. The error is a place that the wheel cannot touch,
-/// if there is one, and otherwise the deepest cut.
+/// The check of the curvatures shows that a wheel fits near its contact. This check finds a touch elsewhere: of the far
+/// side of a cup, the flank of a disc, or the opposite wall of a valley.
+///
+/// # Errors
+/// Returns [`PathError::CannotTouch`] if the wheel cannot touch at one of the places, otherwise [`PathError::Body`] for
+/// the deepest cut.
 pub(super) fn check_body(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> Result<(), PathError> {
     let ground: Vec<([f64; 2], Point)> =
         places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();

@@ -40,10 +40,11 @@ impl Conic {
     /// The plane z = 0.
     pub const PLANE: Self = Self { curvature_per_mm: 0.0, conic: 0.0 };
 
-    /// Creates a conic from its radius of curvature in millimetres, which may be infinite, and its conic constant.
+    /// Creates a conic of revolution. `radius_mm` is the radius of curvature at the vertex, which may be infinite;
+    /// `conic` is the conic constant.
     ///
     /// # Errors
-    /// A radius that is NaN or less than 1e-6 mm in magnitude, or a conic constant that is not finite.
+    /// Returns an error if the radius is NaN or less than 1e-6 mm in magnitude, or if the conic constant is not finite.
     pub fn new(radius_mm: f64, conic: f64) -> Result<Self, DefinitionError> {
         let curvature_per_mm = error::checked_curvature("radius_mm", radius_mm)?;
         Ok(Self { curvature_per_mm, conic: error::check_finite("conic", conic)? })
@@ -54,7 +55,8 @@ impl Conic {
         self.curvature_per_mm
     }
 
-    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the conic and beyond.
+    /// Returns the sag z and the derivative dz/dq for q = h^2, where h is the distance from the axis. Returns `None` at
+    /// the edge of the conic and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -77,7 +79,10 @@ impl TryFrom<&ConicDefinition> for Conic {
     }
 }
 
-/// Returns the checked conic that polynomials are added to; the plane if no conic is given.
+/// Returns the checked conic to which polynomials are added; the plane if `written` is `None`.
+///
+/// # Errors
+/// Returns an error if the radius or the conic constant is not valid.
 pub(super) fn base_conic(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
     written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.in_table("base")))
 }
@@ -109,10 +114,11 @@ pub struct AsphereDefinition {
 }
 
 impl Asphere {
-    /// Creates an asphere from its conic and its (power, coefficient) terms.
+    /// Creates an asphere from a conic and the terms (power of the distance from the axis, coefficient in mm^(1 -
+    /// power)).
     ///
     /// # Errors
-    /// A power below 2 or above 60 or given twice, or a coefficient that is not finite.
+    /// Returns an error if a power is below 2, above 60 or given twice, or if a coefficient is not finite.
     pub fn new(base: Conic, terms: &[(u32, f64)]) -> Result<Self, DefinitionError> {
         let mut sorted = terms.to_vec();
         sorted.sort_by_key(|term| term.0);
@@ -129,7 +135,8 @@ impl Asphere {
         Ok(Self { base, terms: sorted })
     }
 
-    /// Returns the sag z and dz/dq at q = h^2; `None` at the edge of the conic and beyond.
+    /// Returns the sag z and the derivative dz/dq for q = h^2, where h is the distance from the axis. Returns `None` at
+    /// the edge of the conic and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
@@ -159,8 +166,12 @@ impl TryFrom<&AsphereDefinition> for Asphere {
     }
 }
 
-/// Reads coefficients whose keys are numbers, each with or without `letter` before it. `table` is the name of their
-/// table, and `expected` describes a key for error messages.
+/// Converts a table of coefficients to (number, coefficient) pairs, sorted by number. A key is a number with or without
+/// `letter` before it, such as `A4` or `4`. `table` is the name of the table, and `expected` describes a valid key;
+/// both are for messages.
+///
+/// # Errors
+/// Returns an error if a key is not a number, if a number is given twice, or if a coefficient is not finite.
 pub(super) fn parse_coefficients(
     table: &str,
     letter: char,

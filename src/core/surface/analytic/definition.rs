@@ -195,10 +195,11 @@ pub struct DefinedSurface {
 }
 
 impl SurfaceDefinition {
-    /// Reads a definition from TOML text.
+    /// Reads a definition from TOML text. Does not check the values; [`Self::resolve`] does that.
     ///
     /// # Errors
-    /// An error with line and column if the text is not TOML, or if a key is missing, unknown or of the wrong type.
+    /// Returns an error with line and column if the text is not TOML, or if a key is missing, unknown or of the wrong
+    /// type.
     pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         let in_text = |error: toml::de::Error| toml_error(text, error.span(), error.message());
         let mut tables = DeTable::parse(text).map_err(in_text)?.into_inner();
@@ -221,10 +222,10 @@ impl SurfaceDefinition {
         })
     }
 
-    /// Checks the definition, and returns the surface.
+    /// Checks the values of the definition, and returns the surface.
     ///
     /// # Errors
-    /// The first value that is not valid, with its key, the limit and a remedy.
+    /// Returns an error about the first value that is not valid, with its key, the limit and a remedy.
     pub fn resolve(&self) -> Result<DefinedSurface, DefinitionError> {
         let formula = self.surface.resolve().map_err(|error| error.in_table("surface"))?;
         let sampling = match &self.sampling {
@@ -236,10 +237,11 @@ impl SurfaceDefinition {
 }
 
 impl Formula {
-    /// Checks the numbers of the formula, and returns the surface.
+    /// Checks the values of the formula, and returns the surface without an aperture.
     ///
     /// # Errors
-    /// The first value that is not valid; its key is relative to the table of the formula.
+    /// Returns an error about the first value that is not valid. The path of its key starts below the table of the
+    /// formula, as in `radius_mm` instead of `surface.radius_mm`.
     pub fn resolve(&self) -> Result<AnalyticSurface, DefinitionError> {
         Ok(match self {
             Self::Plane(PlaneDefinition {}) => AnalyticSurface::Conic(Conic::PLANE),
@@ -258,7 +260,10 @@ impl Formula {
 }
 
 impl SamplingDefinition {
-    /// Checks the numbers, and returns the rule for the node spacing.
+    /// Checks the values, and returns the rule for the node spacing.
+    ///
+    /// # Errors
+    /// Returns an error if a value is outside its range, or if not exactly one of the two keys is given.
     fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
             (Some(spacing), None) => {
@@ -278,11 +283,12 @@ impl SamplingDefinition {
 }
 
 impl DefinedSurface {
-    /// Joins a formula with its aperture, both in the surface's own frame.
+    /// Joins a formula with the outline of the part. Both are in the frame of the surface.
     ///
     /// # Errors
-    /// An aperture that is not a valid outline, that reaches beyond the normalisation radius or to places where the
-    /// formula has no value, or that does not contain the centre of an off-axis section.
+    /// Returns an error if the aperture is not a valid outline, reaches beyond the normalisation radius or to a place
+    /// where the formula has no value, or does not contain the centre of an off-axis section in the frame of its
+    /// parent.
     pub fn new(formula: AnalyticSurface, aperture: Aperture, sampling: Sampling) -> Result<Self, DefinitionError> {
         aperture.validate()?;
         if let AnalyticSurface::OffAxis(section) = &formula {
@@ -308,7 +314,7 @@ impl DefinedSurface {
     /// Reads and checks a definition in TOML text.
     ///
     /// # Errors
-    /// The first error in the text or in a value, with line and column.
+    /// Returns an error with line and column for the first fault in the text or in a value.
     pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| with_location(text, error))
     }
@@ -318,7 +324,7 @@ impl DefinedSurface {
         &self.formula
     }
 
-    /// Returns the outline.
+    /// Returns the outline of the part.
     pub fn aperture(&self) -> &Aperture {
         &self.aperture
     }
@@ -329,15 +335,17 @@ impl DefinedSurface {
     }
 }
 
-/// Adds line and column to an error about a value if the text contains its key; otherwise returns the error unchanged.
+/// Adds line and column to an error about a value. Returns the error unchanged if the text does not contain the key of
+/// the value.
 fn with_location(text: &str, error: DefinitionError) -> DefinitionError {
     let Some(span) = error.key().and_then(|key| key_span(text, &key)) else { return error };
     let (line, column) = line_and_column(text, span.start);
     DefinitionError::Located { line, column, source: Box::new(error) }
 }
 
-/// Returns the place in the text of the value of a key. If the text does not contain the key, returns the place of the
-/// innermost table on its path; `None` if there is no such table.
+/// Returns the byte range of the value of a key; `path` is the path of the key, such as `surface.radius_mm`. If the
+/// text does not contain the key, returns the range of the name of the innermost table on the path; `None` if there is
+/// no such table either.
 fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     let root = DeTable::parse(text).ok()?;
     let mut table = root.get_ref();
@@ -353,7 +361,11 @@ fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     found
 }
 
-/// Converts `{ kind = "a", b = 1 }` to `{ a = { b = 1 } }`. Every part keeps its place in the text.
+/// Converts the table `{ kind = "a", b = 1 }` to `{ a = { b = 1 } }`, for the enums whose variant is an outer key.
+/// Every value keeps its place in the text. `name` is the name of the table, for messages.
+///
+/// # Errors
+/// Returns an error with line and column if the value is no table, or if `kind` is missing or no string.
 fn deserialize_by_kind<'t>(
     text: &str,
     name: &str,
@@ -375,13 +387,14 @@ fn deserialize_by_kind<'t>(
     Ok(ValueDeserializer::from(Spanned::new(span, DeValue::Table(outer))))
 }
 
-/// Returns an error at a place of the text; at its start if `span` is `None`.
+/// Creates an error with the line and column of the byte range `span`; at the start of the text if `span` is `None`.
 fn toml_error(text: &str, span: Option<Range<usize>>, message: &str) -> DefinitionError {
     let (line, column) = line_and_column(text, span.map_or(0, |span| span.start));
     DefinitionError::Toml { line, column, message: message.to_owned() }
 }
 
-/// Returns line and column of a byte, both counted from 1. Columns are counted in characters.
+/// Returns the line and the column of the byte with the index `byte`, both counted from 1. Columns are counted in
+/// characters.
 fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);

@@ -86,12 +86,14 @@ pub enum DefinitionError {
 }
 
 impl DefinitionError {
-    /// Returns the error for a number outside its limits.
+    /// Creates the error for a value outside its range. `key` is the path of the key; `limit` and `remedy` are texts
+    /// for the message.
     pub(super) fn out_of_range(key: &str, value: f64, limit: &'static str, remedy: &'static str) -> Self {
         Self::OutOfRange { key: key.to_owned(), value, limit, remedy }
     }
 
-    /// Puts the name of the enclosing table before the key.
+    /// Puts `table`, the name of the enclosing table, and a dot before the key of the error. Errors without a stored
+    /// key do not change.
     pub(super) fn in_table(mut self, table: &str) -> Self {
         match &mut self {
             Self::OutOfRange { key, .. }
@@ -103,8 +105,8 @@ impl DefinitionError {
         self
     }
 
-    /// Returns the path of the key that the error is about, such as `surface.radius_mm`; `None` if the text is not
-    /// TOML.
+    /// Returns the path of the key that the error is about, such as `surface.radius_mm`; `None` for an error about the
+    /// TOML text itself.
     pub fn key(&self) -> Option<String> {
         match self {
             Self::OutOfRange { key, .. }
@@ -125,7 +127,10 @@ impl DefinitionError {
     }
 }
 
-/// Returns a number if it is finite, otherwise an error with its key.
+/// Returns `value` unchanged if it is finite.
+///
+/// # Errors
+/// Returns an error about `key` if the value is infinite or NaN.
 pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
     if value.is_finite() {
         return Ok(value);
@@ -133,7 +138,10 @@ pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError
     Err(DefinitionError::out_of_range(key, value, "a finite number", "write a number, or remove the key"))
 }
 
-/// Returns the curvature for a radius of curvature, which may be infinite; an error if the radius is too small.
+/// Returns the curvature in 1/mm for a radius of curvature, which may be infinite.
+///
+/// # Errors
+/// Returns an error about `key` if the radius is NaN or less than 1e-6 mm in magnitude.
 pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionError> {
     if radius_mm.abs() >= 1e-6 {
         return Ok(1.0 / radius_mm);
@@ -142,7 +150,10 @@ pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, Defini
     Err(DefinitionError::out_of_range(key, radius_mm, limit, "for no curvature write inf"))
 }
 
-/// Returns a length if it is positive and at most 1e6 mm, otherwise an error with its key.
+/// Returns `length_mm` unchanged if it is positive and at most 1e6 mm.
+///
+/// # Errors
+/// Returns an error about `key` for any other length.
 pub(super) fn check_positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError> {
     if length_mm > 0.0 && length_mm <= 1e6 {
         return Ok(length_mm);

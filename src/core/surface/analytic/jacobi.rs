@@ -1,9 +1,11 @@
 //! Jacobi polynomials P_k^(0, b), the common root of Zernike's and Forbes' polynomials.
 
-/// Returns sum c_k P_k^(0, b)(t) for several rows of coefficients, each with its derivative with respect to t.
+/// Sums series of Jacobi polynomials: returns sum_k c_k P_k^(0, b)(t) and its derivative with respect to t, for N
+/// series at once.
 ///
-/// Shapes: `coefficients[k]` holds the k-th coefficient of every row. The three-term recurrence (Abramowitz and Stegun,
-/// 22.7.1, alpha = 0) runs upwards, which is stable on [-1, 1]; its derivative is taken term by term, so that it is exact.
+/// Shapes: `coefficients[k]` holds the k-th coefficient of every series. The three-term recurrence (Abramowitz and
+/// Stegun, 22.7.1, alpha = 0) runs upwards, which is stable for t in [-1, 1]. Its derivative is taken term by term, so
+/// that it is exact.
 pub(super) fn series<const N: usize>(coefficients: &[[f64; N]], b: u32, t: f64) -> [(f64, f64); N] {
     let b = f64::from(b);
     let mut sums = [(0.0, 0.0); N];
@@ -19,7 +21,7 @@ pub(super) fn series<const N: usize>(coefficients: &[[f64; N]], b: u32, t: f64) 
     sums
 }
 
-/// Fills `out` with P_0^(0, b)(t), P_1^(0, b)(t) and so on.
+/// Fills `out` with the values at t of the Jacobi polynomials P_0^(0, b), P_1^(0, b) and so on.
 pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
     let [mut below, mut here] = [(0.0, 0.0), (1.0, 0.0)];
     for (k, value) in out.iter_mut().enumerate() {
@@ -28,7 +30,8 @@ pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
     }
 }
 
-/// Returns the polynomial of degree n and its derivative at t, from those of degree n - 1 (`here`) and n - 2 (`below`).
+/// Returns the Jacobi polynomial P_n^(0, b) and its derivative at t, by the three-term recurrence from those of degree
+/// n - 1 (`here`) and n - 2 (`below`).
 fn step(n: f64, b: f64, t: f64, here: (f64, f64), below: (f64, f64)) -> (f64, f64) {
     if n == 1.0 {
         // The general step divides 0 by 0 here when b is 0.

@@ -63,7 +63,8 @@ pub enum AnalyticSurface {
 }
 
 impl AnalyticSurface {
-    /// Returns the sag and its gradient at a place; `None` if the formula has no value or no finite slope there.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y); `None` if the formula has no value or no finite
+    /// slope there.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -83,18 +84,19 @@ impl AnalyticSurface {
         found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
     }
 
-    /// Returns the sag at a place in millimetres; `None` if the formula has no value or no finite slope there.
+    /// Returns the sag z at (x, y), all in millimetres; `None` if the formula has no value or no finite slope there.
     pub fn sag(&self, x: f64, y: f64) -> Option<f64> {
         self.sag_and_gradient(x, y).map(|(z, _)| z)
     }
 
-    /// Returns the unit normal on the +z side at a place; `None` if the formula has no value or no finite slope there.
+    /// Returns the unit normal on the +z side at (x, y), in millimetres; `None` if the formula has no value or no
+    /// finite slope there.
     pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
         self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
     }
 
-    /// Returns the radius of the disc on which the polynomials are defined; `None` if the formula is not limited to a
-    /// disc.
+    /// Returns the normalisation radius, the radius of the disc on which the polynomials are defined; `None` if the
+    /// formula is not limited to a disc.
     fn normalisation_radius_mm(&self) -> Option<f64> {
         match self {
             Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
@@ -105,7 +107,8 @@ impl AnalyticSurface {
         }
     }
 
-    /// Returns the distance from the axis of the formula to the farthest point of an aperture, in millimetres.
+    /// Returns the distance from the axis of the formula to the farthest point of an aperture, in millimetres. For an
+    /// off-axis section this is the axis of its parent.
     fn reach_mm(&self, aperture: &Aperture) -> f64 {
         let Self::OffAxis(section) = self else { return aperture.reach_mm() };
         let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
@@ -146,7 +149,8 @@ mod test_support {
         std::iter::once([0.0, 0.0]).chain(rings).collect()
     }
 
-    /// Returns the largest difference between a gradient and the central differences of fourth order of its sag.
+    /// Returns the largest error of a gradient at the places of [`disc`]. Compares the gradient of `surface`, which
+    /// returns sag and gradient at (x, y), with central differences of fourth order of the sag.
     pub fn gradient_error(surface: &impl Fn(f64, f64) -> Option<(f64, [f64; 2])>, radius: f64) -> f64 {
         let h = 5e-4 * radius;
         let difference =

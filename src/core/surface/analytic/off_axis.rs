@@ -53,12 +53,13 @@ pub struct OffAxisDefinition {
 }
 
 impl OffAxis {
-    /// Creates a section of a parent surface.
-    ///
-    /// Units: millimetres and radians.
+    /// Creates an off-axis section of a parent surface. `distance_mm` is the distance of the centre of the section from
+    /// the axis of the parent, and `azimuth_rad` its azimuth from x towards y. `frame` is the frame in which the
+    /// section is described.
     ///
     /// # Errors
-    /// A negative distance, an azimuth that is not finite, or a centre where the parent has no normal.
+    /// Returns an error if the distance is negative or above 1e6 mm, if the azimuth is not finite, or if the parent has
+    /// no value or no finite slope at the centre.
     pub fn new(
         parent: AnalyticSurface,
         distance_mm: f64,
@@ -83,18 +84,18 @@ impl OffAxis {
         &self.centre
     }
 
-    /// Returns the frame of the section.
+    /// Returns the frame in which the section and its aperture are described.
     pub fn frame(&self) -> SectionFrame {
         self.frame
     }
 
-    /// Returns the whole surface.
+    /// Returns the parent: the whole surface from which the section is cut.
     pub fn parent(&self) -> &AnalyticSurface {
         &self.parent
     }
 
-    /// Returns the sag and its gradient in the section's frame. Returns `None` if the parent has no value or finite
-    /// slope there, or if, in the tilted frame, the surface does not face +z there.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y) in the frame of the section. Returns `None` if the
+    /// parent has no value or no finite slope there, or if, in the tilted frame, the surface does not face +z there.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -108,8 +109,8 @@ impl OffAxis {
         }
     }
 
-    /// Returns the place in the parent's xy plane that belongs to a place of the section; `None` if the section has no
-    /// value there.
+    /// Converts the place (x, y) in the frame of the section to the place in the xy plane of the parent's frame.
+    /// Returns `None` if the section, in the tilted frame, has no value at this place.
     ///
     /// Units: millimetres.
     pub(super) fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
@@ -124,11 +125,12 @@ impl OffAxis {
         }
     }
 
-    /// Solves p_z = f(p_x, p_y), with p = centre + R (x, y, z), for z by Newton's method, and returns z and its
-    /// gradient. `start` is the first estimate of z. Returns `None` without convergence.
+    /// Returns the sag z at (x, y) in the tilted frame, and its gradient. Solves p_z = f(p_x, p_y) for z by Newton's
+    /// method, with p = centre + R (x, y, z); f is the sag of the parent, and R rotates the tilted frame to the
+    /// parent's frame. `start` is the first estimate of z. Returns `None` if the iteration does not converge.
     ///
-    /// The gradient follows from the implicit function theorem: with m = R^T (-f_x, -f_y, 1), a normal in the tilted frame,
-    /// it is (-m_x / m_z, -m_y / m_z).
+    /// The gradient follows from the implicit function theorem: with m = R^T (-f_x, -f_y, 1), a normal in the tilted
+    /// frame, it is (-m_x / m_z, -m_y / m_z).
     fn newton(&self, x: f64, y: f64, start: f64) -> Option<(f64, [f64; 2])> {
         let mut z = start;
         let scale = self.centre.coords.amax().max(x.abs()).max(y.abs());
@@ -150,8 +152,9 @@ impl OffAxis {
         None
     }
 
-    /// Returns the sag and its gradient at a place by following the surface in small steps from the section's centre.
-    /// It is used if Newton's method does not converge directly.
+    /// Returns the sag and its gradient at (x, y) in the tilted frame by numerical continuation: follows the surface
+    /// from the centre of the section in small steps. It is used if Newton's method does not converge directly. Returns
+    /// `None` if a step does not converge.
     fn continue_from_centre(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
         let step = 1.0 / f64::from(CONTINUATION_STEPS);
         let (mut z, mut gradient) = self.newton(0.0, 0.0, 0.0)?;
@@ -182,7 +185,7 @@ impl TryFrom<&OffAxisDefinition> for OffAxis {
     }
 }
 
-/// Returns the smallest rotation that maps z to a unit vector on the +z side.
+/// Returns the smallest rotation that maps the z axis to `n`, a unit vector on the +z side.
 fn min_rotation(n: &Vector) -> Matrix3<f64> {
     let s = 1.0 / (1.0 + n.z);
     Matrix3::new(

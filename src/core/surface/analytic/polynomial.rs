@@ -34,7 +34,7 @@ pub struct XyPolynomialDefinition {
     pub base: Option<ConicDefinition>,
 }
 
-/// Returns the schema of a list of terms: powers up to [`MAX_POWER`].
+/// Returns the JSON schema of the list of terms [i, j, coefficient], with powers i and j up to [`MAX_POWER`].
 #[cfg(feature = "schema")]
 fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
     let power = schemars::json_schema!({ "type": "integer", "minimum": 0, "maximum": MAX_POWER });
@@ -46,7 +46,7 @@ fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
 }
 
 impl XyPolynomial {
-    /// Returns the sag and its gradient; `None` at the edge of the base conic and beyond.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y); `None` at the edge of the base conic and beyond.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {

@@ -41,14 +41,15 @@ pub struct SampledSurface {
 }
 
 impl DefinedSurface {
-    /// Samples the surface on a grid that covers the bounds of the aperture and one ring of nodes around them.
+    /// Samples the surface on a grid that covers the bounding box of the aperture, and one ring of nodes around the
+    /// box.
     ///
-    /// Units: millimetres. Along x and along y the spacing is reduced a little, so that it divides the bounds. Nodes
-    /// farther than 1.5 spacings outside the aperture, and nodes at which the formula has no value, are omitted: they
-    /// are NaN.
+    /// Units: millimetres. The spacing along x and along y is reduced a little, so that it divides the sides of the
+    /// box. Nodes farther than 1.5 spacings outside the aperture, and nodes at which the formula has no value, are NaN.
     ///
     /// # Errors
-    /// A spacing that is not positive, more than 2e7 nodes, or a computation of more than about a minute.
+    /// Returns an error if the spacing is not positive or above 1e6 mm, if there would be more than 2e7 nodes, or if
+    /// the computation would take more than about a minute.
     pub fn sample(&self, spacing_mm: f64) -> Result<SampledSurface, DefinitionError> {
         error::check_positive("sampling.spacing_mm", spacing_mm)?;
         let bounds = self.aperture().bounds();
@@ -71,11 +72,11 @@ impl DefinedSurface {
         })
     }
 
-    /// Returns the node spacing of the definition in millimetres. If the definition gives an accuracy, the spacing is
-    /// estimated from it.
+    /// Returns the node spacing in millimetres that the definition gives. If it gives an accuracy instead, finds the
+    /// spacing for this accuracy.
     ///
     /// # Errors
-    /// An accuracy that is not positive, or one that no spacing reaches.
+    /// Returns an error if the accuracy is not positive, or if no spacing reaches it.
     pub fn spacing_mm(&self) -> Result<f64, DefinitionError> {
         match self.sampling() {
             Sampling::Spacing { spacing_mm } => Ok(spacing_mm),
@@ -83,14 +84,15 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns a node spacing at which the distances to the curved triangles between the nodes have at most this error.
+    /// Returns a node spacing in mm at which the surface between the nodes differs from the formula by at most
+    /// `accuracy_mm`.
     ///
-    /// Units: millimetres. In cells about fixed places all over the aperture and along its outline, the cubic triangles
+    /// In cells about fixed places all over the aperture and along its outline, the cubic triangles between the nodes
     /// are compared with the formula, along the normal. The spacing is halved and then bisected until twice the largest
     /// difference is within `accuracy_mm`.
     ///
     /// # Errors
-    /// An accuracy that is not positive, or one that no spacing reaches.
+    /// Returns an error if the accuracy is not positive, or if no spacing reaches it.
     fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
         error::check_positive("sampling.accuracy_mm", accuracy_mm)?;
         let [least, most] = self.aperture().bounds();
@@ -120,7 +122,10 @@ impl DefinedSurface {
         Ok(fine)
     }
 
-    /// Returns an error if a sampling would have too many nodes or take too long.
+    /// Checks the cost of a sampling with this number of nodes. `spacing_mm` is for the message.
+    ///
+    /// # Errors
+    /// Returns an error if there are more than 2e7 nodes, or if the computation would take more than about a minute.
     fn check_size(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
         if nodes > MAX_NODES {
             return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MAX_NODES });
@@ -134,8 +139,8 @@ impl DefinedSurface {
         Ok(())
     }
 
-    /// Returns the node at x and y and its normal, in the surface's frame. Both are NaN if the place is farther than
-    /// `margin` outside the aperture, or if the formula has no value there.
+    /// Returns the node at (x, y) and its unit normal, in the frame of the surface. Both are NaN if the place is more
+    /// than `margin` (in mm) outside the aperture, or if the formula has no value there.
     fn node(&self, x: f64, y: f64, margin: f64) -> (Point, Vector) {
         let near = self.aperture().distance_mm(x, y) <= margin;
         match self.formula().sag_and_gradient(x, y).filter(|_| near) {
@@ -144,10 +149,11 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns the largest error found in the cell of size `h` about a place, in millimetres.
+    /// Returns the largest error of the cubic triangles, in millimetres, in the square cell about (x, y) whose side is
+    /// `h` mm.
     ///
-    /// The error is infinite if a cell of this size that contains the place can have a corner without a value. The
-    /// sampled surface could then have a gap at the place.
+    /// The error is infinite if a cell of this size that contains the place can have a corner at which the formula has
+    /// no value. The sampled surface could then have a gap at the place.
     fn cell_error(&self, [x, y]: [f64; 2], h: f64) -> f64 {
         let corner = |i: f64, j: f64| {
             let place = [x + (i - 0.5) * h, y + (j - 0.5) * h];
@@ -184,12 +190,12 @@ const TEST_WEIGHTS: [[f64; 3]; 7] = [
     [0.25, 0.25, 0.5],
 ];
 
-/// Returns the sag of the cubic triangle through three corners with given sag and gradient.
+/// Returns the sag, at the barycentric `weights`, of the cubic triangle through three corners with given places, sags
+/// and gradients.
 ///
-/// Shapes: `places`, `sags` and `gradients` by corner; `weights` are barycentric. Along each edge it is the cubic of
-/// Hermite. The one coefficient that is left in the middle is chosen so that quadratics are exact: in Bernstein's form a
-/// quarter of the sum of the six edge coefficients less a sixth of the sum of the three at the corners. The error is O(h^4)
-/// on the edges and O(h^3) within.
+/// Along each edge it is the cubic Hermite polynomial. The one free coefficient, in the middle, is chosen so that
+/// quadratics are exact: in Bernstein's form it is a quarter of the sum of the six edge coefficients, minus a sixth of
+/// the sum of the three corner coefficients. With the edge length h the error is O(h^4) on the edges and O(h^3) inside.
 fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f64; 2]; 3], weights: [f64; 3]) -> f64 {
     let (mut sag, mut edge_sum) = (0.0, 0.0);
     for i in 0..3 {

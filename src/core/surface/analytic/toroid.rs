@@ -39,16 +39,17 @@ pub struct ToroidDefinition {
 }
 
 impl Toroid {
-    /// Creates a toroid from its radius of rotation, which may be infinite, and its curve in the (y, z) plane.
+    /// Creates a toroid: `curve`, in the (y, z) plane, rotated about a line parallel to y at the distance `radius_x_mm`
+    /// from the vertex. An infinite radius makes a cylinder.
     ///
     /// # Errors
-    /// A radius that is NaN or less than 1e-6 mm in magnitude.
+    /// Returns an error if the radius is NaN or less than 1e-6 mm in magnitude.
     pub fn new(radius_x_mm: f64, curve: Asphere) -> Result<Self, DefinitionError> {
         Ok(Self { rotation_per_mm: error::checked_curvature("radius_x_mm", radius_x_mm)?, curve })
     }
 
-    /// Returns the sag and its gradient; `None` if the circle of rotation does not reach x, or if the curve has no
-    /// value at y.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` if the circle of rotation does not
+    /// reach x, or if the curve has no value at y.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -112,7 +113,8 @@ pub struct BiconicDefinition {
 }
 
 impl Biconic {
-    /// Returns the sag and its gradient; `None` at the edge of the surface and beyond.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` where the root of the formula is not
+    /// real or is zero: at the edge of the surface and beyond.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {

@@ -33,8 +33,8 @@ pub enum ZernikeNumbering {
 }
 
 impl ZernikeNumbering {
-    /// Returns the degree n and the azimuthal order m of an index, with m negative for sines; `None` if there is no
-    /// such term.
+    /// Returns the degree n and the azimuthal order m of the term with this index; m is negative for a sine. Returns
+    /// `None` if the numbering has no such index, or if n exceeds 100.
     pub fn degree_and_order(self, index: u32) -> Option<(u32, i32)> {
         let (n, m) = match self {
             Self::Noll => noll(index)?,
@@ -44,7 +44,8 @@ impl ZernikeNumbering {
         (n <= MAX_DEGREE).then_some((n, m))
     }
 
-    /// Returns the default normalisation of the numbering.
+    /// Returns the normalisation that applies if a definition gives none: orthonormal for Noll and ANSI, unnormalised
+    /// for Fringe.
     fn normalisation(self) -> ZernikeNormalisation {
         match self {
             Self::Noll | Self::Ansi => ZernikeNormalisation::Orthonormal,
@@ -91,8 +92,8 @@ pub struct ZernikeDefinition {
 }
 
 impl Zernike {
-    /// Returns the sag and its gradient; `None` at the edge of the base conic and beyond, and farther than 1.5
-    /// normalisation radii from the axis.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` at the edge of the base conic and
+    /// beyond, and farther than 1.5 normalisation radii from the axis.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -157,22 +158,23 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
     }
 }
 
-/// Returns degree and order by Noll's numbering: degree by degree with |m| rising; even indices are cosines, odd ones
-/// sines.
+/// Returns the degree n and the azimuthal order m of an index in Noll's numbering; `None` for index 0. The terms are
+/// sorted by n, then by |m|. Even indices are cosines (m >= 0), odd indices sines (m < 0).
 fn noll(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index.checked_sub(1)?);
     let m = if n % 2 == 0 { place.div_ceil(2) * 2 } else { place / 2 * 2 + 1 };
     Some((n, if index.is_multiple_of(2) { m as i32 } else { -(m as i32) }))
 }
 
-/// Returns degree and order by the ANSI numbering: degree by degree, with m rising from -n to n in steps of 2.
+/// Returns the degree n and the azimuthal order m of an index in the ANSI numbering. The terms are sorted by n; within
+/// a degree m rises from -n to n in steps of 2.
 fn ansi(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index);
     Some((n, 2 * place as i32 - n as i32))
 }
 
-/// Returns degree and order by the Fringe numbering: (n + |m|) / 2 rises; within it |m| falls, and the cosine precedes
-/// the sine.
+/// Returns the degree n and the azimuthal order m of an index in the Fringe numbering; `None` outside 1 to 37. The
+/// terms are sorted by (n + |m|) / 2, then by falling |m|; the cosine precedes the sine.
 fn fringe(index: u32) -> Option<(u32, i32)> {
     // The set stops after (n + |m|) / 2 = 5 and adds one more spherical term.
     if index == 37 {
@@ -185,8 +187,8 @@ fn fringe(index: u32) -> Option<(u32, i32)> {
     Some((2 * group - m, if rest % 2 == 0 { m as i32 } else { -(m as i32) }))
 }
 
-/// Returns the row and the position in the row of the element with index `place` in a triangle whose rows have 1, 2, 3
-/// ... elements. All are counted from 0.
+/// Returns the row of the element with the index `place`, and its position in the row, in a triangle whose rows have 1,
+/// 2, 3, ... elements. All are counted from 0.
 fn triangular(place: u32) -> (u32, u32) {
     let row = ((8 * u64::from(place) + 1).isqrt() - 1) / 2;
     (row as u32, (u64::from(place) - row * (row + 1) / 2) as u32)

@@ -51,7 +51,10 @@ impl LinuxcncGrinder {
         Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
     }
 
-    /// Checks that the machine is ready. Only a person at the machine can make it ready.
+    /// Checks that the machine is ready for a job.
+    ///
+    /// # Errors
+    /// It is not ready; only a person at the machine can correct this.
     pub(super) fn check_ready(&self, seen: &ControllerState) -> DeviceResult<()> {
         match () {
             () if seen.stop_circuit_open || !seen.drives_on => {
@@ -71,8 +74,8 @@ impl LinuxcncGrinder {
         DeviceError::NotReady { machine: self.machine(), reason: why }
     }
 
-    /// Makes the controller write `token` into a new record, and reads it back here. This proves three facts: this
-    /// computer and the controller see the same folder, the controller can write in it, and later lines of the record
+    /// Makes the controller write `token` into a new log file, and reads it back. This proves three facts: this
+    /// computer and the controller see the same folder, the controller can write in it, and later lines of the log file
     /// belong to this preparation.
     async fn open_record(&mut self, program: &FramedProgram, token: u32) -> DeviceResult<()> {
         let record = path(&self.folders.remote, &program.name, RECORD);
@@ -91,7 +94,7 @@ impl LinuxcncGrinder {
                 let (here, there) = (self.folders.local.display(), &self.folders.remote);
                 let errors = self.controller.errors().await?.join("; ");
                 let why = format!(
-                    "the record {record} of the controller does not appear in {here}: check that {there} is the same \
+                    "the log file {record} of the controller does not appear in {here}: check that {there} is the same \
                      folder, and that the account of LinuxCNC has the right to write there. {errors}"
                 );
                 return Err(DeviceError::Folder { machine: self.machine(), reason: why });
@@ -100,7 +103,10 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Sends the start and waits until its effect is seen.
+    /// Sends the start, and waits until the program is seen to run or has logged its begin.
+    ///
+    /// # Errors
+    /// The controller refuses the start, or nothing begins in time.
     pub(super) async fn send_start(&mut self) -> DeviceResult<Status> {
         let heard = self.controller.order(Set::Run, MachineCommand::Start).await;
         let refused = match heard {
@@ -123,7 +129,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Returns the status if the program of the job is seen to run, or has recorded that it began.
+    /// Returns the status if the program of the job is seen to run or has logged its begin, otherwise `None`.
     async fn has_begun(&mut self) -> DeviceResult<Option<Status>> {
         let (seen, status) = self.read_status().await?;
         let Some(work) = self.job.clone() else { return Ok(None) };

@@ -15,7 +15,8 @@ use crate::words::{Fault, MachineState, Outcome, Status};
 const STANDSTILL_AFTER: Duration = Duration::from_secs(5);
 
 impl LinuxcncGrinder {
-    /// Reads the state of the controller, and the record if a job may be over.
+    /// Reads the state of the controller and updates the job. If the job may be over, also reads the log file of its
+    /// program. Returns the state of the controller and the status of the machine.
     pub(super) async fn read_status(&mut self) -> DeviceResult<(ControllerState, Status)> {
         let owned = self.controller.has_control;
         let seen = self.controller.read_state(owned).await?;
@@ -57,7 +58,8 @@ impl LinuxcncGrinder {
         self.notes.drain(..more);
     }
 
-    /// Updates the job from the observed state.
+    /// Updates the job of this driver from the state of the controller. Reads the log file of its program unless the
+    /// program runs.
     async fn update_job(&mut self, seen: &ControllerState) -> DeviceResult<()> {
         let Some(mut work) = self.job.take() else { return Ok(()) };
         let begun = self.update_stage(&mut work, seen).await;
@@ -93,7 +95,7 @@ impl LinuxcncGrinder {
                 }
             }
             Verdict::Unresolved => self.note(
-                "it has stopped, and its program recorded neither its begin nor its end: check the machine, then \
+                "it has stopped, and its program logged neither its begin nor its end: check the machine, then \
                  regrind confirm done if the pass is complete, otherwise regrind confirm still"
                     .to_owned(),
             ),
@@ -102,7 +104,8 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
-    /// Returns the status in the words common to all machines.
+    /// Returns the status of the machine, in the terms that all drivers use, from the state of the controller and the
+    /// job.
     fn make_status(&mut self, seen: &ControllerState) -> Status {
         let is_clear = seen.interpreter == Interpreter::Idle && self.clear_at.as_ref() == Some(&seen.position);
         if !is_clear {
@@ -133,7 +136,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Returns the state when no job of ours is active.
+    /// Returns the machine state for a controller on which no job of this driver is active.
     fn idle_state(&self, seen: &ControllerState) -> MachineState {
         match seen.interpreter {
             Interpreter::Running => MachineState::Execute,

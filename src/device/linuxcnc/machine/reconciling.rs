@@ -12,7 +12,8 @@ use crate::linuxcnc::work::Stage;
 use crate::words::{Armed, Reconciled};
 
 impl LinuxcncGrinder {
-    /// Returns the outcome of the start of the job. Returns `None` if it is not known yet, or if there is no job.
+    /// Returns whether the start of the job has led to a running or finished job, or that the controller runs another
+    /// program. Returns `None` if none of these is seen yet, or if there is no job.
     pub(super) async fn start_outcome(&mut self) -> DeviceResult<Option<Reconciled>> {
         let (seen, status) = self.read_status().await?;
         let Some(work) = &self.job else { return Ok(None) };
@@ -29,9 +30,9 @@ impl LinuxcncGrinder {
         })
     }
 
-    /// Finds out if the job was never begun. After a new claim, no line of an older connection can begin anything. The
-    /// job was not begun if it is then not seen to run for more than a second, and its record has neither a begin nor
-    /// an end.
+    /// Finds out if the start of the job was never carried out. First takes control again, so that no line of an older
+    /// connection can begin the job. The job was not started if it is not seen to run for more than a second after
+    /// that, and if its log file has neither a begin nor an end.
     pub(super) async fn confirm_not_started(&mut self) -> DeviceResult<Reconciled> {
         self.take_control().await?;
         let fenced = Instant::now();
@@ -53,7 +54,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Finds the program that was prepared before this process started, and assigns it to the job.
+    /// Finds the program of the start `intended` that an earlier process prepared, and assigns it to the job.
     pub(super) async fn find_prepared_program(&mut self, intended: &Armed) -> DeviceResult<()> {
         let (cycle, token) = (intended.job.batch_id().cycle.saturating_sub(1), intended.token);
         if let Some(program) = self.in_folders(move |folders| folders.prepared(cycle, token)).await? {

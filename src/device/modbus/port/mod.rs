@@ -16,7 +16,7 @@ use unix::is_there;
 #[cfg(windows)]
 use windows::is_there;
 
-/// Opens a port. While it is open, no other program can open it.
+/// Opens a serial port. While it is open, no other program can open it.
 pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io::Result<SerialStream> {
     let parity = match parity {
         Parity::None => tokio_serial::Parity::None,
@@ -27,8 +27,8 @@ pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io
     Ok(tokio_serial::new(device, baud).parity(parity).stop_bits(stop_bits).open_native_async()?)
 }
 
-/// Returns a message that a port does not exist on this computer, with the names of the existing ports. Returns `None`
-/// if the port exists or `device` is empty.
+/// Returns a message if the serial port `device` does not exist on this computer, with the names of the existing ports.
+/// Returns `None` if the port exists or `device` is empty.
 pub(crate) fn missing(device: &str) -> Option<String> {
     if device.is_empty() || is_there(device) {
         return None;
@@ -38,7 +38,7 @@ pub(crate) fn missing(device: &str) -> Option<String> {
     Some(format!("{device} is not on this computer; the serial ports here: {there}"))
 }
 
-/// Returns the names of the ports that the system knows.
+/// Returns the names of the serial ports that the operating system knows.
 fn names() -> Vec<String> {
     let ports = serialport::available_ports().unwrap_or_default();
     ports.into_iter().map(|port| port.port_name).collect()

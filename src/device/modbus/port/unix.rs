@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-/// Returns true if a port is on this computer.
+/// Returns true if the serial port `device` exists on this computer.
 pub(crate) fn is_there(device: &str) -> bool {
     Path::new(device).exists()
 }

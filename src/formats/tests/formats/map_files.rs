@@ -143,7 +143,7 @@ fn x3p_refuses_unsupported_content() {
         ("<SizeX>3", "<SizeX>-3", "a whole number"),
         ("<SizeX>3", "<SizeX>0", "a side of the map is 0"),
         ("<SizeX>3", "<SizeX>4", "expected 64 bytes for the dimension in main.xml, found `48`"),
-        ("<SizeX>3", "<SizeX>2", "more than the limit of 32 bytes unpacked"),
+        ("<SizeX>3", "<SizeX>2", "bytes unpacked, more than the limit of 32"),
         ("<SizeX>3", "<SizeX>4000000000000", "samples of a map"),
         ("bindata/data.bin", "../data.bin", "an entry of this container"),
         ("bindata/data.bin", "bindata/none.bin", "no bindata/none.bin"),

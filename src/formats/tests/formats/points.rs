@@ -131,7 +131,7 @@ fn errors_name_place_and_remedy() {
     let cases: &[(&str, &str)] = &[
         ("", "measured.csv: the file is empty, expected points; export it again"),
         ("\n# nothing\n\n", "measured.csv: the file is empty"),
-        ("x,y,z\n", "measured.csv: a header but no points after it"),
+        ("x,y,z\n", "measured.csv: the file has no points"),
         (
             "x,y,z\n1,2,3\n1,abc,3\n",
             "measured.csv, line 3, column 2: expected a number in mm, found `abc`; remove the text or give the \
@@ -141,7 +141,7 @@ fn errors_name_place_and_remedy() {
         ("1,2,3\n1,2,nan\n", "line 2, column 3: expected a finite number in mm, found `nan`"),
         ("nan,nan,nan\n", "line 1, column 1: expected a finite number"),
         ("1,-inf,3\n", "line 1, column 2: expected a finite number"),
-        ("1,2,1e300\n", "line 1, column 3: expected at most 1e7 mm in size, found `1e300`"),
+        ("1,2,1e300\n", "line 1, column 3: expected a number of at most 1e7 mm, found `1e300`"),
         ("1,2,1e999\n", "found `1e999`"),
         ("1,2,3\n1,2\n1,2,3\n", "line 2: expected 3 columns separated by comma as in line 1, found 2"),
         ("1,2,3\n1,2,3,4\n", "line 2: expected 3 columns separated by comma as in line 1, found 4"),
@@ -182,10 +182,16 @@ fn errors_name_place_and_remedy() {
         ("x [inch];y [inch];z [inch]\n1;2;3\n", "found the unit `inch`"),
         ("x [mm];y [mm];z [\u{b5}m]\n1;2;3\n", "found the unit `\u{b5}m`"),
         ("# units: inch\n1 2 3\n", "line 1: expected coordinates in mm, found the unit `inch`"),
-        ("12,345;23,456;34,567\n", "line 1, column 1: `12,345` has either a decimal comma or a thousands comma"),
+        (
+            "12,345;23,456;34,567\n",
+            "line 1, column 1: the comma of `12,345` can be a decimal mark or a thousands separator",
+        ),
         ("1.5;2.5;3.5\n1,5;2,5;3,5\n", "line 2, column 1: expected a number with a decimal point like those before it"),
         ("1,5;2,5;3,5\n1.5;2.5;3.5\n", "line 2, column 1: expected a number with a decimal comma like those before it"),
-        ("1.5;2.5;3.5\n1.5;2,512;3.5\n", "line 2, column 2: `2,512` has either a decimal comma or a thousands comma"),
+        (
+            "1.5;2.5;3.5\n1.5;2,512;3.5\n",
+            "line 2, column 2: the comma of `2,512` can be a decimal mark or a thousands separator",
+        ),
         ("1,2,3\n1,\"2,3\n", "line 2"),
         ("1,2,3\n1,2,3\0\n", "line 2: expected text, found byte 0x00"),
     ];
@@ -337,7 +343,7 @@ fn ply_errors_name_their_line() {
         ("format ascii", "format utf", "line 2: expected format ascii, binary_little_endian or binary_big_endian"),
         ("vertex 4", "vertex -4", "line 6: expected an element with a count"),
         ("vertex 4", "vertex 99999999999999999999", "line 6: expected an element with a count"),
-        ("vertex 4", "vertex 99999999999", "is more than the limit of 4294967295 vertices"),
+        ("vertex 4", "vertex 99999999999", "99999999999 vertices, more than the limit of 4294967295"),
         ("vertex 4", "vertex 0", "no vertices"),
         ("vertex 4", "vertex 5", "line 22: the file is cut, expected face 2 of 2"),
         ("vertex 4", "points 4", "expected one element vertex, found `0 of them`"),
@@ -348,8 +354,8 @@ fn ply_errors_name_their_line() {
         ("list uchar int vertex", "list uchar float vertex", "expected vertex indices of an integer type"),
         ("element camera 1\n", "", "line 4: expected an element before its properties"),
         ("comment by hand", "remark by hand", "line 3: expected comment, element, property or end_header"),
-        ("9 4 0 1 2 3", "9 4 0 1 2 4", "line 21: face names vertex 4, but there are 4"),
-        ("9 4 0 1 2 3", "9 4 0 1 2 -1", "line 21: face names vertex -1"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 4", "line 21: a face has the vertex 4, but there are 4 vertices"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 -1", "line 21: a face has the vertex -1"),
         ("9 4 0 1 2 3", "9 2 0 1", "line 21: expected at least 3 corners of face 1, found `2`"),
         ("9 4 0 1 2 3", "9 4.5 0 1 2 3", "line 21: expected face 1 of 2, found `4.5`"),
         (
@@ -639,7 +645,7 @@ fn note_on_missing_line_end() {
     }
     let told = notes(&format!("x,y,z\n{lines}1.500,2.500,-13.500"));
     assert_eq!(told.len(), 1);
-    for words in [", line 5: ", "no line end", "`-13.500`", "(1.5, 2.5, -13.5) mm", "would not show"] {
+    for words in [", line 5: ", "no line end", "`-13.500`", "(1.5, 2.5, -13.5) mm", "may be cut"] {
         assert!(told[0].contains(words), "{told:?}");
     }
     for (cut, digits) in [("3.50", 2), ("3.5", 1), ("3.", 0), ("13", 0)] {
@@ -652,7 +658,7 @@ fn note_on_missing_line_end() {
     assert!(told[0].contains("`3.5e-0` has 1 digits; the lines above have 2"), "{told:?}");
     // Numbers that are written as short as they are show nothing.
     let told = notes("1.125,2,3\n1,2,3.25\n1,2,3.125\n1,2,3");
-    assert!(told.len() == 1 && told[0].contains("would not show"), "{told:?}");
+    assert!(told.len() == 1 && told[0].contains("may be cut"), "{told:?}");
 }
 
 #[test]
