@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use crate::words::{RegisterBlock, WordOrder, bytes_of, crc16};
+use crate::register_encoding::{RegisterBlock, WordOrder, bytes_of, crc16};
 
 /// States of docs/modbus.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use crate::words::WordOrder;
+use crate::register_encoding::WordOrder;
 
 /// First address of every block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

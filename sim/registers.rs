@@ -9,9 +9,9 @@ use crate::body::{Kind, Physics};
 use crate::command::{Mode, State};
 use crate::handshake::Handshake;
 use crate::options::{Block, MachineOptions, RegisterLayout};
-use crate::seen::{HandshakeEvent, LogEntry, Observer};
+use crate::event_log::{HandshakeEvent, LogEntry, Observer};
 use crate::transfer::{Inbox, page_image, slots_image};
-use crate::words::{RegisterBlock, WordOrder};
+use crate::register_encoding::{RegisterBlock, WordOrder};
 
 /// Modbus exception code of a refused request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,7 +1,7 @@
 //! Transfer of payloads to the machine and of results from it, page by page.
 
 use crate::body::{Kind, Payload, ResultData};
-use crate::words::{RegisterBlock, WordOrder, bytes_of, registers_of, turn_payload};
+use crate::register_encoding::{RegisterBlock, WordOrder, bytes_of, registers_of, turn_payload};
 
 /// Number of data registers of a full page.
 pub const PAGE_REGISTERS: usize = 112;

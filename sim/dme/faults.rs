@@ -40,4 +40,4 @@ pub enum Fault {
 }
 
 /// Faults by the names of commands.
-pub type CommandFaults = crate::faults::PendingFaults<String, Fault>;
+pub type CommandFaults = crate::pending_faults::PendingFaults<String, Fault>;

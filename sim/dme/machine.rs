@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use super::deed::MachineEvent;
+use super::event::MachineEvent;
 use super::line::{Argument, Command, DmeError};
 use crate::Vec3;
 use crate::cmm::{TouchProbe, TouchResult};

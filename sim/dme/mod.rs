@@ -13,7 +13,7 @@
 //! out at once. After an error, the server accepts only ClearAllErrors. Each command that an abort ends gets error
 //! 0006.
 
-pub mod deed;
+pub mod event;
 pub mod faults;
 pub mod line;
 pub mod machine;
@@ -22,7 +22,7 @@ mod scan;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use deed::{MachineEvent, Observer};
+use event::{MachineEvent, Observer};
 use faults::{CommandFaults, Fault};
 use line::{Command, DmeError, Tag};
 use machine::{CommandResult, DmeMachine};

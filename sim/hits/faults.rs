@@ -39,4 +39,4 @@ impl Fault {
 }
 
 /// Faults by the number of the line, from 1.
-pub type PrintFaults = crate::faults::PendingFaults<u64, Fault>;
+pub type PrintFaults = crate::pending_faults::PendingFaults<u64, Fault>;

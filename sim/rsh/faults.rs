@@ -30,4 +30,4 @@ pub enum Fault {
 }
 
 /// Faults by the beginning of the line.
-pub type LineFaults = crate::faults::PendingFaults<String, Fault>;
+pub type LineFaults = crate::pending_faults::PendingFaults<String, Fault>;

@@ -11,7 +11,7 @@
 //! which can be read once, and from later queries. One client has control: the one that took it last. A set takes a
 //! tenth of a second. If a program cannot be opened, the one before stays open.
 
-pub mod deed;
+pub mod event;
 pub mod faults;
 mod program;
 
@@ -22,7 +22,7 @@ use std::time::Duration;
 
 use crate::Vec3;
 use crate::wheel::PlainWheel;
-use deed::{ControllerEvent, Observer};
+use event::{ControllerEvent, Observer};
 use faults::{Fault, LineFaults};
 use program::{LogAction, Program, Step, says};
 
@@ -124,7 +124,7 @@ impl Controller {
 
     fn notify(&mut self, deed: ControllerEvent) {
         if let Some(witness) = &mut self.observer {
-            witness(&deed);
+            witness(&event);
         }
     }
 

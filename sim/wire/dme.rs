@@ -11,7 +11,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
-use super::executed::ExecutedPath;
+use super::executed_path::ExecutedPath;
 use crate::dme::{Outgoing, Server};
 
 /// Maximum length of a line, without its line end.

@@ -14,7 +14,7 @@
 //! Most callers need only [`Serving`]: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod dme;
-pub mod executed;
+pub mod executed_path;
 pub mod faults;
 pub mod hits;
 #[cfg(not(unix))]
@@ -38,7 +38,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use crate::registers::{Exception, SimulatedMachine};
-use crate::words::{bytes_of, crc16, registers_of};
+use crate::register_encoding::{bytes_of, crc16, registers_of};
 use faults::{Fault, Request, SharedFaultPlan};
 
 /// Interval at which the machines' time advances.

@@ -11,7 +11,7 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 
 use super::faults::SharedFaultPlan;
 use super::{After, Framing, Units, answer};
-use crate::words::crc16;
+use crate::register_encoding::crc16;
 
 /// Silence after which an incomplete frame is dropped. It is far longer than 3.5 characters, since a busy computer
 /// pauses between bytes where a wire does not.

@@ -24,25 +24,25 @@
 //! is completed, its answer is discarded, and the connection stays valid. A `start` that is dropped has to be
 //! reconciled. To interrupt a long transfer in order, raise its [`Interrupt`].
 
-mod beside_plan;
+mod plan_mismatch;
 mod error;
-pub mod exchange;
+pub mod file_exchange;
 pub mod hit_lines;
 pub mod ippdme;
-mod kept;
+mod job_memory;
 pub mod linuxcnc;
 mod machine;
 mod manual;
 mod modbus;
 mod no_machine;
 mod payload;
-mod place;
+mod machine_table;
 mod range;
-mod table;
-mod wiring;
-mod words;
+mod driver_table;
+mod driver_factory;
+mod handshake;
 
-pub use beside_plan::PlanMismatch;
+pub use plan_mismatch::PlanMismatch;
 pub use error::DeviceError;
 use error::DeviceResult;
 pub use hit_lines::{HitLinesCmm, HitLinesSettings, HitLinesWire, HitSource};
@@ -60,13 +60,13 @@ pub use payload::{
     CarefulStart, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PlanTarget,
     PreliminaryPoints, TargetKind, TouchStatus,
 };
-pub use place::MachineTable;
+pub use machine_table::MachineTable;
 pub use range::{RANGES, ValueRange};
 pub use regrind_formats::result::Coordinates;
-pub use table::{AnyCmm, AnyGrinder, Wire};
-pub use wiring::{DriverContext, DriverError, DriverFactory, Timing};
-pub use words::hex;
-pub use words::{
+pub use driver_table::{AnyCmm, AnyGrinder, Wire};
+pub use driver_factory::{DriverContext, DriverError, DriverFactory, Timing};
+pub use handshake::hex;
+pub use handshake::{
     Answer, Armed, BatchId, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation,
     Outcome, Reconciled, SignalValue, Started, Status, digest,
 };

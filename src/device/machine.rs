@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::error::DeviceError;
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, PreliminaryPoints};
-use super::words::{Armed, Identity, Job, OperatorConfirmation, Reconciled, Started, Status};
+use super::handshake::{Armed, Identity, Job, OperatorConfirmation, Reconciled, Started, Status};
 
 /// Operations of every machine of a cell, whatever its wire.
 ///

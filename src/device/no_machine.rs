@@ -4,7 +4,7 @@
 use super::error::DeviceResult;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
-use super::words::{Armed, Identity, Job, Reconciled, Started, Status};
+use super::handshake::{Armed, Identity, Job, Reconciled, Started, Status};
 
 /// Type of a machine that a wire does not support. It has no values.
 #[derive(Debug)]

@@ -17,7 +17,7 @@ use regrind_sim::command::{Command, CommandFrame};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{self, PointRecord, encode_points};
 use regrind_sim::registers::SimulatedMachine;
-use regrind_sim::words::{self, bytes_of, crc16, registers_of, turn_payload};
+use regrind_sim::register_encoding::{self, bytes_of, crc16, registers_of, turn_payload};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -147,7 +147,7 @@ fn map() -> CorrectionMap {
 
 /// Returns a machine that has already received a command of another client, so that the numbers of its client fill both
 /// words.
-fn machine(kind: Kind, word_order: words::WordOrder) -> SimulatedMachine {
+fn machine(kind: Kind, word_order: register_encoding::WordOrder) -> SimulatedMachine {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
     let mut machine = SimulatedMachine::new(Box::new(Toy::new(kind, 1e9)), BOOT_ID, options);
     let stranger =
@@ -157,7 +157,7 @@ fn machine(kind: Kind, word_order: words::WordOrder) -> SimulatedMachine {
 }
 
 /// Returns the traffic while a point is measured.
-async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
+async fn measured(order: WordOrder, sim_order: register_encoding::WordOrder) -> Vec<Vec<u8>> {
     let (settings, record) = record(machine(Kind::Cmm, sim_order), order).await;
     let (mut cmm, plan, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
     let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[plan.identity()]) };
@@ -178,7 +178,7 @@ async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>>
 }
 
 /// Returns the traffic while seven of eight points are measured, and read.
-async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<Vec<u8>> {
+async fn measured_ahead(order: WordOrder, word_order: register_encoding::WordOrder) -> Vec<Vec<u8>> {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
     let machine = SimulatedMachine::new(Box::new(Toy::new(Kind::Cmm, 1e9).up_to(7)), BOOT_ID, options);
     let (settings, record) = record(machine, order).await;
@@ -219,7 +219,7 @@ async fn complete(machine: &mut impl Driver) -> Status {
 }
 
 /// Returns the traffic while a map and a pass are transferred, and the pass is ground.
-async fn ground(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
+async fn ground(order: WordOrder, sim_order: register_encoding::WordOrder) -> Vec<Vec<u8>> {
     let (settings, record) = record(machine(Kind::Grinder, sim_order), order).await;
     let (mut grinder, calm) = (ModbusGrinder::new(settings).unwrap(), Interrupt::new());
     let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[map().identity(), pass().identity()]) };
@@ -271,7 +271,7 @@ async fn modbus_page_frames_match_wire() {
     let page = vectors();
     let mut looked_at = BTreeSet::new();
     for (name, order, sim_order) in
-        [("big", WordOrder::Big, words::WordOrder::Big), ("little", WordOrder::Little, words::WordOrder::Little)]
+        [("big", WordOrder::Big, register_encoding::WordOrder::Big), ("little", WordOrder::Little, register_encoding::WordOrder::Little)]
     {
         let mut sent = measured(order, sim_order).await;
         sent.extend(ground(order, sim_order).await);
@@ -324,9 +324,9 @@ fn point_record() -> PointRecord {
     PointRecord { index: 70_000, status: payload::Status::Touched, quality: 0, position_mm: [1.1, -2.3, 2.7] }
 }
 
-fn point_in_counts(order: words::WordOrder) -> Vec<u8> {
+fn point_in_counts(order: register_encoding::WordOrder) -> Vec<u8> {
     let mut bytes = encode_points(&[point_record()], Some(1e-6));
-    if order == words::WordOrder::Little {
+    if order == register_encoding::WordOrder::Little {
         turn_payload(4, 2, &mut bytes);
     }
     bytes
@@ -341,12 +341,12 @@ fn modbus_page_checksums_match_frames() {
         format!("`123456789` gives 0x{:08X}", crc32fast::hash(b"123456789")),
         format!("`123456789` gives 0x{:04X}", crc16(b"123456789")),
     ];
-    for (name, order) in [("big", words::WordOrder::Big), ("little", words::WordOrder::Little)] {
+    for (name, order) in [("big", register_encoding::WordOrder::Big), ("little", register_encoding::WordOrder::Little)] {
         let of = |frame: &str| &page[&format!("{frame}.{name}.tcp")];
         told.push(format!("0x{}", of("claim")[13 + 32..][..2].iter().map(|b| format!("{b:02X}")).collect::<String>()));
         told.push(format!("0x{:08X}", crc32fast::hash(&of("page")[13 + 16..])));
         let mut point = encode_points(&[point_record()], None);
-        if order == words::WordOrder::Little {
+        if order == register_encoding::WordOrder::Little {
             turn_payload(4, 1, &mut point);
         }
         assert_eq!(of("point")[9 + 8..], point, "{name}");

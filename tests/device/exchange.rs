@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant, SystemTime};
 
-use regrind::device::exchange::{
+use regrind::device::file_exchange::{
     CmmExchange, CmmFolders, ConfirmedStep, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
     GrinderFolders, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult, StationFiles, Stations,
 };

@@ -1,6 +1,6 @@
 //! Tests of the drivers, each against machines at the far end of its real connection.
 
-mod ahead;
+mod read_ahead;
 mod contract;
 mod exchange;
 mod hit_lines;

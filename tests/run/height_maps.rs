@@ -12,7 +12,7 @@ use crate::worlds::header;
 use nalgebra::{Matrix6, Vector6};
 use regrind::cell::{Actor, Ending, Role};
 use regrind::config::CellConfig;
-use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Permit};
+use regrind::device::file_exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Permit};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::drive::{BlockingExecutor, CycleRow, Drive, JournalSink, Notice, RunInputs};
 use regrind::formats::result::{Content, Coordinates as Said};

@@ -14,7 +14,7 @@ use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::{Reader, RecordKind, verify};
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::event_log::HandshakeEvent;
 
 /// Maximum number of kills of a part's program.
 const MAX_KILLS: usize = 3;

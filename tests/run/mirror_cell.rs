@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::data::data;
-use regrind::device::exchange::{
+use regrind::device::file_exchange::{
     CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, Permit, StationFiles, Stations,
 };
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};

@@ -13,7 +13,7 @@ use regrind::cell::Ending;
 use regrind::drive::{Drive, OrderSender, Request};
 use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::command::CommandFrame;
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::event_log::HandshakeEvent;
 use serde_json::Value;
 
 const DEVICES: [&str; 2] = ["cmm", "grinder"];

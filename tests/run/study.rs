@@ -25,7 +25,7 @@ use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
 use regrind_sim::body::{Payload, Payloads, Physics};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target, decode_points};
-use regrind_sim::process::Grinder;
+use regrind_sim::grinder::Grinder;
 use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;

@@ -8,9 +8,9 @@ use std::time::Duration;
 use regrind::cell::{Phase, StateName};
 use regrind::journal::{Reader, verify};
 use regrind_sim::command::{Command, State};
-use regrind_sim::dme::deed::MachineEvent;
-use regrind_sim::rsh::deed::ControllerEvent;
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::dme::event::MachineEvent;
+use regrind_sim::rsh::event::ControllerEvent;
+use regrind_sim::event_log::HandshakeEvent;
 use serde_json::Value;
 use tokio::time::Instant;
 

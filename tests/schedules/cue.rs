@@ -7,7 +7,7 @@ use std::time::Duration;
 use rand::RngExt as _;
 use rand::rngs::StdRng;
 use regrind_sim::command::State;
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::event_log::HandshakeEvent;
 use serde_json::Value;
 use tokio::sync::watch;
 

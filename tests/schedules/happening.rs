@@ -17,7 +17,7 @@ use regrind::device::{
 use regrind::drive::{BlockingExecutor, BlockingWork, Drive, InterruptedRun, OrderSender, RunInputs};
 use regrind::journal::{AuditKey, Header, Journal, Reader, RecordKind, RunLock, verify};
 use regrind::setup;
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::event_log::HandshakeEvent;
 use regrind_sim::wire::faults::{FaultPlan, SharedFaultPlan};
 use serde_json::json;
 use tokio::sync::mpsc;

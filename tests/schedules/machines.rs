@@ -4,15 +4,15 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use regrind_sim::command::State;
-use regrind_sim::dme::deed::MachineEvent;
+use regrind_sim::dme::event::MachineEvent;
 use regrind_sim::dme::faults::CommandFaults as DmeFaults;
 use regrind_sim::dme::{Server, machine as probe};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::rsh::Controller;
-use regrind_sim::rsh::deed::ControllerEvent;
+use regrind_sim::rsh::event::ControllerEvent;
 use regrind_sim::rsh::faults::LineFaults as RshFaults;
-use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::event_log::HandshakeEvent;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;

@@ -13,7 +13,7 @@ use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
 use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 use regrind_sim::wire::rsh::SharedController;
-use regrind_sim::words::WordOrder;
+use regrind_sim::register_encoding::WordOrder;
 use tokio::time::{Instant, sleep};
 
 use crate::ledger::{Disk, SharedDisk};

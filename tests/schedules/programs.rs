@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use regrind::cell::StateName;
-use regrind_sim::rsh::deed::ControllerEvent;
+use regrind_sim::rsh::event::ControllerEvent;
 use tokio::time::Instant;
 
 use crate::checker::{Evidence, is_intent};

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use regrind::cell::StateName;
-use regrind_sim::dme::deed::MachineEvent;
+use regrind_sim::dme::event::MachineEvent;
 use tokio::time::Instant;
 
 use crate::checker::{Evidence, is_intent};

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use regrind_sim::command::{Command, CommandFrame};
 use regrind_sim::options::RegisterLayout;
-use regrind_sim::words::WordOrder;
+use regrind_sim::register_encoding::WordOrder;
 use tokio::time::Instant;
 
 use crate::cue::Cues;

@@ -12,7 +12,7 @@ const RADIUS_MM: f64 = 12.5;
 fn sweep(world: &World, spacing_mm: f64, height_mm: f64, tracks: impl Iterator<Item = u32>, until_x_mm: f64) {
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
     let mut clock = 0.0;
-    let mut to = |wheel: &mut regrind_sim::executed::Wheel, place: [f64; 3]| {
+    let mut to = |wheel: &mut regrind_sim::executed_wheel::Wheel, place: [f64; 3]| {
         clock += 1e-3;
         wheel.move_to(place, clock);
     };

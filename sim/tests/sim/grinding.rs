@@ -269,7 +269,7 @@ fn grinder_prepare_refuses_bad_payload() {
     let world = world(small_perfect());
     let mut grinder = world.grinder();
     let (map, good) = (zero_map(HALF_MM), deep(0.1));
-    let answer = |grinder: &mut regrind_sim::process::Grinder, map: &_, pass: &_| {
+    let answer = |grinder: &mut regrind_sim::grinder::Grinder, map: &_, pass: &_| {
         grinder.prepare(1, 0, &grinder_payloads(map, pass)).map(|_| 0).unwrap_or_else(|refusal| refusal.answer)
     };
     assert_eq!(grinder.prepare(1, 0, &Default::default()).unwrap_err().answer, 8);

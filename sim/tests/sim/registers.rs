@@ -7,8 +7,8 @@ use regrind_sim::body::Kind;
 use regrind_sim::command::{Answer, Command, CommandFrame, Mode, State, interlock};
 use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::registers::{Exception, SimulatedMachine};
-use regrind_sim::seen::{BeatStatistics, HandshakeEvent};
-use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
+use regrind_sim::event_log::{BeatStatistics, HandshakeEvent};
+use regrind_sim::register_encoding::{WordOrder, bytes_of, registers_of, turn_payload};
 
 const MS: Duration = Duration::from_millis(1);
 const S: Duration = Duration::from_secs(1);

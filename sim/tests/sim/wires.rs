@@ -14,7 +14,7 @@ use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 #[cfg(unix)]
 use regrind_sim::wire::pty::Pty;
 use regrind_sim::wire::rtu::Line;
-use regrind_sim::words::{WordOrder, bytes_of, crc16, registers_of};
+use regrind_sim::register_encoding::{WordOrder, bytes_of, crc16, registers_of};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_modbus::client::{Context, Reader, Writer};

@@ -13,8 +13,8 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep_until, timeout};
 use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _};
 
-use super::hearing::{MeasurementSession, locked};
-use super::lines::LineSplitter;
+use super::job::{MeasurementSession, locked};
+use super::line_splitter::LineSplitter;
 use crate::error::DeviceError;
 use crate::modbus::Parity;
 

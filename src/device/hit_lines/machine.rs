@@ -11,16 +11,16 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use super::hearing::{MeasurementSession, RequestedMeasurement, locked};
+use super::job::{MeasurementSession, RequestedMeasurement, locked};
 use super::link::Listener;
-use super::list::TargetList;
+use super::target_list::TargetList;
 use super::settings::HitLinesSettings;
 use crate::error::{DeviceError, DeviceResult};
-use crate::exchange::plan_csv;
-use crate::kept::JobMemory;
+use crate::file_exchange::plan_csv;
+use crate::job_memory::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
-use crate::words::{
+use crate::handshake::{
     Answer, Armed, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome, Reconciled,
     Started, Status, digest, hex,
 };

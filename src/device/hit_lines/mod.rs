@@ -13,17 +13,17 @@
 //! A person, or the machine's own part program, leads the probe; nothing is ever sent. Page for the shop:
 //! docs/hit-lines.md.
 
-mod format;
-mod hearing;
-mod lines;
+mod protocol;
+mod job;
+mod line_splitter;
 mod link;
-mod list;
+mod target_list;
 mod machine;
 mod settings;
 
-pub use format::{Hit, LineError, LineFormat, LineParser, Separator};
-pub use lines::{LineSplitter, ReceivedLine};
+pub use protocol::{Hit, LineError, LineFormat, LineParser, Separator};
+pub use line_splitter::{LineSplitter, ReceivedLine};
 pub use link::HitSource;
-pub use list::Repeated;
+pub use target_list::Repeated;
 pub use machine::HitLinesCmm;
 pub use settings::{Axes, DataBits, HitLinesSettings, HitLinesWire, Mark};

@@ -7,14 +7,14 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::HitLinesCmm;
-use super::format::{LineFormat, LineParser, Separator};
-use super::hearing::LineRules;
+use super::protocol::{LineFormat, LineParser, Separator};
+use super::job::LineRules;
 use super::link::{HitSource, LinkTimeouts};
-use super::list::{Repeated, TouchRules};
-use crate::modbus::{Parity, port};
+use super::target_list::{Repeated, TouchRules};
+use crate::modbus::{Parity, serial_port};
 use crate::no_machine::NoMachine;
-use crate::place::MachineTable;
-use crate::wiring::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
+use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 use regrind_formats::Unit;
 use regrind_formats::result::Coordinates;
@@ -331,7 +331,7 @@ impl HitLinesWire {
 
     fn missing(&self) -> Option<String> {
         let device = self.device.as_ref().filter(|device| *device != AUTO)?;
-        port::missing(device)
+        serial_port::missing(device)
     }
 
     fn check_line(&self, place: &MachineTable<'_>, document: &mut Document) {

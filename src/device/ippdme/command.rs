@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::grammar;
-use super::text::{Item, Reader, Strictness, SyntaxError, Tag, arguments, has_stray_blank, list};
+use super::syntax::{Item, Reader, Strictness, SyntaxError, Tag, arguments, has_stray_blank, list};
 
 /// Maximum number of characters in a line, without the line end.
 pub const MAX_LINE_LENGTH: usize = 65_536;

@@ -2,7 +2,7 @@
 //! the grammar is not refused for its arguments.
 
 use super::command::DmeCommand;
-use super::text::{Item, SyntaxError, Tag, arguments, bad};
+use super::syntax::{Item, SyntaxError, Tag, arguments, bad};
 
 const PART_AXES: &[&str] = &["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C"];
 const CSYS: &[&str] = &["JogDisplayCsy", "JogMoveCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy", "SensorCsy"];

@@ -11,16 +11,16 @@ use tokio::time::Instant;
 
 use super::response::values;
 use super::route::Route;
-use super::session::{Failure, Session};
+use super::link::{Failure, Session};
 use super::settings::{IppdmeSettings, name};
-use super::text::Item;
-use super::work::{JobRequest, RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
+use super::syntax::Item;
+use super::job::{JobRequest, RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
 use crate::error::{DeviceError, DeviceResult};
-use crate::kept::JobMemory;
+use crate::job_memory::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, PreliminaryPoints};
-use crate::words::{
+use crate::handshake::{
     Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, Outcome, Reconciled, Started,
     Status, digest,
 };
@@ -119,7 +119,7 @@ impl IppdmeCmm {
         session.open(moved.then_some(self.settings.silence_limit)).await?;
         let version = request_if_supported(session, "GetDMEVersion", Vec::new()).await?;
         let class = request_if_supported(session, "GetMachineClass", Vec::new()).await?;
-        let said = |answer: &Option<super::session::CommandReply>, name: &str| match answer
+        let said = |answer: &Option<super::link::CommandReply>, name: &str| match answer
             .as_ref()?
             .line()
             .and_then(|data| values(data, name))?

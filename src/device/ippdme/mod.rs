@@ -17,17 +17,17 @@ mod machine;
 mod response;
 mod route;
 mod scan;
-mod session;
+mod link;
 mod settings;
-mod text;
-mod work;
+mod syntax;
+mod job;
 
 pub use command::{DmeCommand, MAX_LINE_LENGTH};
 pub use machine::IppdmeCmm;
 pub use response::{DmeResponse, ResponseContent, ServerError, value, values};
-pub use session::Limits;
+pub use link::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
-pub use text::{Item, SyntaxError, Tag, number};
+pub use syntax::{Item, SyntaxError, Tag, number};
 
 /// Returns the command name as a static string, for messages that hold no owned strings. Returns `"a command"` for an
 /// unknown name.

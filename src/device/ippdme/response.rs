@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::text::{Item, Reader, Strictness, SyntaxError, Tag};
+use super::syntax::{Item, Reader, Strictness, SyntaxError, Tag};
 
 /// Line from a server.
 #[derive(Clone, Debug, PartialEq)]

@@ -8,10 +8,10 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::IppdmeCmm;
-use super::session::Limits;
+use super::link::Limits;
 use crate::no_machine::NoMachine;
-use crate::place::MachineTable;
-use crate::wiring::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
+use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 
 /// I++ DME over TCP, for a measuring machine.

@@ -9,7 +9,7 @@ use super::link::{Link, LinkFault};
 use super::protocol::{ControllerMode, Get, RshReply, RshRequest, Set};
 use super::settings::LinuxcncSettings;
 use crate::error::{DeviceError, DeviceResult};
-use crate::words::{Answer, MachineCommand, MachineState};
+use crate::handshake::{Answer, MachineCommand, MachineState};
 use crate::{Connector, LineAddress};
 
 /// Interval between two queries while waiting for something.

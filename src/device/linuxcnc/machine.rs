@@ -10,9 +10,9 @@
 //!  STOP, ABORT  `abort`; the wheel stops where it is, possibly in the part                     -> COMPLETE, ABORTED
 //! ```
 
-mod beginning;
-mod looking;
-mod reconciling;
+mod start;
+mod status;
+mod reconcile;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,18 +26,18 @@ use super::folder::Folders;
 use super::program::{FramedProgram, PROGRAM, ProgramRecord, path};
 use super::protocol::{ControllerMode, Set};
 use super::settings::LinuxcncSettings;
-use super::work::{ActiveJob, Stage};
+use super::job::{ActiveJob, Stage};
 use crate::Connector;
 use crate::error::{DeviceError, DeviceResult};
 use crate::machine::{Grinder, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
-use crate::words::{
+use crate::handshake::{
     Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome,
     Reconciled, Started, Status, digest,
 };
-use looking::standing_fault;
-use reconciling::unknown;
+use status::standing_fault;
+use reconcile::unknown;
 
 /// Interval between two status queries while waiting for a start or a record.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);

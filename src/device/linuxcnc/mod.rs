@@ -19,7 +19,7 @@ mod machine;
 mod program;
 mod protocol;
 mod settings;
-mod work;
+mod job;
 
 pub use machine::LinuxcncGrinder;
 pub use program::{FramedProgram, ProgramInputs, ProgramRecord};

@@ -11,8 +11,8 @@ use serde::Deserialize;
 use super::LinuxcncGrinder;
 use crate::MachineKind;
 use crate::no_machine::NoMachine;
-use crate::place::MachineTable;
-use crate::wiring::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
+use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 
 /// LinuxCNC by linuxcncrsh over TCP, for a grinder.

@@ -18,7 +18,7 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 use tokio::time::Instant;
 
-use super::exchange::{
+use super::file_exchange::{
     ExchangeError, ResultRequirements, assemble_measurement, check_measurement, contradiction, file_word, plan_csv,
 };
 use super::{

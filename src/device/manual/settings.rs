@@ -5,7 +5,7 @@ use serde::Deserialize;
 
 use super::{ManualMachine, ManualSettings};
 use crate::MachineKind;
-use crate::wiring::{DriverContext, DriverError, DriverFactory};
+use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use regrind_formats::result::{Content, Coordinates, DecimalMark};
 use regrind_formats::{Columns, Unit};
 

@@ -3,7 +3,7 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
-use super::codec::{Registers, decode_outcome, decode_pass_record, decode_point, point_registers};
+use super::protocol::{Registers, decode_outcome, decode_pass_record, decode_point, point_registers};
 use super::{LineAddress, Link, ModbusMachine, ModbusSettings, WordOrder};
 use crate::{Job, MachineKind, Status};
 

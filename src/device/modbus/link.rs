@@ -33,7 +33,7 @@ use tokio_modbus::slave::{Slave, SlaveContext as _};
 use tokio_modbus::{ProtocolError, Request, Response};
 use tokio_serial::{SerialPort as _, SerialStream};
 
-use super::port;
+use super::serial_port;
 use super::settings::LineAddress;
 
 /// First pause before a line is opened again; it doubles up to [`MAX_BACKOFF`].
@@ -493,7 +493,7 @@ impl Connector for SystemConnector {
                     Ok(Box::new(stream) as Box<dyn LineStream>)
                 }
                 LineAddress::Rtu { device, baud, parity, stop_bits } => {
-                    Ok(Box::new(port::open(device, *baud, *parity, *stop_bits)?) as Box<dyn LineStream>)
+                    Ok(Box::new(serial_port::open(device, *baud, *parity, *stop_bits)?) as Box<dyn LineStream>)
                 }
             }
         })

@@ -10,12 +10,12 @@
 //! Only START is never repeated under a new number. Its frame may be written again with the same number. If that does
 //! not give an answer either, the outcome is unknown and stays unknown until the machine is asked.
 
-mod ahead;
+mod read_ahead;
 #[cfg(any(test, fuzzing))]
 mod any_registers;
-mod codec;
+mod protocol;
 mod link;
-pub(crate) mod port;
+pub(crate) mod serial_port;
 mod settings;
 mod signal;
 mod unit;
@@ -33,10 +33,10 @@ use super::{
     MachineCommand, MachineKind, MachineState, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints,
     Reconciled, SignalValue, Started, Status, digest,
 };
-use ahead::{ReadAhead, ReadAheadFailures};
+use read_ahead::{ReadAhead, ReadAheadFailures};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
-use codec::{CommandFrame, Payload, RecordError, crc32};
+use protocol::{CommandFrame, Payload, RecordError, crc32};
 use link::LinkRequest;
 pub(crate) use link::SystemConnector;
 pub use link::{ConnectFuture, Connector, LineStream, Link, LinkStatistics};
@@ -220,7 +220,7 @@ impl ModbusMachine {
         if !matches!(words[2], 1 | 2) {
             return Err(unlisted("its mode", words[2]));
         }
-        let outcome = codec::decode_outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
+        let outcome = protocol::decode_outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
         let job = Job { job: block.u32(8), cycle: words[10], digest: block.u32(12) };
         let block = StatusBlock {
             state,
@@ -789,7 +789,7 @@ impl ModbusMachine {
         }
         let (format, bytes, records) = (words[1], block.u32(2), block.u32(10));
         let size = match kind {
-            4 => codec::point_registers(format),
+            4 => protocol::point_registers(format),
             _ => (format == 1).then_some(32),
         };
         let Some(size) = size else {
@@ -1131,7 +1131,7 @@ impl Cmm for ModbusCmm {
         let coordinates = machine.coordinates(&header)?;
         let points = words.chunks_exact(header.registers).map(|record| {
             let record = machine.unit.registers(record);
-            codec::decode_point(record, header.format, header.scale_mm).map_err(|flaw| machine.record_error(flaw))
+            protocol::decode_point(record, header.format, header.scale_mm).map_err(|flaw| machine.record_error(flaw))
         });
         Ok(Measurement {
             points: points.collect::<Result<_, _>>()?,
@@ -1158,7 +1158,7 @@ impl Grinder for ModbusGrinder {
         let (status, header, words) = machine.fetch(job, 5, interrupt).await?;
         machine.count("pass records", 1, header.records.into())?;
         let figures =
-            codec::decode_pass_record(machine.unit.registers(&words)).map_err(|flaw| machine.record_error(flaw))?;
+            protocol::decode_pass_record(machine.unit.registers(&words)).map_err(|flaw| machine.record_error(flaw))?;
         let (number, cycle, outcome, [path_mm, removed_mm3, deepest_mm, idle_share, spindle_load, wheel_radius_mm]) =
             figures;
         machine.compare([

@@ -6,8 +6,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::port;
-use crate::place::MachineTable;
+use super::serial_port;
+use crate::machine_table::MachineTable;
 use regrind_document::Document;
 
 /// Number of registers that a Modbus device can have.
@@ -239,7 +239,7 @@ impl RtuWire {
     /// Returns a message if the serial port does not exist on this computer, with the names of the existing ports.
     /// Returns `None` if the port exists.
     pub(super) fn missing(&self) -> Option<String> {
-        port::missing(&self.device)
+        serial_port::missing(&self.device)
     }
 }
 

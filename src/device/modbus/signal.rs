@@ -1,6 +1,6 @@
 //! Additional signal that a cell file requests: the value in its registers, and the cause of a missing value.
 
-use super::codec::Registers;
+use super::protocol::Registers;
 use super::settings::{Signal, SignalType, WordOrder};
 
 impl Signal {

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use tokio::time::{Instant, sleep};
 
-use super::codec::{Registers, Writer};
+use super::protocol::{Registers, Writer};
 use super::link::{Link, LinkFault, LinkRequest};
 use super::settings::{RegisterMap, WordOrder};
 use crate::{DeviceError, Identity, MachineKind};
@@ -405,5 +405,5 @@ fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
 }
 
 fn crc(words: &[u16]) -> u64 {
-    u64::from(super::codec::crc32(words))
+    u64::from(super::protocol::crc32(words))
 }

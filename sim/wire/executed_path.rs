@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use crate::executed::Wheel;
+use crate::executed_wheel::Wheel;
 
 /// Duration of a servo cycle, in s.
 const CYCLE_S: f64 = 1e-3;

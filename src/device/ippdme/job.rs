@@ -9,12 +9,12 @@ use tokio::time::{Instant, sleep};
 
 use super::response::{ServerError, values};
 use super::route::{Leg, Route, approach, point_on_normal};
-use super::session::{CommandReply, Failure, Session};
+use super::link::{CommandReply, Failure, Session};
 use super::settings::IppdmeSettings;
-use super::text::Item;
+use super::syntax::Item;
 use crate::error::DeviceError;
 use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
-use crate::words::{Fault, Job, MachineState, Outcome};
+use crate::handshake::{Fault, Job, MachineState, Outcome};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.

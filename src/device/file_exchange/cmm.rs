@@ -13,7 +13,7 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::dmis;
-use super::measured::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
+use super::result_requirements::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
 use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};

@@ -8,7 +8,7 @@
 
 use std::time::Duration;
 
-use super::codec::{self, Registers};
+use super::protocol::{self, Registers};
 use super::link::LinkRequest;
 use super::{Header, MAX_RESULT_BYTES, ModbusMachine, PAGE_REGISTERS, StatusBlock};
 use crate::{DeviceError, Interrupt, Job, MachineState, MeasuredPoint, PreliminaryPoints, digest};
@@ -216,7 +216,7 @@ impl ModbusMachine {
     fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.point_count() * registers];
-        let point = |record| codec::decode_point(Registers::new(record, self.unit.map.word_order), format, scale_mm);
+        let point = |record| protocol::decode_point(Registers::new(record, self.unit.map.word_order), format, scale_mm);
         let points = new.chunks_exact(registers).map(|record| point(record).map_err(|flaw| self.record_error(flaw)));
         points.collect()
     }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use super::controller::{ControllerState, Interpreter};
 use super::program::{FramedProgram, ProgramRecord};
-use crate::words::{Fault, Job, MachineState, Outcome};
+use crate::handshake::{Fault, Job, MachineState, Outcome};
 
 /// Prepared job and everything known about it.
 #[derive(Clone, Debug)]

@@ -11,11 +11,11 @@ use std::time::Duration;
 use serde::Serialize;
 use tokio::time::Instant;
 
-use super::format::{LineError, LineParser};
-use super::lines::ReceivedLine;
-use super::list::{TargetList, TouchAssignment};
+use super::protocol::{LineError, LineParser};
+use super::line_splitter::ReceivedLine;
+use super::target_list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
-use crate::words::{Job, MachineState, Outcome, hex};
+use crate::handshake::{Job, MachineState, Outcome, hex};
 use regrind_formats::JsonlAppender;
 
 /// Number of refused lines kept for a person: the last ones.
@@ -307,7 +307,7 @@ impl MeasurementSession {
 
 #[cfg(test)]
 mod tests {
-    use super::super::list::tests::{RULES, plan};
+    use super::super::target_list::tests::{RULES, plan};
     use super::*;
     use regrind_formats::result::Coordinates;
 

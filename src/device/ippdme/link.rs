@@ -15,7 +15,7 @@ use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use super::command::{DmeCommand, MAX_LINE_LENGTH};
 use super::response::{DmeResponse, ResponseContent, ServerError, value};
-use super::text::{Item, Tag};
+use super::syntax::{Item, Tag};
 use crate::error::DeviceError;
 use crate::{Connector, LineAddress};
 
@@ -297,7 +297,7 @@ impl Session {
                 Ok(())
             }
             (Tag::UNSOLICITED, ResponseContent::Data(data)) => {
-                self.note(format!("action at the machine: {}", super::text::list(&data)));
+                self.note(format!("action at the machine: {}", super::syntax::list(&data)));
                 Ok(())
             }
             (Tag::UNSOLICITED, _) => Ok(()),

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::words::{Armed, Job};
+use crate::handshake::{Armed, Job};
 
 /// Job memory; `Load` is the type of the payload that is loaded for the next job.
 #[derive(Debug)]

@@ -8,8 +8,8 @@ use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
 use crate::error::DeviceResult;
 use crate::linuxcnc::controller::Interpreter;
 use crate::linuxcnc::program::ProgramRecord;
-use crate::linuxcnc::work::Stage;
-use crate::words::{Armed, Reconciled};
+use crate::linuxcnc::job::Stage;
+use crate::handshake::{Armed, Reconciled};
 
 impl LinuxcncGrinder {
     /// Returns whether the start of the job has led to a running or finished job, or that the controller runs another

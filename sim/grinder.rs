@@ -35,7 +35,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
-use crate::follow;
+use crate::followed_surface;
 use crate::form::FormError;
 use crate::head::Head;
 use crate::part::{Grooves, HeightGrid, Part};
@@ -271,7 +271,7 @@ fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program
     let y0 = grown(pass.extent_mm)[2];
     let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
     let followed =
-        program.map(|program| follow::heights_mm(part, program, pass.wheel_radius_mm, pass.track_spacing_mm));
+        program.map(|program| followed_surface::heights_mm(part, program, pass.wheel_radius_mm, pass.track_spacing_mm));
     let nodes = part.height.nodes().zip(&state.systematic_mm).enumerate();
     let steered = nodes.map(|(node, ([x, y], systematic))| {
         let [p, q] = part.shape.gradient(x, y);
