@@ -14,7 +14,7 @@ use regrind::cell::{Command, Ending, Event, Judgement};
 use regrind::compensation::Correction;
 use regrind::compensation::path::{HeightField, TargetSurface};
 use regrind::config::CellConfig;
-use regrind::device::exchange::ResultRequirements;
+use regrind::device::file_exchange::ResultRequirements;
 use regrind::document::Problems;
 use regrind::drive::{Reply, Request};
 use regrind::formats::Unit;

@@ -183,15 +183,15 @@ impl EventLog {
             self.forgotten += Self::CAPACITY as u64 / 2;
         }
         let seen = LogEntry { at, what };
-        if let Some(witness) = &mut self.observer {
-            witness(&seen);
+        if let Some(observer) = &mut self.observer {
+            observer(&seen);
         }
         self.entries.push(seen);
     }
 
     /// Sets an observer, which receives all events from now on.
-    pub(crate) fn set_observer(&mut self, witness: Observer) {
-        self.observer = Some(witness);
+    pub(crate) fn set_observer(&mut self, observer: Observer) {
+        self.observer = Some(observer);
     }
 
     pub(crate) fn entries(&self) -> &[LogEntry] {

@@ -24,8 +24,8 @@ use std::sync::{Arc, Mutex};
 
 use crate::Vec3;
 use crate::body::Kind;
-use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
 use crate::grinder::{cut, smooth};
+use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
 use crate::shape::project_onto;
 use crate::spec::{SpecError, WorldSpec};
 use crate::truth::{ExecutedPass, Source, WorldState, locked, stream};

@@ -13,10 +13,10 @@ use rand::RngExt;
 use crate::Rng;
 use crate::body::{Kind, Payloads, Physics, Progress};
 use crate::command::{Answer, Command, CommandFrame, Mode, State, interlock};
-use crate::options::MachineOptions;
 use crate::event_log::{BeatMonitor, EventLog, HandshakeEvent};
-use crate::transfer::{Arrived, Origin, Outbox, Slot, slot_of};
+use crate::options::MachineOptions;
 use crate::register_encoding::{RegisterBlock, WordOrder};
+use crate::transfer::{Arrived, Origin, Outbox, Slot, slot_of};
 
 /// Faults of docs/modbus.md that the handshake itself raises.
 const FAULT_STOP_CIRCUIT: u16 = 1;

@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use crate::body::{Kind, Physics};
 use crate::command::{Mode, State};
+use crate::event_log::{HandshakeEvent, LogEntry, Observer};
 use crate::handshake::Handshake;
 use crate::options::{Block, MachineOptions, RegisterLayout};
-use crate::event_log::{HandshakeEvent, LogEntry, Observer};
-use crate::transfer::{Inbox, page_image, slots_image};
 use crate::register_encoding::{RegisterBlock, WordOrder};
+use crate::transfer::{Inbox, page_image, slots_image};
 
 /// Modbus exception code of a refused request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -327,8 +327,8 @@ impl SimulatedMachine {
     }
 
     /// Sets an observer, which receives all events of the machine from now on.
-    pub fn set_observer(&mut self, witness: Observer) {
-        self.handshake.log.set_observer(witness);
+    pub fn set_observer(&mut self, observer: Observer) {
+        self.handshake.log.set_observer(observer);
     }
 
     /// Returns the number of old events that were removed from the log.

@@ -6,7 +6,7 @@
 //!  machine  what the machine is and does: tools, frames, motion, touches
 //!  scan     scans: curves followed in contact
 //!  faults   faults, by command
-//!  deed     events of the machine
+//!  event    events of the machine
 //! ```
 //!
 //! Commands are acknowledged when they arrive and carried out one after another; those whose name ends in E are carried
@@ -123,13 +123,13 @@ impl Server {
     }
 
     /// Sets an observer of all events of the machine from now on.
-    pub fn set_observer(&mut self, witness: Observer) {
-        self.observer = Some(witness);
+    pub fn set_observer(&mut self, observer: Observer) {
+        self.observer = Some(observer);
     }
 
-    fn notify(&mut self, deeds: &[MachineEvent]) {
-        if let Some(witness) = &mut self.observer {
-            deeds.iter().for_each(witness);
+    fn notify(&mut self, events: &[MachineEvent]) {
+        if let Some(observer) = &mut self.observer {
+            events.iter().for_each(observer);
         }
     }
 
@@ -294,8 +294,8 @@ impl Server {
     }
 
     fn notify_machine_events(&mut self) {
-        let deeds = std::mem::take(&mut self.machine.events);
-        self.notify(&deeds);
+        let events = std::mem::take(&mut self.machine.events);
+        self.notify(&events);
     }
 
     fn finish(&mut self) {

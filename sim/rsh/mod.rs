@@ -4,7 +4,7 @@
 //! ```text
 //!  program  a program as the interpreter reads it: ahead of the motion
 //!  faults   faults, by line
-//!  deed     events of the controller
+//!  event     events of the controller
 //! ```
 //!
 //! The acknowledgement of a `set` means only that the line was received. Whether it succeeded follows from the errors,
@@ -118,13 +118,13 @@ impl Controller {
     }
 
     /// Sets an observer, which receives all events of the controller from now on.
-    pub fn set_observer(&mut self, witness: Observer) {
-        self.observer = Some(witness);
+    pub fn set_observer(&mut self, observer: Observer) {
+        self.observer = Some(observer);
     }
 
-    fn notify(&mut self, deed: ControllerEvent) {
-        if let Some(witness) = &mut self.observer {
-            witness(&event);
+    fn notify(&mut self, event: ControllerEvent) {
+        if let Some(observer) = &mut self.observer {
+            observer(&event);
         }
     }
 

@@ -37,8 +37,8 @@ use tokio::net::{TcpListener, ToSocketAddrs};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use crate::registers::{Exception, SimulatedMachine};
 use crate::register_encoding::{bytes_of, crc16, registers_of};
+use crate::registers::{Exception, SimulatedMachine};
 use faults::{Fault, Request, SharedFaultPlan};
 
 /// Interval at which the machines' time advances.

@@ -11,12 +11,13 @@ use regrind::formats::{FormatError, JsonlAppender, ResultFolder, ScratchFolder, 
 use regrind::journal::utc;
 use regrind::recipe::{Recipe, WheelDimensions};
 use regrind_sim::cmm::TouchProbe;
+use regrind_sim::event_log::LogEntry;
+use regrind_sim::grinder::Programs;
 use regrind_sim::head::Head;
 use regrind_sim::options::{MachineOptions, RegisterLayout};
-use regrind_sim::grinder::Programs;
 use regrind_sim::program::Control;
+use regrind_sim::register_encoding;
 use regrind_sim::registers::SimulatedMachine;
-use regrind_sim::event_log::LogEntry;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::dme::ServingDme;
 use regrind_sim::wire::executed_path::ExecutedPath;
@@ -24,7 +25,6 @@ use regrind_sim::wire::faults::SharedFaultPlan;
 use regrind_sim::wire::hits::ServingHits;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
-use regrind_sim::register_encoding;
 use regrind_sim::world::World;
 use regrind_sim::{dme, hits};
 use serde::{Deserialize, Serialize};
@@ -386,7 +386,11 @@ fn boot_id() -> u32 {
 fn options(link: &LinkConfig, speed: f64, seed: u64) -> MachineOptions {
     let RegisterMap { word_order, .. } = link.registers;
     MachineOptions {
-        word_order: if word_order.is_low_first() { register_encoding::WordOrder::Little } else { register_encoding::WordOrder::Big },
+        word_order: if word_order.is_low_first() {
+            register_encoding::WordOrder::Little
+        } else {
+            register_encoding::WordOrder::Big
+        },
         swaps_bytes: word_order.swaps_bytes(),
         layout: layout(&link.registers),
         speed,

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use thiserror::Error;
 
+use super::handshake::MachineKind;
 use super::hit_lines::HitSource;
 use super::machine::{Cmm, Grinder};
-use super::modbus::{LineAddress, Link, RegisterMap, Signal};
 use super::machine_table::MachineTable;
-use super::handshake::MachineKind;
+use super::modbus::{LineAddress, Link, RegisterMap, Signal};
 use regrind_document::Document;
 use regrind_formats::FormatError;
 use regrind_formats::result::Coordinates;

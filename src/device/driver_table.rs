@@ -3,15 +3,15 @@
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::driver_factory::{DriverContext, DriverError, DriverFactory};
 use super::file_exchange::ExchangeWire;
 use super::hit_lines::{HitLinesWire, HitSource};
 use super::ippdme::IppdmeWire;
 use super::linuxcnc::LinuxcncWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
+use super::machine_table::MachineTable;
 use super::manual::ManualWire;
 use super::modbus::{LineAddress, Link, RtuWire, TcpWire};
-use super::machine_table::MachineTable;
-use super::driver_factory::{DriverContext, DriverError, DriverFactory};
 use super::{
     Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, OperatorConfirmation, Pass, PassRecord, Plan,
     PreliminaryPoints, Reconciled, Started, Status,

@@ -24,31 +24,38 @@
 //! is completed, its answer is discarded, and the connection stays valid. A `start` that is dropped has to be
 //! reconciled. To interrupt a long transfer in order, raise its [`Interrupt`].
 
-mod plan_mismatch;
+mod driver_factory;
+mod driver_table;
 mod error;
 pub mod file_exchange;
+mod handshake;
 pub mod hit_lines;
 pub mod ippdme;
 mod job_memory;
 pub mod linuxcnc;
 mod machine;
+mod machine_table;
 mod manual;
 mod modbus;
 mod no_machine;
 mod payload;
-mod machine_table;
+mod plan_mismatch;
 mod range;
-mod driver_table;
-mod driver_factory;
-mod handshake;
 
-pub use plan_mismatch::PlanMismatch;
+pub use driver_factory::{DriverContext, DriverError, DriverFactory, Timing};
+pub use driver_table::{AnyCmm, AnyGrinder, Wire};
 pub use error::DeviceError;
 use error::DeviceResult;
+pub use handshake::hex;
+pub use handshake::{
+    Answer, Armed, BatchId, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation,
+    Outcome, Reconciled, SignalValue, Started, Status, digest,
+};
 pub use hit_lines::{HitLinesCmm, HitLinesSettings, HitLinesWire, HitSource};
 pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, Scanning};
 pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
+pub use machine_table::MachineTable;
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]
 pub use modbus::any_registers;
@@ -60,13 +67,6 @@ pub use payload::{
     CarefulStart, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PlanTarget,
     PreliminaryPoints, TargetKind, TouchStatus,
 };
-pub use machine_table::MachineTable;
+pub use plan_mismatch::PlanMismatch;
 pub use range::{RANGES, ValueRange};
 pub use regrind_formats::result::Coordinates;
-pub use driver_table::{AnyCmm, AnyGrinder, Wire};
-pub use driver_factory::{DriverContext, DriverError, DriverFactory, Timing};
-pub use handshake::hex;
-pub use handshake::{
-    Answer, Armed, BatchId, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation,
-    Outcome, Reconciled, SignalValue, Started, Status, digest,
-};

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::error::DeviceError;
-use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, PreliminaryPoints};
 use super::handshake::{Armed, Identity, Job, OperatorConfirmation, Reconciled, Started, Status};
+use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, PreliminaryPoints};
 
 /// Operations of every machine of a cell, whatever its wire.
 ///

@@ -2,9 +2,9 @@
 //! grinders only.
 
 use super::error::DeviceResult;
+use super::handshake::{Armed, Identity, Job, Reconciled, Started, Status};
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
-use super::handshake::{Armed, Identity, Job, Reconciled, Started, Status};
 
 /// Type of a machine that a wire does not support. It has no values.
 #[derive(Debug)]

@@ -16,8 +16,8 @@ use regrind_sim::body::Kind;
 use regrind_sim::command::{Command, CommandFrame};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{self, PointRecord, encode_points};
-use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::register_encoding::{self, bytes_of, crc16, registers_of, turn_payload};
+use regrind_sim::registers::SimulatedMachine;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -270,9 +270,10 @@ const UNTURNED: [&str; 10] = [
 async fn modbus_page_frames_match_wire() {
     let page = vectors();
     let mut looked_at = BTreeSet::new();
-    for (name, order, sim_order) in
-        [("big", WordOrder::Big, register_encoding::WordOrder::Big), ("little", WordOrder::Little, register_encoding::WordOrder::Little)]
-    {
+    for (name, order, sim_order) in [
+        ("big", WordOrder::Big, register_encoding::WordOrder::Big),
+        ("little", WordOrder::Little, register_encoding::WordOrder::Little),
+    ] {
         let mut sent = measured(order, sim_order).await;
         sent.extend(ground(order, sim_order).await);
         sent.extend(measured_ahead(order, sim_order).await);
@@ -341,7 +342,8 @@ fn modbus_page_checksums_match_frames() {
         format!("`123456789` gives 0x{:08X}", crc32fast::hash(b"123456789")),
         format!("`123456789` gives 0x{:04X}", crc16(b"123456789")),
     ];
-    for (name, order) in [("big", register_encoding::WordOrder::Big), ("little", register_encoding::WordOrder::Little)] {
+    for (name, order) in [("big", register_encoding::WordOrder::Big), ("little", register_encoding::WordOrder::Little)]
+    {
         let of = |frame: &str| &page[&format!("{frame}.{name}.tcp")];
         told.push(format!("0x{}", of("claim")[13 + 32..][..2].iter().map(|b| format!("{b:02X}")).collect::<String>()));
         told.push(format!("0x{:08X}", crc32fast::hash(&of("page")[13 + 16..])));

@@ -1,6 +1,5 @@
 //! Tests of the drivers, each against machines at the far end of its real connection.
 
-mod read_ahead;
 mod contract;
 mod exchange;
 mod hit_lines;
@@ -11,4 +10,5 @@ mod keep;
 mod modbus;
 #[path = "../common/program.rs"]
 mod program;
+mod read_ahead;
 mod toy;

@@ -18,7 +18,7 @@ use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
-use regrind_sim::{registers, register_encoding};
+use regrind_sim::{register_encoding, registers};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket};
 
@@ -195,7 +195,11 @@ async fn modbus_pass_ground_and_recorded() {
 async fn word_orders_and_moved_registers() {
     for word_order in [WordOrder::Little, WordOrder::Badc, WordOrder::Dcba] {
         let layout = RegisterLayout { status: 1064, command: 1040, outbox_page: 2462, ..RegisterLayout::default() };
-        let of_sim = if word_order.is_low_first() { register_encoding::WordOrder::Little } else { register_encoding::WordOrder::Big };
+        let of_sim = if word_order.is_low_first() {
+            register_encoding::WordOrder::Little
+        } else {
+            register_encoding::WordOrder::Big
+        };
         let swaps_bytes = word_order.swaps_bytes();
         let options = MachineOptions { word_order: of_sim, swaps_bytes, layout, ..MachineOptions::default() };
         let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();

@@ -17,7 +17,7 @@ use regrind_sim::options::MachineOptions;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
-use regrind_sim::{registers, register_encoding};
+use regrind_sim::{register_encoding, registers};
 
 use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, rtu, settings, wait_for_state};
 use crate::toy::Toy;
@@ -136,7 +136,8 @@ async fn read_ahead_result_equals_full_read() {
 #[tokio::test]
 async fn read_ahead_records_across_pages() {
     let plan = plan(POINTS);
-    let options = MachineOptions { speed: 0.0, word_order: register_encoding::WordOrder::Little, ..MachineOptions::default() };
+    let options =
+        MachineOptions { speed: 0.0, word_order: register_encoding::WordOrder::Little, ..MachineOptions::default() };
     let machine = registers::SimulatedMachine::new(Box::new(toy().in_counts()), 0xb007, options);
     let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
     let mut settings = patient(settings(&serving));

@@ -21,10 +21,10 @@ use regrind_sim::Vec3;
 use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::probe::Placement;
+use regrind_sim::register_encoding;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
-use regrind_sim::register_encoding;
 use regrind_sim::world::World;
 use serde::Deserialize;
 use serde_json::json;
@@ -382,7 +382,11 @@ async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<WorldRecorder>) -> ([
         // A client on a loaded computer must not look like a client that is gone.
         lost_after_ms: 30_000,
         acting: Duration::from_millis(10),
-        word_order: if setup.other_word_order { register_encoding::WordOrder::Little } else { register_encoding::WordOrder::Big },
+        word_order: if setup.other_word_order {
+            register_encoding::WordOrder::Little
+        } else {
+            register_encoding::WordOrder::Big
+        },
         version: setup.version,
         ..MachineOptions::default()
     };

@@ -9,8 +9,8 @@ use regrind::cell::{Phase, StateName};
 use regrind::journal::{Reader, verify};
 use regrind_sim::command::{Command, State};
 use regrind_sim::dme::event::MachineEvent;
-use regrind_sim::rsh::event::ControllerEvent;
 use regrind_sim::event_log::HandshakeEvent;
+use regrind_sim::rsh::event::ControllerEvent;
 use serde_json::Value;
 use tokio::time::Instant;
 
@@ -55,9 +55,9 @@ pub struct Evidence {
     pub folder: PathBuf,
     pub log: Vec<Moment>,
     /// Actions of the CMM, if it is one by I++ DME.
-    pub deeds: Vec<(Instant, MachineEvent)>,
+    pub machine_events: Vec<(Instant, MachineEvent)>,
     /// Actions of the grinder, if it is one by LinuxCNC.
-    pub rsh_deeds: Vec<(Instant, ControllerEvent)>,
+    pub rsh_events: Vec<(Instant, ControllerEvent)>,
     pub given: Vec<GivenOrder>,
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
@@ -90,16 +90,17 @@ impl Evidence {
             .sent
             .iter()
             .map(|s| (s.at, format!("{} is sent {:?} {}", NAMES[s.machine], s.command, s.frame.sequence)));
-        let deeds = self.deeds.iter().map(|(at, deed)| (*at, format!("cmm {deed:?}")));
-        let rsh_deeds = self.rsh_deeds.iter().map(|(at, deed)| (*at, format!("grinder {:.180}", format!("{deed:?}"))));
+        let machine_events = self.machine_events.iter().map(|(at, event)| (*at, format!("cmm {event:?}")));
+        let rsh_events =
+            self.rsh_events.iter().map(|(at, event)| (*at, format!("grinder {:.180}", format!("{event:?}"))));
         let spoken = self.wires.lines.iter().map(|s| (s.at, format!("{} is told {}", NAMES[s.machine], s.line)));
         let mut lines: Vec<(Instant, String)> = log
             .chain(written)
             .chain(given)
             .chain(shown)
             .chain(sent)
-            .chain(deeds)
-            .chain(rsh_deeds)
+            .chain(machine_events)
+            .chain(rsh_events)
             .chain(spoken)
             .collect();
         lines.sort_by_key(|(at, _)| *at);
@@ -485,7 +486,7 @@ fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
 /// Checks that an abort is sent at once to a moving machine, whatever the disk does, if nothing obstructs it.
 fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = &evidence.hindered else { return Ok(()) };
-    let by_lines = [!evidence.deeds.is_empty(), !evidence.rsh_deeds.is_empty()];
+    let by_lines = [!evidence.machine_events.is_empty(), !evidence.rsh_events.is_empty()];
     for abort in evidence.given.iter().filter(|given| given.what == "abort" && given.done) {
         let by = abort.at + ABORTS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && abort.at <= *to + RECOVERS_WITHIN);

@@ -66,18 +66,18 @@ GUARDS = {
     "what an interrupted I++ job has left moving is aborted": (
         "src/device/ippdme/machine.rs", "moved.then_some(self.settings.silence_limit)", "moved.then_some(self.settings.silence_limit).filter(|_| false)"),
     "a line of another I++ command is none of this one": (
-        "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
+        "src/device/ippdme/link.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
         "device", "unrequested_data_disconnects"),
     "an I++ job is held between two targets": (
-        "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break 'job;", "if false && self.current_request() != JobRequest::Continue {\n                    break 'job;",
+        "src/device/ippdme/job.rs", "if self.current_request() != JobRequest::Continue {\n                    break 'job;", "if false && self.current_request() != JobRequest::Continue {\n                    break 'job;",
         "device", "hold_retracts_resume_touches_rest"),
     "an I++ job is held between two rows": (
-        "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break;", "if false && self.current_request() != JobRequest::Continue {\n                    break;",
+        "src/device/ippdme/job.rs", "if self.current_request() != JobRequest::Continue {\n                    break;", "if false && self.current_request() != JobRequest::Continue {\n                    break;",
         "device", "hold_in_scan_defers_next_row"),
     "the probe travels at the clearance": (
-        "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
+        "src/device/ippdme/job.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
     "a program that has begun is not prepared again": (
-        "src/device/linuxcnc/machine/beginning.rs", "if before.begun > 0 {", "if false && before.begun > 0 {",
+        "src/device/linuxcnc/machine/start.rs", "if before.begun > 0 {", "if false && before.begun > 0 {",
         "linuxcnc", "prepare_refuses_begun_program"),
     "the controller has the program that it was told to open": (
         "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)",
@@ -87,7 +87,7 @@ GUARDS = {
     "a program writes its end behind its motion": (
         "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
-        "src/device/linuxcnc/machine/reconciling.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
+        "src/device/linuxcnc/machine/reconcile.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
         "linuxcnc", "ignored_start_unknown_until_reconcile"),
     "what is prepared is looked at before a START": (
         "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != MachineState::Prepared || seen.mode", "if seen.mode",

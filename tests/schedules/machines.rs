@@ -7,12 +7,12 @@ use regrind_sim::command::State;
 use regrind_sim::dme::event::MachineEvent;
 use regrind_sim::dme::faults::CommandFaults as DmeFaults;
 use regrind_sim::dme::{Server, machine as probe};
+use regrind_sim::event_log::HandshakeEvent;
 use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::rsh::Controller;
 use regrind_sim::rsh::event::ControllerEvent;
 use regrind_sim::rsh::faults::LineFaults as RshFaults;
-use regrind_sim::event_log::HandshakeEvent;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
@@ -109,10 +109,10 @@ impl Plant {
 pub struct Machines {
     pub plants: [Plant; 2],
     pub log: Log,
-    pub deeds: Deeds,
+    pub machine_events: Deeds,
     /// Remaining faults of the server of I++ DME.
     pub dme_faults: DmeFaults,
-    pub rsh_deeds: RshDeeds,
+    pub rsh_events: RshDeeds,
     pub rsh_faults: RshFaults,
 }
 
@@ -128,7 +128,7 @@ impl Machines {
             spec.cmm.not_found_share = 0.01;
         }
         let world = World::new(spec).unwrap();
-        let (log, deeds, dme_faults) = (Log::default(), Deeds::default(), DmeFaults::none());
+        let (log, machine_events, dme_faults) = (Log::default(), Deeds::default(), DmeFaults::none());
         let options = |seed| MachineOptions { speed, seed, trusting, ..MachineOptions::default() };
         let by_registers = |number: usize, mut machine: SimulatedMachine| {
             let (log, cues) = (log.clone(), cues.clone());
@@ -144,10 +144,10 @@ impl Machines {
                 for (method, skip, fault) in faults {
                     dme_faults.add(*method, *skip, fault.clone());
                 }
-                Plant::Dme(by_lines(&world, speed, dme_faults.clone(), (&log, &deeds, cues)))
+                Plant::Dme(by_lines(&world, speed, dme_faults.clone(), (&log, &machine_events, cues)))
             }
         };
-        let (rsh_deeds, rsh_faults) = (RshDeeds::default(), RshFaults::none());
+        let (rsh_events, rsh_faults) = (RshDeeds::default(), RshFaults::none());
         let grinder = match &schedule.rsh {
             None => by_registers(1, SimulatedMachine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6))),
             Some(faults) => {
@@ -155,10 +155,10 @@ impl Machines {
                     rsh_faults.add(*begins, *skip, fault.clone());
                 }
                 let speed = OF_PROGRAMS * speed;
-                Plant::Rsh(by_programs(&world, speed, rsh_faults.clone(), (&log, &rsh_deeds, cues)))
+                Plant::Rsh(by_programs(&world, speed, rsh_faults.clone(), (&log, &rsh_events, cues)))
             }
         };
-        Self { plants: [cmm, grinder], log, deeds, dme_faults, rsh_deeds, rsh_faults }
+        Self { plants: [cmm, grinder], log, machine_events, dme_faults, rsh_events, rsh_faults }
     }
 
     /// Returns the far end of the connection of a machine.
@@ -187,13 +187,18 @@ impl Machines {
 }
 
 /// Returns a measuring machine with a server of I++ DME.
-fn by_lines(world: &World, speed: f64, faults: DmeFaults, (log, deeds, cues): (&Log, &Deeds, &Cues)) -> SharedServer {
+fn by_lines(
+    world: &World,
+    speed: f64,
+    faults: DmeFaults,
+    (log, machine_events, cues): (&Log, &Deeds, &Cues),
+) -> SharedServer {
     let mut server = Server::new(probe::DmeMachine::new(world.touch_probe(), probe::Options::default()), speed, faults);
-    let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
-    server.set_observer(Box::new(move |deed| {
+    let (log, machine_events, cues) = (log.clone(), machine_events.clone(), cues.clone());
+    server.set_observer(Box::new(move |event| {
         let at = Instant::now();
-        deeds.lock().unwrap().push((at, deed.clone()));
-        let (from, to) = match deed {
+        machine_events.lock().unwrap().push((at, event.clone()));
+        let (from, to) = match event {
             MachineEvent::MotionStarted { command, .. } => {
                 if command == "ChangeTool" {
                     cues.begin();
@@ -213,15 +218,15 @@ fn by_programs(
     world: &World,
     speed: f64,
     faults: RshFaults,
-    (log, deeds, cues): (&Log, &RshDeeds, &Cues),
+    (log, machine_events, cues): (&Log, &RshDeeds, &Cues),
 ) -> SharedController {
     let radius_mm = setting(RequiredQuality::Good).recipe.grinding.wheel.radius_mm();
     let mut controller = Controller::new(world.plain_wheel(radius_mm), speed, faults);
-    let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
-    controller.set_observer(Box::new(move |deed| {
+    let (log, machine_events, cues) = (log.clone(), machine_events.clone(), cues.clone());
+    controller.set_observer(Box::new(move |event| {
         let at = Instant::now();
-        deeds.lock().unwrap().push((at, deed.clone()));
-        let (from, to) = match deed {
+        machine_events.lock().unwrap().push((at, event.clone()));
+        let (from, to) = match event {
             ControllerEvent::Began { .. } => return cues.begin(),
             ControllerEvent::MotionStarted => (State::Idle, State::Execute),
             ControllerEvent::MotionEnded => (State::Execute, State::Idle),

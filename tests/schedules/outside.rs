@@ -8,12 +8,12 @@ use regrind::device::{Link, Machine as _, ModbusCmm, ModbusGrinder, ModbusSettin
 use regrind::drive::{OrderSender, Request};
 use regrind_sim::command::{CommandFrame, Mode};
 use regrind_sim::options::RegisterLayout;
+use regrind_sim::register_encoding::WordOrder;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
 use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 use regrind_sim::wire::rsh::SharedController;
-use regrind_sim::register_encoding::WordOrder;
 use tokio::time::{Instant, sleep};
 
 use crate::ledger::{Disk, SharedDisk};

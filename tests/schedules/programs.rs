@@ -23,7 +23,7 @@ const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
 ///
 /// Returns the first broken promise.
 pub fn check(evidence: &Evidence) -> Result<(), String> {
-    if evidence.rsh_deeds.is_empty() {
+    if evidence.rsh_events.is_empty() {
         return Ok(());
     }
     begins_what_is_meant(evidence)?;
@@ -43,8 +43,8 @@ fn named(path: &str) -> Option<(&str, u64)> {
 /// of that pass.
 fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
     let mut begun = BTreeSet::new();
-    for (at, deed) in &evidence.rsh_deeds {
-        let ControllerEvent::Began { path, text } = deed else { continue };
+    for (at, event) in &evidence.rsh_events {
+        let ControllerEvent::Began { path, text } = event else { continue };
         let when = evidence.seconds(*at);
         if !begun.insert(path) {
             return Err(format!("{path} was begun twice, again at {when:.3} s"));
@@ -72,8 +72,8 @@ fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
 /// only by a START.
 fn goes_on_by_an_order(evidence: &Evidence) -> Result<(), String> {
     let mut aborted: Option<Instant> = None;
-    for (at, deed) in &evidence.rsh_deeds {
-        match deed {
+    for (at, event) in &evidence.rsh_events {
+        match event {
             ControllerEvent::Aborted => aborted = Some(*at),
             ControllerEvent::MotionStarted => {
                 let Some(since) = aborted.take() else { continue };
@@ -109,7 +109,7 @@ fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
         evidence.given.iter().filter(|given| matches!(given.what, "hold" | "stop") && given.done && given.moved[1])
     {
         let moved =
-            evidence.rsh_deeds.iter().rfind(|(at, deed)| *at <= given.at && *deed == ControllerEvent::MotionStarted);
+            evidence.rsh_events.iter().rfind(|(at, event)| *at <= given.at && *event == ControllerEvent::MotionStarted);
         let since = moved.map_or(evidence.began, |(at, _)| *at);
         let by = given.at.max(since + SEEN_WITHIN) + HOLDS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && given.at <= *to + RECOVERS_WITHIN);
@@ -117,9 +117,9 @@ fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
         let ended = evidence.shown.iter().rfind(|shown| shown.at <= by && shown.state.is_none());
         let has_met = ended.is_none_or(|ended| ended.at + RECOVERS_WITHIN < given.at);
         let stands = evidence
-            .rsh_deeds
+            .rsh_events
             .iter()
-            .any(|(at, deed)| given.at <= *at && *at <= by && *deed == ControllerEvent::MotionEnded);
+            .any(|(at, event)| given.at <= *at && *at <= by && *event == ControllerEvent::MotionEnded);
         let told = evidence.wires.lines.iter().any(|spoken| {
             let makes_safe = matches!(spoken.line.as_str(), "set pause" | "set abort");
             spoken.machine == 1 && makes_safe && since <= spoken.at && spoken.at <= by

@@ -28,7 +28,7 @@ const MOTIONS: [&str; 4] = ["GoTo(", "PtMeas(", "Home(", "ChangeTool("];
 ///
 /// Returns the first broken promise.
 pub fn check(evidence: &Evidence) -> Result<(), String> {
-    if evidence.deeds.is_empty() {
+    if evidence.machine_events.is_empty() {
         return Ok(());
     }
     moves_by_an_intent(evidence)?;
@@ -41,7 +41,7 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
 
 /// Returns every motion that began: its command, its start and its end.
 fn motions(evidence: &Evidence) -> impl Iterator<Item = (Instant, &str, [[f64; 3]; 2])> {
-    evidence.deeds.iter().filter_map(|(at, deed)| match deed {
+    evidence.machine_events.iter().filter_map(|(at, event)| match event {
         MachineEvent::MotionStarted { command, from_mm, to_mm } => Some((*at, command.as_str(), [*from_mm, *to_mm])),
         _ => None,
     })
@@ -75,8 +75,8 @@ fn moves_by_an_intent(evidence: &Evidence) -> Result<(), String> {
 /// Checks that nothing moves after an abort before a person resumes the job, or the next START is on record.
 fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
     let mut aborted = None;
-    for (at, deed) in &evidence.deeds {
-        match (deed, aborted) {
+    for (at, event) in &evidence.machine_events {
+        match (event, aborted) {
             (MachineEvent::Aborted, _) => aborted = Some(*at),
             (MachineEvent::MotionStarted { command, .. }, Some(since)) => {
                 let goes_on = |w: &Recorded| {
@@ -97,7 +97,7 @@ fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
 /// Checks that below the clearance the probe only moves straight up or down, and to a target directly there. Homing is
 /// excluded: the machine does it in its own way.
 fn travels_at_the_clearance(evidence: &Evidence) -> Result<(), String> {
-    let touched = evidence.deeds.iter().filter_map(|(_, deed)| match deed {
+    let touched = evidence.machine_events.iter().filter_map(|(_, event)| match event {
         MachineEvent::Touched { point_mm, .. } => Some(point_mm[2]),
         _ => None,
     });
@@ -130,8 +130,8 @@ fn measured_is_touched(evidence: &Evidence) -> Result<(), String> {
         let Some(intent) = intents().rfind(of_cycle) else { continue };
         let next = intents().find(|w| w.at > intent.at).map(|w| w.at);
         let mut last = BTreeMap::new();
-        for (at, deed) in &evidence.deeds {
-            if let MachineEvent::Touched { point_mm, centre_mm, .. } = deed
+        for (at, event) in &evidence.machine_events {
+            if let MachineEvent::Touched { point_mm, centre_mm, .. } = event
                 && intent.at <= *at
                 && next.is_none_or(|next| *at < next)
             {

@@ -2,9 +2,9 @@
 #![allow(dead_code)]
 
 use regrind_sim::body::{Payload, Payloads, Physics, ResultData};
+use regrind_sim::grinder::Grinder;
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target, decode_points};
-use regrind_sim::grinder::Grinder;
 use regrind_sim::spec::CmmSpec;
 use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::WorldSpec;

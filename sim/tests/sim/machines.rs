@@ -7,8 +7,8 @@ use regrind_sim::body::Physics;
 use regrind_sim::command::{Answer, Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{PassRecord, decode_points};
-use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::register_encoding::{WordOrder, bytes_of, registers_of, turn_payload};
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::world::World;
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];

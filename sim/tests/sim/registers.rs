@@ -5,10 +5,10 @@ use std::time::Duration;
 use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Answer, Command, CommandFrame, Mode, State, interlock};
-use regrind_sim::options::{MachineOptions, RegisterLayout};
-use regrind_sim::registers::{Exception, SimulatedMachine};
 use regrind_sim::event_log::{BeatStatistics, HandshakeEvent};
+use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::register_encoding::{WordOrder, bytes_of, registers_of, turn_payload};
+use regrind_sim::registers::{Exception, SimulatedMachine};
 
 const MS: Duration = Duration::from_millis(1);
 const S: Duration = Duration::from_secs(1);

@@ -8,13 +8,13 @@ use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
+use regrind_sim::register_encoding::{WordOrder, bytes_of, crc16, registers_of};
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 #[cfg(unix)]
 use regrind_sim::wire::pty::Pty;
 use regrind_sim::wire::rtu::Line;
-use regrind_sim::register_encoding::{WordOrder, bytes_of, crc16, registers_of};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_modbus::client::{Context, Reader, Writer};

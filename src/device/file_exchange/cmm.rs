@@ -13,8 +13,8 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::dmis;
-use super::result_requirements::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
 use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
+use super::result_requirements::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
 use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult};

@@ -11,8 +11,8 @@ use std::time::Duration;
 use serde::Serialize;
 use tokio::time::Instant;
 
-use super::protocol::{LineError, LineParser};
 use super::line_splitter::ReceivedLine;
+use super::protocol::{LineError, LineParser};
 use super::target_list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
 use crate::handshake::{Job, MachineState, Outcome, hex};

@@ -13,17 +13,17 @@ use std::sync::{Arc, Mutex};
 
 use super::job::{MeasurementSession, RequestedMeasurement, locked};
 use super::link::Listener;
-use super::target_list::TargetList;
 use super::settings::HitLinesSettings;
+use super::target_list::TargetList;
 use crate::error::{DeviceError, DeviceResult};
 use crate::file_exchange::plan_csv;
-use crate::job_memory::JobMemory;
-use crate::machine::{Cmm, Interrupt, Machine};
-use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
 use crate::handshake::{
     Answer, Armed, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome, Reconciled,
     Started, Status, digest, hex,
 };
+use crate::job_memory::JobMemory;
+use crate::machine::{Cmm, Interrupt, Machine};
+use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
 use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
 
 /// Measuring machine that prints a line for each hit.

@@ -13,17 +13,17 @@
 //! A person, or the machine's own part program, leads the probe; nothing is ever sent. Page for the shop:
 //! docs/hit-lines.md.
 
-mod protocol;
 mod job;
 mod line_splitter;
 mod link;
-mod target_list;
 mod machine;
+mod protocol;
 mod settings;
+mod target_list;
 
-pub use protocol::{Hit, LineError, LineFormat, LineParser, Separator};
 pub use line_splitter::{LineSplitter, ReceivedLine};
 pub use link::HitSource;
-pub use target_list::Repeated;
 pub use machine::HitLinesCmm;
+pub use protocol::{Hit, LineError, LineFormat, LineParser, Separator};
 pub use settings::{Axes, DataBits, HitLinesSettings, HitLinesWire, Mark};
+pub use target_list::Repeated;

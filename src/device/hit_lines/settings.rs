@@ -7,14 +7,14 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::HitLinesCmm;
-use super::protocol::{LineFormat, LineParser, Separator};
 use super::job::LineRules;
 use super::link::{HitSource, LinkTimeouts};
+use super::protocol::{LineFormat, LineParser, Separator};
 use super::target_list::{Repeated, TouchRules};
+use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
 use crate::modbus::{Parity, serial_port};
 use crate::no_machine::NoMachine;
-use crate::machine_table::MachineTable;
-use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 use regrind_formats::Unit;
 use regrind_formats::result::Coordinates;

@@ -7,14 +7,14 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep};
 
+use super::link::{CommandReply, Failure, Session};
 use super::response::{ServerError, values};
 use super::route::{Leg, Route, approach, point_on_normal};
-use super::link::{CommandReply, Failure, Session};
 use super::settings::IppdmeSettings;
 use super::syntax::Item;
 use crate::error::DeviceError;
-use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 use crate::handshake::{Fault, Job, MachineState, Outcome};
+use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.

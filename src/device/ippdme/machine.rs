@@ -9,21 +9,21 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
+use super::job::{JobRequest, RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
+use super::link::{Failure, Session};
 use super::response::values;
 use super::route::Route;
-use super::link::{Failure, Session};
 use super::settings::{IppdmeSettings, name};
 use super::syntax::Item;
-use super::job::{JobRequest, RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
 use crate::error::{DeviceError, DeviceResult};
-use crate::job_memory::JobMemory;
-use crate::machine::{Cmm, Interrupt, Machine};
-use crate::modbus::SystemConnector;
-use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, PreliminaryPoints};
 use crate::handshake::{
     Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, Outcome, Reconciled, Started,
     Status, digest,
 };
+use crate::job_memory::JobMemory;
+use crate::machine::{Cmm, Interrupt, Machine};
+use crate::modbus::SystemConnector;
+use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, PreliminaryPoints};
 use crate::{Connector, LineAddress};
 use regrind_formats::result::Coordinates;
 

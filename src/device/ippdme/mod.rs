@@ -13,19 +13,19 @@
 
 mod command;
 mod grammar;
+mod job;
+mod link;
 mod machine;
 mod response;
 mod route;
 mod scan;
-mod link;
 mod settings;
 mod syntax;
-mod job;
 
 pub use command::{DmeCommand, MAX_LINE_LENGTH};
+pub use link::Limits;
 pub use machine::IppdmeCmm;
 pub use response::{DmeResponse, ResponseContent, ServerError, value, values};
-pub use link::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
 pub use syntax::{Item, SyntaxError, Tag, number};
 

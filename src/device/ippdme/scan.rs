@@ -9,11 +9,11 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::job::{MISS_ERRORS, RoutedPlan, Worker, distance, locked};
+use super::link::Failure;
 use super::response::ServerError;
 use super::route::{Leg, point_on_normal};
-use super::link::Failure;
 use super::syntax::Item;
-use super::job::{MISS_ERRORS, RoutedPlan, Worker, distance, locked};
 use crate::error::DeviceError;
 use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 

@@ -9,9 +9,9 @@ use serde::Deserialize;
 
 use super::IppdmeCmm;
 use super::link::Limits;
-use crate::no_machine::NoMachine;
-use crate::machine_table::MachineTable;
 use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
+use crate::no_machine::NoMachine;
 use regrind_document::Document;
 
 /// I++ DME over TCP, for a measuring machine.

@@ -10,9 +10,9 @@
 //!  STOP, ABORT  `abort`; the wheel stops where it is, possibly in the part                     -> COMPLETE, ABORTED
 //! ```
 
+mod reconcile;
 mod start;
 mod status;
-mod reconcile;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,21 +23,21 @@ use tokio::time::{Instant, timeout};
 
 use super::controller::{Controller, Interpreter};
 use super::folder::Folders;
+use super::job::{ActiveJob, Stage};
 use super::program::{FramedProgram, PROGRAM, ProgramRecord, path};
 use super::protocol::{ControllerMode, Set};
 use super::settings::LinuxcncSettings;
-use super::job::{ActiveJob, Stage};
 use crate::Connector;
 use crate::error::{DeviceError, DeviceResult};
-use crate::machine::{Grinder, Interrupt, Machine};
-use crate::modbus::SystemConnector;
-use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use crate::handshake::{
     Answer, Armed, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome,
     Reconciled, Started, Status, digest,
 };
-use status::standing_fault;
+use crate::machine::{Grinder, Interrupt, Machine};
+use crate::modbus::SystemConnector;
+use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use reconcile::unknown;
+use status::standing_fault;
 
 /// Interval between two status queries while waiting for a start or a record.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);

@@ -14,12 +14,12 @@
 
 mod controller;
 mod folder;
+mod job;
 mod link;
 mod machine;
 mod program;
 mod protocol;
 mod settings;
-mod job;
 
 pub use machine::LinuxcncGrinder;
 pub use program::{FramedProgram, ProgramInputs, ProgramRecord};

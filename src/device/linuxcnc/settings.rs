@@ -10,9 +10,9 @@ use serde::Deserialize;
 
 use super::LinuxcncGrinder;
 use crate::MachineKind;
-use crate::no_machine::NoMachine;
-use crate::machine_table::MachineTable;
 use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
+use crate::no_machine::NoMachine;
 use regrind_document::Document;
 
 /// LinuxCNC by linuxcncrsh over TCP, for a grinder.

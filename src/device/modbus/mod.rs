@@ -10,11 +10,11 @@
 //! Only START is never repeated under a new number. Its frame may be written again with the same number. If that does
 //! not give an answer either, the outcome is unknown and stays unknown until the machine is asked.
 
-mod read_ahead;
 #[cfg(any(test, fuzzing))]
 mod any_registers;
-mod protocol;
 mod link;
+mod protocol;
+mod read_ahead;
 pub(crate) mod serial_port;
 mod settings;
 mod signal;
@@ -33,13 +33,13 @@ use super::{
     MachineCommand, MachineKind, MachineState, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints,
     Reconciled, SignalValue, Started, Status, digest,
 };
-use read_ahead::{ReadAhead, ReadAheadFailures};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
-use protocol::{CommandFrame, Payload, RecordError, crc32};
 use link::LinkRequest;
 pub(crate) use link::SystemConnector;
 pub use link::{ConnectFuture, Connector, LineStream, Link, LinkStatistics};
+use protocol::{CommandFrame, Payload, RecordError, crc32};
+use read_ahead::{ReadAhead, ReadAheadFailures};
 pub use settings::{
     LineAddress, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };

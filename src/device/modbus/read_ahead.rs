@@ -8,8 +8,8 @@
 
 use std::time::Duration;
 
-use super::protocol::{self, Registers};
 use super::link::LinkRequest;
+use super::protocol::{self, Registers};
 use super::{Header, MAX_RESULT_BYTES, ModbusMachine, PAGE_REGISTERS, StatusBlock};
 use crate::{DeviceError, Interrupt, Job, MachineState, MeasuredPoint, PreliminaryPoints, digest};
 

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use tokio::time::{Instant, sleep};
 
-use super::protocol::{Registers, Writer};
 use super::link::{Link, LinkFault, LinkRequest};
+use super::protocol::{Registers, Writer};
 use super::settings::{RegisterMap, WordOrder};
 use crate::{DeviceError, Identity, MachineKind};
 

@@ -2,8 +2,8 @@
 
 use super::settings::{LineAddress, ModbusSettings, RtuWire, TcpWire};
 use super::{Link, ModbusCmm, ModbusGrinder};
-use crate::machine_table::MachineTable;
 use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::machine_table::MachineTable;
 use regrind_document::Document;
 
 macro_rules! modbus_wire {

@@ -163,13 +163,13 @@ fn weather(seed: u64, cells: usize, parts: usize) {
         (1..=cells).map(|number| cell(&plant, number, &approvers, &broker)).unzip();
 
     let left = AtomicUsize::new(parts);
-    let deeds = std::thread::scope(|scope| {
+    let events = std::thread::scope(|scope| {
         for (k, cell) in cells.iter().enumerate() {
             let left = &left;
             scope.spawn(move || cell.works(seed * 100 + k as u64, left));
         }
         let mut chance = StdRng::seed_from_u64(seed);
-        let mut deeds = 0;
+        let mut events = 0;
         let began = Instant::now();
         while left.load(Ordering::SeqCst) > 0 {
             assert!(began.elapsed() < 12 * PATIENCE, "seed {seed}: {} parts are left", left.load(Ordering::SeqCst));
@@ -193,15 +193,15 @@ fn weather(seed: u64, cells: usize, parts: usize) {
                 _ => {}
             }
             std::thread::park_timeout(2 * a_while);
-            deeds += 1;
+            events += 1;
             // The lease of a killed cell expires a little faster here.
             plant.sql("UPDATE work SET leased_until = now() - interval '1 second' WHERE state = 'leased' AND leased_until < now() + interval '290 seconds'");
             left.store(open_parts(&plant, &cells, parts), Ordering::SeqCst);
         }
-        deeds
+        events
     });
     network.mend();
-    println!("seed {seed}: {deeds} deeds of the weather");
+    println!("seed {seed}: {events} events of the weather");
     is_once_and_whole(&plant, &cells, parts, seed);
     cells.iter().for_each(|cell| is_told(cell, &broker));
 }

@@ -6,10 +6,10 @@ use tokio::time::{Instant, sleep};
 
 use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
 use crate::error::DeviceResult;
-use crate::linuxcnc::controller::Interpreter;
-use crate::linuxcnc::program::ProgramRecord;
-use crate::linuxcnc::job::Stage;
 use crate::handshake::{Armed, Reconciled};
+use crate::linuxcnc::controller::Interpreter;
+use crate::linuxcnc::job::Stage;
+use crate::linuxcnc::program::ProgramRecord;
 
 impl LinuxcncGrinder {
     /// Returns whether the start of the job has led to a running or finished job, or that the controller runs another

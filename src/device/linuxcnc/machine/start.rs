@@ -8,11 +8,11 @@ use tokio::time::{Instant, sleep};
 use super::status::standing_fault;
 use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
 use crate::error::{DeviceError, DeviceResult};
+use crate::handshake::{Answer, Armed, Fault, Job, MachineCommand, MachineState, Status};
 use crate::linuxcnc::controller::{ControllerState, Interpreter};
+use crate::linuxcnc::job::{ActiveJob, Stage};
 use crate::linuxcnc::program::{FramedProgram, ProgramRecord, RECORD, opening, path};
 use crate::linuxcnc::protocol::{ControllerMode, Set};
-use crate::linuxcnc::job::{ActiveJob, Stage};
-use crate::handshake::{Answer, Armed, Fault, Job, MachineCommand, MachineState, Status};
 
 impl LinuxcncGrinder {
     pub(super) async fn prepare_program(&mut self, job: Job, program: Arc<FramedProgram>) -> DeviceResult<Armed> {

@@ -6,10 +6,10 @@ use tokio::time::Instant;
 
 use super::LinuxcncGrinder;
 use crate::error::DeviceResult;
-use crate::linuxcnc::controller::{ControllerState, Interpreter};
-use crate::linuxcnc::protocol::ControllerMode;
-use crate::linuxcnc::job::{ActiveJob, Stage, Verdict};
 use crate::handshake::{Fault, MachineState, Outcome, Status};
+use crate::linuxcnc::controller::{ControllerState, Interpreter};
+use crate::linuxcnc::job::{ActiveJob, Stage, Verdict};
+use crate::linuxcnc::protocol::ControllerMode;
 
 /// Time without a change after which a running program that does not move is noted.
 const STANDSTILL_AFTER: Duration = Duration::from_secs(5);
