@@ -10,7 +10,7 @@
 //!  c' = c + (R - stated) z - lag  touched off at its lowest place; the axes lag behind along the path
 //! ```
 //!
-//! plus the systematic errors, wear, growth, and the random error of the pass, as in [`crate::process`].
+//! plus the systematic errors, wear, growth, and the random error of the pass, as in [`crate::grinder`].
 //!
 //! **Tracks.** A track begins when the wheel comes near the part, and ends when it lifts off or turns back in x. A
 //! track grinds the strip half way to its neighbours, with the depth at its own y: the ridges between are the

@@ -3,7 +3,7 @@
 //!
 //! The wheel is a ball. With its centre at C, its height over the nominal surface is the distance of C from the surface
 //! minus its radius, at the projection of C. Between two tracks, a stiff machine would leave the heights of both
-//! tracks, interpolated linearly. Machine and part deflect as in [`crate::process`], which defines `S` and `mu`: h
+//! tracks, interpolated linearly. Machine and part deflect as in [`crate::grinder`], which defines `S` and `mu`: h
 //! becomes mu h + (1 - mu) cmd where h > cmd. The grooves of single tracks, wear and growth are not modelled here.
 
 use std::sync::{Arc, Mutex};

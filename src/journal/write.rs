@@ -133,7 +133,7 @@ impl Journal {
     }
 
     /// Opens the journal of a run to continue it, and records this. Checks the hash chain from the anchor on, or all of
-    /// it if there is no anchor; [`super::verify`] always checks all of it. Nothing is signed from here on.
+    /// it if there is no anchor; [`super::verify()`] always checks all of it. Nothing is signed from here on.
     ///
     /// # Errors
     /// The folder has no journal; the journal is in use, closed, broken, or of another program.
