@@ -462,7 +462,7 @@ const BAD_RECIPES: &[BadText] = &[
         "did you mean `width_mm`",
     ),
     (RECIPE, "accuracy_nm = 0.5", "accuracy_nm = 0.5\nspacing_mm = 1", "nominal.sampling", "sampling]", "exactly one"),
-    (BICONIC, "projection = \"xy\"", "sampling = { spacing_mm = 1 }", "nominal.sampling", "sampling", "one source"),
+    (BICONIC, "projection = \"xy\"", "sampling = { spacing_mm = 1 }", "nominal.sampling", "sampling", "nominal.file"),
 ];
 
 const BAD_CELLS: &[BadText] = &[

@@ -316,10 +316,7 @@ fn result_errors_include_remedy() {
         (with("1,2,3\n4,5,6\n"), "2 points for a plan of 3 targets"),
         (with("1,2,3\n4,NaN,6\n7,8,9\n"), "line 3, column 2: expected a finite number"),
         (with("1,2,3\n4,5,6\n7,8\n"), "line 4: expected 3 columns"),
-        (
-            with("1,234;5,678;9,012\n1,234;5,678;9,012\n1,234;5,678;9,012\n"),
-            "line 2, column 1: `1,234` has either a decimal comma",
-        ),
+        (with("1,234;5,678;9,012\n1,234;5,678;9,012\n1,234;5,678;9,012\n"), "line 2, column 1: the comma of `1,234`"),
         (with("1,5;2;3\n4.5;5;6\n7;8;9\n"), "line 3, column 1: expected a number with a decimal comma"),
         (
             THREE.to_owned(),

@@ -379,7 +379,7 @@ fn height_map_formats_give_contact_points() {
         assert_eq!((taken.points.len(), taken.coordinates), (19, Coordinates::Contacts));
         let content = Content { coordinates: Some(Said::Centres), ..Content::default() };
         let (taken, said) = exchanged(&path, content);
-        assert!(taken.is_none() && said.join("\n").contains("coordinates is contacts, in the cell file centres"));
+        assert!(taken.is_none() && said.join("\n").contains("centres in the cell file"));
     }
 }
 

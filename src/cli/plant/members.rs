@@ -162,7 +162,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let text = "SELECT cell, coalesce(words, 'never heard of'), coalesce(to_char(told_at, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, '')
+        let text = "SELECT cell, coalesce(words, 'no report yet'), coalesce(to_char(told_at, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, '')
             FROM cell_now ORDER BY cell";
         let found = link.query(text, &[]).await?;
         let cells: Vec<[String; 4]> = found.iter().map(|row| [0, 1, 2, 3].map(|k| row.get(k))).collect();

@@ -128,7 +128,7 @@ impl CellSummary {
 
     fn heard(&self) -> String {
         match self.heard_s {
-            None => "never heard of".to_owned(),
+            None => "no report yet".to_owned(),
             Some(seconds) if self.is_silent() => format!("not heard of for {}", ago(seconds)),
             Some(seconds) => format!("heard {} ago", ago(seconds)),
         }
@@ -221,7 +221,7 @@ mod tests {
             let silent = cell("Execute", heard.filter(|heard| !heard.is_nan()), 0);
             assert_eq!(silent.display_state(), DisplayState::Silent);
             let card = card(&silent).into_string();
-            assert!(card.contains("is not known") && !card.contains("left") && !card.contains("runs"), "{card}");
+            assert!(card.contains("unknown") && !card.contains("left") && !card.contains("runs"), "{card}");
         }
         let looks = [
             ("Execute", 0, DisplayState::Runs),

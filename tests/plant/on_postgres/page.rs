@@ -196,7 +196,7 @@ fn overview_shows_cells_and_yield() {
         said.contains("cell-2 not heard of for 3 h Its present state is unknown. Last report: grinding SN-0043"),
         "{said}"
     );
-    assert!(said.contains("cell-3 never heard of"), "{said}");
+    assert!(said.contains("cell-3 no report yet"), "{said}");
     // Ten ended, seven were accepted, five of these after one pass: 24 to 76 % by Wilson.
     assert!(said.contains("mirror 10 7 70 % 50 % 24 – 76 %") && said.contains("lens 1 0 0 % 0 %"), "{said}");
     assert!(said.contains("cell-1 10 7 70 % 50 %") && said.contains("cell-3 1 0 0 %"), "{said}");
