@@ -239,10 +239,15 @@ impl Wheel {
         let on_part = |foot: &&WheelProjection| {
             foot.position_mm[0].abs() <= half_x && foot.position_mm[1].abs() <= half_y + OUTER_STRIP_MM
         };
-        let (sum, count) =
-            feet.iter().filter(on_part).fold((0.0, 0.0), |(sum, n), foot| (sum + foot.position_mm[1], n + 1.0));
-        if count > 0.0 && feet.len() > 1 {
-            let track = Track { y_mm: sum / count, projections: feet };
+        // The mean is over the length, because the wheel can slow down and stop anywhere on the track.
+        let on: Vec<&WheelProjection> = feet.iter().filter(on_part).collect();
+        let (sum, length_mm) = on.windows(2).fold((0.0, 0.0), |(sum, length_mm), pair| {
+            let [a, b] = [pair[0], pair[1]].map(|foot| foot.position_mm);
+            let step_mm = (b[0] - a[0]).abs();
+            (sum + step_mm * 0.5 * (a[1] + b[1]), length_mm + step_mm)
+        });
+        if length_mm > 0.0 {
+            let track = Track { y_mm: sum / length_mm, projections: feet };
             self.grind_waiting(state, Some(track.y_mm));
             self.waiting_track = Some(track);
         }

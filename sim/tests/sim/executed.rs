@@ -48,6 +48,42 @@ fn executed_path_determines_surface() {
     }
 }
 
+/// A controller whose next lines are late slows down on a track. The track must not move in y because of the places at
+/// which the wheel was slow.
+#[test]
+fn slow_wheel_leaves_same_surface() {
+    let surface = |slow_steps: u32| {
+        let world = World::new(small_perfect()).unwrap();
+        let mut wheel = world.wheel(RADIUS_MM).unwrap();
+        let mut clock = 0.0;
+        for track in 0..40 {
+            // Each track drifts in y, to and fro, by a fifth of the spacing.
+            let y_mm = |x_mm: f64| -9.75 + 0.5 * f64::from(track) + 0.05 * x_mm / 17.0;
+            let mut to = |x_mm: f64, over_mm: f64| {
+                let (point, n) = world.nominal(x_mm, y_mm(x_mm));
+                clock += 1e-3;
+                wheel.move_to([0, 1, 2].map(|k| point[k] + (RADIUS_MM + over_mm) * n[k]), clock);
+            };
+            let along = |x_mm: f64| if track % 2 == 0 { x_mm } else { -x_mm };
+            to(along(-17.0), 20.0);
+            for k in 0..170 {
+                let steps = if track % 3 == 0 && k < 60 { slow_steps } else { 1 };
+                (0..steps)
+                    .for_each(|s| to(along(-17.0 + 0.2 * (f64::from(k) + f64::from(s) / f64::from(steps))), 0.013));
+            }
+            to(along(17.0), 0.013);
+            to(along(17.0), 20.0);
+        }
+        wheel.finish_waiting_track();
+        let [pass] = world.executed_passes()[..] else { panic!("one pass") };
+        (pass.spacing_mm, over(&world, [14.0, 9.0]))
+    };
+    let [(steady_mm, steady), (slow_mm, slow)] = [1, 8].map(surface);
+    assert!((steady_mm - slow_mm).abs() < 1e-4, "{steady_mm} {slow_mm}");
+    let off = steady.iter().zip(&slow).fold(0.0, |most: f64, (a, b)| most.max((a - b).abs()));
+    assert!(off < 2e-6, "{off} mm");
+}
+
 #[test]
 fn executed_path_matches_simulated_pass() {
     // What depends on the feed, on the path's own time and on how the wheel is touched off is left out.
