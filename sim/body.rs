@@ -97,10 +97,12 @@ pub trait Physics: Send {
     /// # Errors
     /// The payload is broken, of another part, or beyond the limits of the machine.
     fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal>;
-    /// Prepares a job and its cycle with the `payloads` in force, and returns the progress before the start.
+    /// Prepares cycle number `cycle` of the job `job`, without motion. `payloads` are the payloads in force: the
+    /// checked plan, map or pass that the machine stores. Returns the progress before the start.
     ///
     /// # Errors
-    /// A payload is missing, or the payloads do not fit together.
+    /// Returns a refusal if a payload is missing or exceeds the limits of the machine, if the payloads are for
+    /// different parts, or if the other machine has the part.
     fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal>;
     /// Begins to carry out the prepared job.
     fn begin(&mut self);
@@ -109,19 +111,20 @@ pub trait Physics: Send {
     /// Moves the wheel or the probe clear of the part. The job can then continue with [`Physics::advance`] or end with
     /// [`Physics::end_job`].
     fn retract(&mut self);
-    /// Returns true if [`Physics::partial_result`] can return a result.
+    /// Returns true if this kind of machine can return a part of its result while a job runs, through
+    /// [`Physics::partial_result`]. The default is false.
     fn has_partial_result(&self) -> bool {
         false
     }
-    /// Returns the part of the result that will not change any more while the job runs. Returns `None` if the machine
-    /// gives a result only after the end of the job.
+    /// Returns the finished part of the result while the job still runs. This part does not change any more. Returns
+    /// `None` if no job runs, or if the machine has a result only after the end of a job. The default is `None`.
     fn partial_result(&self) -> Option<ResultData> {
         None
     }
     /// Ends the job as complete (1), stopped (2), aborted (3) or failed (4), and returns its result.
     fn end_job(&mut self, result: u16) -> ResultData;
-    /// Returns the interlock bits of the machine, as docs/modbus.md numbers them. Bit 1 means that the wheel or the
-    /// probe is clear of the part.
+    /// Returns the interlock bits of the machine, numbered as in docs/modbus.md. A bit is 1 if the interlock is closed
+    /// (good). Bit 1 means that the wheel or the probe is clear of the part.
     fn interlocks(&self) -> u16;
     /// Returns the temperature in °C that the machine reports in its status block.
     fn temperature_c(&self) -> f64;

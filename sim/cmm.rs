@@ -31,8 +31,8 @@ use crate::{Rng, Vec3};
 pub const COUNT_MM: f64 = 1e-6;
 
 impl CmmSpec {
-    /// Returns the thermal expansion of the part as a ratio: its size at its temperature, divided by its size on the
-    /// drawing.
+    /// Returns the thermal expansion of the part as a ratio without unit: the size of the part at its temperature,
+    /// divided by its size at the reference temperature of the drawing.
     fn growth(&self) -> f64 {
         1.0 + self.cte_per_k * (self.part_temperature_c - REFERENCE_C)
     }
@@ -65,8 +65,9 @@ impl CmmSpec {
     }
 }
 
-/// Returns the path of the probe's centre to a target. `radius_mm` is the true radius of the probe ball. Begin and end
-/// of the path use the radius that the plan states, because the machine knows only that one.
+/// Returns the straight path of the probe's centre to `target`, in the machine's frame. `radius_mm` is the true radius
+/// of the probe ball. The path begins and ends at distances that are computed with the radius stated in `plan`, because
+/// the machine does not know the true radius.
 fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
@@ -77,7 +78,8 @@ fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     }
 }
 
-/// Rotates a direction from the machine's frame to the part's frame.
+/// Rotates the vector `v` from the machine's frame to the part's frame, by the inverse rotation of `placement`. The
+/// translation of `placement` is not used.
 fn turned_back(placement: &Placement, v: Vec3) -> Vec3 {
     std::array::from_fn(|i| (0..3).map(|k| placement.rotation[k][i] * v[k]).sum())
 }
@@ -127,8 +129,9 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns, for each target of a plan, the time in s from the start of the job to the end of its touch, travel
-    /// included. If the plan has a careful start, its first targets take longer.
+    /// Returns one time in s for each target of `plan`: the time from the start of the job to the end of the touch. The
+    /// times include the travel between targets. The plan can require a slower speed for its first targets; their
+    /// touches take longer in proportion.
     fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
         let (slowly, speed_mm_s) = plan.careful;
         let each_s = |k: usize| {
@@ -168,8 +171,9 @@ impl Run {
         }
     }
 
-    /// Touches one target and returns its record, with the noise, outliers and faults of the machine. If there was no
-    /// contact, the status in the record gives the reason.
+    /// Touches one target, and returns the record of the point with the position in mm. The position includes the
+    /// noise, outliers and configured faults of the machine. If there is no contact, the status in the record gives the
+    /// reason, and the position is zero.
     fn measure(&mut self, state: &WorldState, target: &Target) -> PointRecord {
         let spec = &state.spec.cmm;
         let shift = self.disturbance(spec);
@@ -192,7 +196,9 @@ impl Run {
         }
     }
 
-    /// Computes where the probe ball touches a target, in the machine's frame and without noise.
+    /// Computes where the probe ball touches `target`, without noise. The returned ball centre is in the machine's
+    /// frame, in mm. Returns `Contact::Missed` if there is no contact, and `Contact::Unexpected` if the ball touches
+    /// before the search begins.
     fn contact(&self, state: &WorldState, target: &Target) -> Contact {
         let spec = &state.spec.cmm;
         let in_machine = approach_to(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
@@ -221,8 +227,9 @@ impl Run {
         }
     }
 
-    /// Draws the error of one touch, in mm: Gaussian noise and sometimes an outlier. Every call draws the same number
-    /// of random numbers, with and without an outlier.
+    /// Draws the random error of one touch, as a vector in mm. The error is Gaussian noise, and in some touches also an
+    /// outlier (a large error in a random direction). Every call draws the same number of random numbers, so an outlier
+    /// does not change the errors of later touches.
     fn disturbance(&mut self, spec: &CmmSpec) -> Vec3 {
         let normal = |rng: &mut Rng| -> f64 { StandardNormal.sample(rng) };
         let noise: Vec3 = std::array::from_fn(|_| 1e-3 * spec.noise_um * normal(&mut self.noise));
@@ -241,8 +248,13 @@ fn untouched(target: &Target, status: Status) -> PointRecord {
     PointRecord { index: target.index, status, quality: 100, position_mm: [0.0; 3] }
 }
 
-/// Returns the position that the machine reports when the ball's centre is at `centre_mm`. Configured faults can change
-/// it to the contact point (at the distance `stated_radius_mm` from the centre), to inches, or to a mirrored y.
+/// Returns the position that the machine reports for a touch of `target` with the ball's centre at `centre_mm`. Without
+/// faults, this is `centre_mm`. Configured `faults` change the position in three ways:
+///
+/// - The contact point is reported instead of the centre. This point is `stated_radius_mm` below the centre, along the
+///   normal of `target`.
+/// - The unit is the inch instead of the millimetre.
+/// - The sign of y is reversed.
 fn reported(faults: &WorldFaults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
     let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
     let unit = if faults.inches { 25.4 } else { 1.0 };
@@ -285,7 +297,8 @@ impl TouchProbe {
         Self { world, run: None }
     }
 
-    /// Returns the lower and the upper corner of the travel, in mm.
+    /// Returns the two opposite corners of the travel volume, in mm in the machine's frame: first the minimum x, y, z,
+    /// then the maximum x, y, z.
     pub fn volume_mm(&self) -> [Vec3; 2] {
         let spec = &locked(&self.world).spec.cmm;
         [spec.travel_least_mm, spec.travel_most_mm]
@@ -301,9 +314,13 @@ impl TouchProbe {
         locked(&self.world).spec.cmm.seconds_per_point
     }
 
-    /// Touches the part at `point_mm` along `normal`. The array holds the probe radius, the approach distance and the
-    /// search distance, in mm. If the part has left the CMM since the last touch, this touch begins a new measurement.
-    /// If the grinder has the part, the result is unexpected contact.
+    /// Touches the part or the reference sphere at the target `point_mm` with the outward unit normal `normal`, both in
+    /// the machine's frame. The ball moves against the normal. The array holds the radius of the probe, the approach
+    /// distance and the search distance, in mm.
+    ///
+    /// Returns the centre of the ball in mm, or the reason why there is none. Returns `TouchResult::Unexpected` if the
+    /// grinder has the part or the state of the part is unknown. If the part has left the CMM since the last touch,
+    /// this touch begins a new measurement with a new random placement.
     pub fn touch(
         &mut self,
         point_mm: Vec3,
@@ -350,8 +367,8 @@ impl TouchProbe {
     }
 }
 
-/// Returns the feature to which a point belongs: the reference sphere if the point is close to its surface, otherwise
-/// the part.
+/// Returns the feature to which the point `point_mm` belongs. The feature is the reference sphere if the point is less
+/// than half a sphere radius from the sphere's surface. Otherwise the feature is the part.
 fn feature(spec: &CmmSpec, point_mm: Vec3) -> Feature {
     let away_mm = (0..3).map(|k| (point_mm[k] - spec.sphere_centre_mm[k]).powi(2)).sum::<f64>().sqrt();
     if (away_mm - spec.sphere_radius_mm).abs() < 0.5 * spec.sphere_radius_mm {

@@ -137,7 +137,8 @@ impl BeatMonitor {
         self.count = self.count.saturating_add(1);
     }
 
-    /// Returns the statistics of the heartbeats up to the time `now`.
+    /// Returns the statistics of the owner's heartbeats from the start of the job to the time `now`: their number, the
+    /// mean interval and the longest silence.
     pub(crate) fn statistics(&self, now: Duration) -> BeatStatistics {
         let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
         let mean = between.checked_div(self.count.saturating_sub(1)).unwrap_or_default();

@@ -111,8 +111,9 @@ impl Wheel {
         })
     }
 
-    /// Moves the wheel's centre to `place_mm`, in the frame of the part, at the time `seconds` of the controller's
-    /// clock. The first call, and the first one after an unknown position, only sets the start position.
+    /// Moves the wheel's centre to `place_mm`, in the frame of the part, and simulates the grinding on the way.
+    /// `seconds` is the time of the controller's clock at this position, in s. The first call only sets the start
+    /// position, and so does the first call after [`Self::set_position_unknown`].
     pub fn move_to(&mut self, place_mm: Vec3, seconds: f64) {
         let Some((from_mm, then)) = self.last.replace((place_mm, seconds)) else { return };
         if from_mm == place_mm {
@@ -126,23 +127,24 @@ impl Wheel {
         }
     }
 
-    /// Marks the position of the wheel as unknown, for example before homing or after power-off. The wheel then counts
-    /// as lifted off the part.
+    /// Marks the position of the wheel as unknown, for example before homing or after power-off. From then on the wheel
+    /// is treated as lifted off the part: the present track ends, and the grinder releases the part.
     pub fn set_position_unknown(&mut self) {
         self.last = None;
         let world = Arc::clone(&self.world);
         self.lift_off(&mut locked(&world));
     }
 
-    /// Handles a gap in the reported path. The state of the part is unknown from then on, and the wheel counts as
-    /// lifted off.
+    /// Handles a gap in the path that the controller reports. The position of the wheel and the state of the part are
+    /// unknown from then on. The wheel is treated as lifted off the part.
     pub fn path_lost(&mut self) {
         self.set_position_unknown();
         locked(&self.world).part_unknown = true;
     }
 
-    /// Grinds the waiting track: the last complete track, whose width depends on the next track. Treats it as the last
-    /// track of the pass. Does nothing while the wheel is at the part, because the present track is then the next one.
+    /// Grinds the waiting track (the last track that has ended but is not yet ground) as the last track of the pass.
+    /// Normally, a track is ground only after the next track has ended, because its width depends on the next track.
+    /// Does nothing if no track waits, or if the wheel is at the part and the next track has begun.
     pub fn finish_waiting_track(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
@@ -151,9 +153,13 @@ impl Wheel {
         }
     }
 
-    /// Projects the wheel's centre onto the nominal surface, with the lag and the radius error of the grinder.
-    /// `from_mm` and `place_mm` are the previous and the present commanded position, `then` and `seconds` their times
-    /// in s. Returns `None` if the wheel is not near the part or the projection fails.
+    /// Projects the wheel's centre onto the nominal surface. Returns the position, and the height in mm over the
+    /// nominal surface that the wheel would leave. The centre includes the lag of the axes and the radius error of the
+    /// grinder.
+    ///
+    /// `from_mm` and `place_mm` are the previous and the present commanded position in mm. `then` and `seconds` are the
+    /// times of these positions in s. Returns `None` if the wheel is 1 mm or more above the real surface, or if the
+    /// projection fails.
     fn project(
         &mut self,
         state: &mut WorldState,
@@ -231,8 +237,9 @@ impl Wheel {
         state.executed_passes.push(ExecutedPass::default());
     }
 
-    /// Ends the present track after the wheel has lifted off or turned back. Grinds the waiting track, which is the
-    /// track before, and makes the present track the waiting one.
+    /// Ends the present track after the wheel has lifted off or turned back. Grinds the waiting track (the track before
+    /// the present one). The present track then waits until the next track ends, because its width depends on the next
+    /// track. Ignores a present track with fewer than two positions, or with no position near the part.
     fn end_track(&mut self, state: &mut WorldState) {
         let feet = std::mem::take(&mut self.projections);
         let [half_x, half_y] = state.part.aperture.half_mm();
@@ -253,8 +260,10 @@ impl Wheel {
         }
     }
 
-    /// Grinds a strip along the waiting track. The strip reaches half way to the next track, which is at y = `next_mm`;
-    /// `None` if there is no next track.
+    /// Grinds a strip along the waiting track (the last track that has ended but is not yet ground). The strip reaches
+    /// half way to the next track, at y = `next_mm` in mm. If `next_mm` is `None`, or its distance is not plausible for
+    /// a neighbouring track, the strip ends about half a track distance from the waiting track. Does nothing if no
+    /// track waits.
     fn grind_waiting(&mut self, state: &mut WorldState, next_mm: Option<f64>) {
         let Some(track) = self.waiting_track.take() else { return };
         let Some(mut pass) = self.pass.take() else { return };
@@ -295,8 +304,10 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     })
 }
 
-/// Places the grooves of the part at the tracks of this pass. `half_mm` is half the distance between two tracks;
-/// without it, nothing changes. Where this pass has not ground, the grooves keep their previous height.
+/// Sets the positions of the part's grooves to the tracks of this pass. The positions follow from the first track of
+/// `pass` and from `track`. `half_mm` is half the distance between two tracks. If `half_mm` is `None`, nothing changes.
+/// If the specification has no grooves, the part has none afterwards. Where this pass has not ground, the grooves keep
+/// their previous height.
 fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
@@ -314,9 +325,9 @@ fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_
     state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
 }
 
-/// Grinds the nodes along a track within the limits `strip` of y. `beside` lists the open sides, -1 or 1 along y, that
-/// have no neighbouring track. On these sides the wheel also grinds beyond the strip, as far as its curved profile
-/// reaches.
+/// Grinds the nodes along `track` whose y is within the two limits `strip`, in mm. `beside` lists the sides of the
+/// strip without a neighbouring track: -1 is the side of smaller y, 1 the side of larger y. On these sides the wheel
+/// also grinds nodes beyond the strip, up to 1.5 mm, with its curved profile.
 fn grind(
     state: &mut WorldState,
     pass: &mut PassState,
@@ -357,8 +368,9 @@ fn grind(
     }
 }
 
-/// Returns the nodes along a track within the limits `strip` of y. Each has its index, its position (x, y), and the
-/// height in mm that the wheel leaves at this x on the centre line of the track.
+/// Returns the grid nodes along `track` whose y is within the two limits `strip`, in mm. Each item has the index of the
+/// node, its position (x, y) in mm, and the height in mm that the wheel leaves. The height is interpolated along the
+/// centre line of the track at the x of the node.
 fn nodes_in_strip(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
     let mut nodes = Vec::new();
     for pair in track.projections.windows(2) {

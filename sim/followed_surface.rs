@@ -27,8 +27,9 @@ pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_m
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
-/// Returns a position on the part unchanged. For a position outside, returns the last position on the part on the line
-/// to its middle: the wheel has lifted off outside, so the height at the edge is used there.
+/// Returns the position `at_mm` (x, y) unchanged if it is on the part. For a position outside, returns the point at
+/// which the line from the origin to this position crosses the edge of the part. Nodes outside thus get the height of
+/// the edge, because the wheel has lifted off there.
 fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     let at = |share: f64| at_mm.map(|v| share * v);
     let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
@@ -55,8 +56,9 @@ fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<BallSample> {
     found
 }
 
-/// Projects the centre of the ball onto the nominal surface, and returns the position and height of its contact.
-/// Returns `None` if the ball is not near the surface or the projection fails.
+/// Projects the ball's `centre` (x, y, z in mm) onto the nominal surface. Returns the position of the contact, and the
+/// height in mm of the ball of radius `radius_mm` over the nominal surface. Returns `None` if the ball is 1 mm or more
+/// from the surface, or if the projection fails.
 fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<BallSample> {
     let (at_mm, over_mm) = project_onto(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
     let height_mm = over_mm - radius_mm;
@@ -82,9 +84,9 @@ impl SampleIndex {
         at_mm.map(|v| (v / self.reach_mm).floor() as i64)
     }
 
-    /// Returns the height in mm at a position, from a plane fitted by weighted least squares to the contacts around it.
-    /// The weight of a contact falls to 0 at the distance `reach_mm`. Returns NaN if there are no contacts within this
-    /// distance.
+    /// Returns the height in mm over the nominal surface at the position `at_mm` (x, y). Fits a plane to the samples of
+    /// the ball near this position, by weighted least squares. The weight of a sample falls to 0 at the distance
+    /// `reach_mm`. Returns NaN if there is no sample within this distance.
     fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
         let [i, j] = self.cell(at_mm);
         // Normal equations of h = c0 + c1 u + c2 v.

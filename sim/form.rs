@@ -17,8 +17,9 @@ pub struct FormError {
 }
 
 impl FormError {
-    /// Draws a random form error from a seed. `pv_mm` is its peak-to-valley value over the rectangle `width_mm` by
-    /// `depth_mm` that is centred on the origin.
+    /// Draws a random form error from `seed`. The error has the peak-to-valley value `pv_mm` over a rectangle of
+    /// `width_mm` by `depth_mm`, centred on the origin. `correlation_length_mm` is the distance at which the
+    /// autocovariance has fallen to 1/e.
     pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
         let mut rng = crate::rng(seed);
         let sigma = 2f64.sqrt() / correlation_length_mm;
@@ -36,7 +37,8 @@ impl FormError {
         error
     }
 
-    /// Draws a random form error from a random generator. `rms_mm` is its root mean square over the infinite plane.
+    /// Draws a random form error with the random generator `rng`. `rms_mm` is the root mean square of the error over
+    /// the infinite plane. `correlation_length_mm` is the distance at which the autocovariance has fallen to 1/e.
     ///
     /// The error is a sum of waves, and a wave of amplitude a has the mean square a^2/2.
     pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
@@ -61,12 +63,13 @@ impl FormError {
         self.waves.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).cos()).sum()
     }
 
-    /// Adds the error to the values at the nodes of a grid, row by row, x fastest. `first_mm` is the position of the
-    /// first node, `step_mm` the spacing along x and y, and `columns` the number of nodes in a row.
+    /// Adds this form error to `values_mm`, the values in mm at the nodes of a grid. The values are stored row by row,
+    /// x fastest. `first_mm` is the position (x, y) of the first node, `step_mm` the spacing along x and y, and
+    /// `columns` the number of nodes in a row.
     ///
-    /// From node to node, the phase of a wave advances by the same angle, so each value is a rotation of the one
-    /// before: no cosine is computed within a row. Rounding errors accumulate to about 1e-14 of the amplitude over a
-    /// row of hundreds of nodes.
+    /// From node to node, the phase of a wave advances by the same angle. Each value is therefore computed by a
+    /// rotation from the value before, without a cosine. Rounding errors accumulate to about 1e-14 of the amplitude
+    /// over a row of hundreds of nodes.
     pub fn add_to_grid(&self, first_mm: [f64; 2], step_mm: [f64; 2], columns: usize, values_mm: &mut [f64]) {
         let turns: Vec<_> = self.waves.iter().map(|[kx, ..]| (kx * step_mm[0]).sin_cos()).collect();
         for (j, row) in values_mm.chunks_mut(columns).enumerate() {
@@ -85,7 +88,7 @@ impl FormError {
         }
     }
 
-    /// Returns the derivatives of the error with respect to x and y.
+    /// Returns the derivatives of the form error with respect to x and y at (x, y), in mm/mm.
     pub fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
         self.waves.iter().fold([0.0, 0.0], |[p, q], [kx, ky, phase, a]| {
             let s = -a * (kx * x + ky * y + phase).sin();

@@ -85,8 +85,9 @@ pub(crate) fn finite_or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
-/// Returns the systematic error of the grinder at every node, in mm, with waviness. The error of the wheel's radius is
-/// not included.
+/// Returns the systematic error of the grinder at every node of `part`, in mm. The error contains the errors of
+/// setting, tilt, straightness and screw pitch, and the random waviness that is the same in every pass. It does not
+/// contain the error of the wheel's radius.
 pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
     let (seed, spec) = (spec.seed, &spec.grinder);
     let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
@@ -210,9 +211,11 @@ impl Run {
     }
 }
 
-/// Grinds one node. `cmd_mm` is the height that an infinitely stiff machine would leave; of the excess over it, the
-/// share `error_copying` remains. `bend` is the curvature in 1/mm of the groove that the wheel leaves, `None` if it
-/// leaves no grooves. Returns true if the wheel removed material.
+/// Grinds the node with the index `node`. `cmd_mm` is the height in mm that an infinitely stiff machine would leave. A
+/// real machine deflects: the fraction `error_copying` of the height above `cmd_mm` remains. `bend` is the curvature in
+/// 1/mm of the groove that the wheel leaves, or `None` for a wheel without grooves. Returns true if the wheel removed
+/// material. Returns false and changes nothing if the node is not higher than `cmd_mm`, or if the fault `no_part` is
+/// configured.
 pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
     let h = &mut state.part.height.heights_mm[node];
     if state.spec.faults.no_part || *h <= cmd_mm {
@@ -226,7 +229,8 @@ pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option
     true
 }
 
-/// Returns a pass record that is falsified as `misreported` requires.
+/// Returns `record` with the one value falsified that the configured fault `misreported` names, for example the path
+/// length. Returns `record` unchanged for `Nothing` and `Duration`.
 fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     match misreported {
         Misreported::Nothing | Misreported::Duration => record,
@@ -238,8 +242,9 @@ fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     }
 }
 
-/// Returns the nodes on the raster path of the wheel, in their order: the position of each along the path in mm, and
-/// its index. Also returns the length of the path in mm.
+/// Returns the grid nodes that the wheel passes on its raster path (parallel tracks, alternately forth and back), in
+/// the order of the path. Each item has the position along the path in mm, and the index of the node. The second value
+/// is the length of the path in mm.
 fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
     let [x0, x1, y0, y1] = grown(pass.extent_mm);
     let (length, spacing) = (x1 - x0, pass.track_spacing_mm);
@@ -260,9 +265,9 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
     [x0 - OVERTRAVEL_MM, x1 + OVERTRAVEL_MM, y0 - OVERTRAVEL_MM, y1 + OVERTRAVEL_MM]
 }
 
-/// Returns, for every node, the height in mm over the nominal surface that the pass aims at, with the errors of the
-/// grinder that do not change with time (so without wear and thermal growth). Follows the program if there is one,
-/// otherwise the map.
+/// Returns one height in mm over the nominal surface for every node: the height that the pass commands, plus the errors
+/// of the grinder that do not change with time. Wear and thermal growth are not included. The commanded height comes
+/// from `program` if there is one, otherwise from `map`. The height is NaN at nodes that the program does not reach.
 fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
@@ -297,7 +302,8 @@ fn true_radius_mm(state: &WorldState, pass: &Pass) -> f64 {
     state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
 }
 
-/// Returns the grooves that the wheel would leave over the whole part in this pass.
+/// Returns the grooves that the wheel would leave in this pass if it cut everywhere on the part: their curvature at
+/// every node, the first track and the spacing of the tracks.
 fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     let wheel_radius_mm = true_radius_mm(state, pass);
     let part = &state.part;
@@ -306,8 +312,8 @@ fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
-/// Returns the displacement in mm that this machine uses at (x, y). Configured faults can mirror, double, ignore or
-/// invert the map.
+/// Returns the displacement in mm that the machine applies at (x, y). Without faults, this is the displacement of `map`
+/// at (x, y). Configured faults can mirror or rotate the map, double it, ignore it, or reverse its sign.
 fn displaced(state: &WorldState, map: &Map, x: f64, y: f64) -> f64 {
     let faults = &state.spec.faults;
     let (x, y) = match faults.map_mirrored {
@@ -334,10 +340,11 @@ pub struct Programs {
 }
 
 impl Programs {
-    /// Finds and parses the program whose comment names the map with this identity.
+    /// Finds and parses the program for a map. `identity` is the SHA-256 of the map. A program belongs to the map if
+    /// its comment contains this SHA-256. If several programs match, the longest is used.
     ///
     /// # Errors
-    /// Returns a text if the folder cannot be read, if it has no such program, or if the machine cannot execute the
+    /// Returns a message if the folder cannot be read, if no program matches, or if the machine cannot execute the
     /// program.
     fn read_for_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
         let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -367,7 +374,8 @@ impl Grinder {
         Self { world, programs: None, ready: None, running: None }
     }
 
-    /// Makes the grinder follow the programs in a folder. Without this call it follows the map itself.
+    /// Makes the grinder follow the program in a folder that belongs to the map of the pass. `programs` names the
+    /// folder and the control. Without this call, the grinder uses the map itself.
     #[must_use]
     pub fn by_programs(mut self, programs: Programs) -> Self {
         self.programs = Some(programs);
@@ -436,10 +444,11 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     (strokes, begin_s)
 }
 
-/// Prepares a pass: computes the heights, the path and the strokes from the present state of the part.
+/// Prepares a pass without motion: computes the commanded heights, the path and the strokes from the present state of
+/// the part. `map` is decoded from `map_payload`. The pass follows `program` if there is one, otherwise `map`.
 ///
 /// # Errors
-/// The pass needs more strokes than the machine allows.
+/// Returns a refusal if the pass needs more strokes than the machine allows.
 fn run(
     state: &WorldState,
     (job, cycle): (u32, u16),

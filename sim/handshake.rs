@@ -125,9 +125,9 @@ impl Handshake {
         }
     }
 
-    /// Decodes the command block after its last register was written, and carries out its command if it is new. Ignores
-    /// a broken block and a repeated sequence number. A lower sequence number is ignored too, except for CLAIM and
-    /// ABORT.
+    /// Handles the 20 registers of the command block after the client has written the last of them. Carries out the
+    /// command if it is new and allowed. Ignores a block with a wrong CRC, and a sequence number equal to the last one.
+    /// Also ignores a lower sequence number, except for CLAIM and ABORT.
     pub(crate) fn read_command(&mut self, words: &[u16; 20]) {
         let Some(frame) = CommandFrame::read(self.order, words) else { return self.note(HandshakeEvent::Broken) };
         let (sequence, command) = (frame.sequence, Command::from_number(frame.command));
@@ -151,7 +151,8 @@ impl Handshake {
         owner != 0 && owner == self.owner
     }
 
-    /// Handles a new heartbeat of the client that owns the machine.
+    /// Records a heartbeat of the client that owns the machine, and restarts the clock that measures the silence of
+    /// this client.
     pub(crate) fn beat(&mut self) {
         self.beat_monitor.record(self.now);
         self.hear();
@@ -232,8 +233,9 @@ impl Handshake {
         }
     }
 
-    /// Returns the digest of the payloads in force: the CRC-32 over their identities. Returns `None` if a payload that
-    /// this machine needs is missing.
+    /// Returns the digest of the payloads in force (the plan, or the map and the pass, that the machine stores and
+    /// uses). The digest is the CRC-32 of their SHA-256 identities. Returns `None` if a payload that this kind of
+    /// machine needs is missing.
     fn digest(&self) -> Option<u32> {
         let needed: &[usize] = match self.body.kind() {
             Kind::Cmm => &[0],
@@ -246,8 +248,8 @@ impl Handshake {
         Some(hasher.finalize())
     }
 
-    /// Carries out an accepted command. `frame` contains its arguments. Its sequence number and its answer are already
-    /// stored.
+    /// Carries out `command`, which the machine has already accepted and answered. `frame` contains the arguments of
+    /// the command.
     fn act(&mut self, command: Command, frame: &CommandFrame) {
         match command {
             Command::Claim => {
@@ -297,8 +299,8 @@ impl Handshake {
         self.retract(State::Holding);
     }
 
-    /// Moves the wheel or the probe clear of the part, and enters the state `acting`, for example STOPPING. That state
-    /// ends by itself after some time.
+    /// Moves the wheel or the probe clear of the part, and enters the state `acting`: HOLDING, STOPPING or ABORTING.
+    /// The machine leaves this state by itself after a fixed time. The token of PREPARE becomes invalid.
     fn retract(&mut self, acting: State) {
         self.token = 0;
         self.acting_left = self.acting;
@@ -334,8 +336,9 @@ impl Handshake {
         }
     }
 
-    /// Ends a running job with the result number `result` of docs/modbus.md. Returns true if its result data can be
-    /// encoded or no job runs, otherwise false.
+    /// Ends the running job, and stores its result in the outbox. `result` is the result number of docs/modbus.md: 1
+    /// complete, 2 stopped, 3 aborted, 4 failed. Returns false if the result data cannot be encoded. Returns true and
+    /// does nothing if no job runs.
     fn end(&mut self, result: u16) -> bool {
         if !std::mem::take(&mut self.running) {
             return true;
@@ -351,21 +354,24 @@ impl Handshake {
         self.outbox.is_some()
     }
 
-    /// Returns what identifies the result of the running or last job: the job, the cycle, the `done` number and the
-    /// identity of the plan or map.
+    /// Returns the data that identify the result of the running or last job. These are the job number, the cycle, the
+    /// `done` number (the sequence number of the START of the job that ended last), and the SHA-256 identity of the
+    /// plan or map.
     fn origin(&self) -> Origin {
         let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
         let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
         Origin { job: self.job.job, cycle: self.job.cycle, done: self.done, identity }
     }
 
-    /// Returns true if a client can read full pages of a result while the job still runs.
+    /// Returns true if a client can read the complete pages of a result while the job still runs. The option of the
+    /// simulator and the kind of machine must both allow this.
     pub(crate) fn gives_ahead(&self) -> bool {
         self.gives_ahead && self.body.has_partial_result()
     }
 
-    /// Returns the outbox that a client can read now: the result of a complete job, or the partial result of a running
-    /// or held job. Returns `None` if there is no result to read.
+    /// Returns the outbox (result header and data) that a client can read now. In the state COMPLETE this is the whole
+    /// result. While a job runs, is held or stops, this is the partial result, if the machine offers one. Returns
+    /// `None` in all other states, or if there is no result.
     pub(crate) fn outbox(&self) -> Option<Cow<'_, Outbox>> {
         match self.state {
             State::Complete => self.outbox.as_ref().map(Cow::Borrowed),
@@ -465,8 +471,9 @@ impl Handshake {
         self.body.interlocks() & interlock::ALL & !self.opened
     }
 
-    /// Opens the interlocks in `bits`, even if the physics reports them closed. With `bits` = 0, the interlocks are
-    /// those of the physics again.
+    /// Opens the interlocks whose bits are set in `bits`, even if the simulated machine reports them as closed. An open
+    /// interlock forbids motion. Any other interlock has the state that the simulated machine reports, so `bits` = 0
+    /// ends the simulated fault.
     pub(crate) fn open(&mut self, bits: u16) {
         self.opened = bits;
         if self.state == State::Prepared && !self.is_safe(interlock::ALL) {
@@ -493,8 +500,9 @@ impl Handshake {
         }
     }
 
-    /// Starts a motion without a command if `strays` is true and the machine is idle. If `strays` is false, ends such a
-    /// motion: the machine is idle again.
+    /// Starts or ends a stray motion: a simulated motion that no command requested. If `strays` is true and the machine
+    /// is idle, the machine enters EXECUTE without a job. If `strays` is false, a stray motion ends and the machine is
+    /// idle. Otherwise nothing happens.
     pub(crate) fn stray(&mut self, strays: bool) {
         if strays && self.state == State::Idle {
             self.note(HandshakeEvent::Strayed);
@@ -506,14 +514,15 @@ impl Handshake {
         }
     }
 
-    /// Requests a fault that happens once: after the next payload has come into force and a client has read the slots,
-    /// the machine changes the identities of its payloads in force.
+    /// Requests a simulated fault that happens once. After the next payload is accepted, the machine changes the
+    /// SHA-256 identities of all its stored payloads. The change happens just after a client has read the registers
+    /// that show the stored payloads.
     pub(crate) fn spoil(&mut self) {
         self.spoils = true;
     }
 
-    /// Handles a read of the slots in force by a client. Changes the identities in force if the fault of
-    /// [`Self::spoil`] is due.
+    /// Handles a read of the payloads in force (the registers that show the stored payloads) by a client. If the fault
+    /// of [`Self::spoil`] is due, changes the SHA-256 identities of all stored payloads. Otherwise nothing happens.
     pub(crate) fn slots_were_read(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;
@@ -526,8 +535,8 @@ impl Handshake {
         }
     }
 
-    /// Restarts the program of the machine with another boot id. It keeps only the list of the jobs that it began. If
-    /// the restart interrupts a job, the machine enters FAULTED.
+    /// Restarts the machine's program with a new boot id. The machine remembers only the list of jobs that it began.
+    /// Afterwards the machine is idle, or FAULTED if the restart interrupted a job.
     pub(crate) fn reboot(&mut self) {
         let cut_off = self.lose_memory();
         self.note(HandshakeEvent::Rebooted { boot_id: self.boot_id });
@@ -538,8 +547,8 @@ impl Handshake {
         }
     }
 
-    /// Takes another boot id, and clears the memory except the list of the jobs that the machine began. Returns true if
-    /// this interrupted a job.
+    /// Draws a new boot id, and clears the payloads, the owner and the last command. The list of jobs that the machine
+    /// began is kept. A running job ends, and its result is lost. Returns true if a job was running.
     fn lose_memory(&mut self) -> bool {
         let cut_off = std::mem::take(&mut self.running);
         if cut_off {
@@ -561,7 +570,8 @@ impl Handshake {
         cut_off
     }
 
-    /// Restarts the program of the machine without a trace: it keeps its boot id, forgets all jobs and is idle.
+    /// Simulates a restart that a client cannot detect: the boot id stays the same. The machine forgets all jobs that
+    /// it began, its payloads and its owner, and is idle.
     pub(crate) fn forget(&mut self) {
         let boot_id = self.boot_id;
         self.lose_memory();
@@ -576,10 +586,12 @@ impl Handshake {
         self.log.push(self.now, what);
     }
 
-    /// Checks a payload and puts it into force.
+    /// Checks a payload that was received completely. If it is good, stores it as the payload in force, which the next
+    /// job uses.
     ///
     /// # Errors
-    /// Returns the number of the answer with which the machine refuses the payload.
+    /// Returns the answer number of docs/modbus.md with which the machine refuses the payload, for example 8 for a
+    /// broken payload.
     pub(crate) fn put_in_force(&mut self, arrived: Arrived) -> Result<(), u16> {
         let (kind, identity) = (arrived.kind, arrived.identity);
         let slot = Slot::new(self.order, arrived);

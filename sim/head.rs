@@ -26,9 +26,9 @@ pub struct Head {
 }
 
 impl Head {
-    /// Returns the centre of the wheel in mm. `slides_mm` is the position of the slides, `scale_deg` the angle in
-    /// degrees that the scale of the head shows. Without a pivot, the control itself keeps the centre, so it is at
-    /// `slides_mm`.
+    /// Returns the centre of the wheel in mm. `slides_mm` is the position of the slides. `scale_deg` is the angle in
+    /// degrees on the scale of the head. If `pivot_mm` is `None`, the control itself compensates the rotation, and the
+    /// centre is at `slides_mm`.
     pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
         let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
         let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();
@@ -39,8 +39,9 @@ impl Head {
         std::array::from_fn(|k| pivot[k] - arm[k])
     }
 
-    /// Returns the centre of the wheel in mm on the move from `from` to `to`, after the fraction `share` of the move,
-    /// from 0 to 1. The angle of the head changes in proportion to the travel of the slides.
+    /// Returns the centre of the wheel in mm during the move from `from` to `to`. `share` is the completed fraction of
+    /// the move, from 0 to 1. The slides follow the line or arc of the move. The angle of the head changes linearly
+    /// with `share`.
     pub fn centre_on_move_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> Vec3 {
         let slides = to.position_at(from.at_mm, share);
         let ends = from.rotary_deg.or(to.rotary_deg).zip(to.rotary_deg);

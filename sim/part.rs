@@ -73,7 +73,8 @@ pub struct DefectSpec {
 }
 
 impl DefectSpec {
-    /// Returns the height of the defect at (x, y), in mm.
+    /// Returns the height of the defect over the surface at (x, y), in mm. The height is negative where material is
+    /// missing, and 0 outside the defect. x and y are in mm in the model frame.
     pub fn height_mm(&self, [x, y]: [f64; 2]) -> f64 {
         /// Width of a flank, in mm: half of it is inside the rectangle and half outside.
         const FLANK_MM: f64 = 1.0;
@@ -246,9 +247,10 @@ impl HeightGrid {
         (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
     }
 
-    /// Returns the nodes within two limits of x and two limits of y, each with its index in `heights_mm`. The two
-    /// limits can be in either order. A node on the lower limit is included, a node on the upper limit is not, so that
-    /// each node of adjacent rectangles is in exactly one of them.
+    /// Returns the nodes whose x is within the two limits `x_mm` and whose y is within the two limits `y_mm`. Each item
+    /// has the index in `heights_mm` and the position (x, y) in mm. The limits of an axis can be in either order. A
+    /// node on the lower limit is included. A node on the upper limit is excluded, so that a node on the border of two
+    /// rectangles belongs to only one.
     pub(crate) fn within(&self, x_mm: [f64; 2], y_mm: [f64; 2]) -> impl Iterator<Item = (usize, [f64; 2])> + '_ {
         let from = |k: usize, place: f64| ((place - self.first_mm[k]) / self.step_mm[k]).ceil().max(0.0) as usize;
         let range =
@@ -271,7 +273,9 @@ impl HeightGrid {
         self.step_mm[0] * self.step_mm[1]
     }
 
-    /// Returns the height at (x, y) in mm and its gradient, by cubic interpolation between the nodes.
+    /// Returns the height at (x, y) in mm, and its derivatives with respect to x and y. Uses cubic (Catmull-Rom)
+    /// interpolation between the nodes. A coordinate before the second node or after the last but one is clamped to
+    /// that node, and the derivative on this axis is 0.
     pub fn at(&self, x: f64, y: f64) -> (f64, [f64; 2]) {
         let (i, wx, dx) = weights(x, self.first_mm[0], self.step_mm[0], self.columns);
         let (j, wy, dy) = weights(y, self.first_mm[1], self.step_mm[1], self.rows);
@@ -291,11 +295,12 @@ impl HeightGrid {
     }
 }
 
-/// Returns the weights of cubic (Catmull-Rom) interpolation at the coordinate `t`: the index of the first of the four
-/// nodes around it, the weights of the four nodes, and the derivatives of the weights. `first` is the coordinate of the
-/// first node, `step` the spacing and `nodes` the number of nodes.
+/// Returns the weights of cubic (Catmull-Rom) interpolation at the coordinate `t` on one axis. `first` is the
+/// coordinate of the first node, `step` the spacing and `nodes` the number of nodes.
 ///
-/// Beyond the innermost cells, the coordinate is clamped to the border, and the derivatives are 0.
+/// The result has three parts: the index of the first of the four nodes around `t`, the weights of these four nodes,
+/// and the derivatives of the weights with respect to `t`. Before the second node and after the last but one, the
+/// weights are those at that node, and the derivatives are 0.
 fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f64; 4]) {
     let place = (t - first) / step;
     let held = place.clamp(1.0, (nodes - 2) as f64);
@@ -327,9 +332,10 @@ pub struct Grooves {
 }
 
 impl Grooves {
-    /// Returns the curvature in 1/mm, across the tracks, of the gap between wheel and part at (x, y): the curvature of
-    /// the wheel minus that of the part. The tracks are along x, and the gap is taken at its minimum along the track.
-    /// Returns 0 where the wheel leaves no groove.
+    /// Returns the curvature in 1/mm of the groove that the wheel leaves at (x, y). This is the curvature of the wheel
+    /// minus the curvature of the part, across the tracks. The tracks run along x. Across the tracks, the gap between
+    /// wheel and part counts at its minimum along x. Returns 0 where the wheel leaves no groove, for example in a
+    /// hollow that is narrower than the wheel.
     pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
         let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -348,8 +354,8 @@ impl Grooves {
         self.first_mm + number * self.spacing_mm
     }
 
-    /// Returns the height in mm at (x, y) above the bottom of the groove of track number `track`, and the gradient of
-    /// this height.
+    /// Returns the height of a groove at (x, y) over its bottom, in mm, and the derivatives of this height with respect
+    /// to x and y. `track` is the number of the track that left the groove.
     fn at(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (b, [bx, by]) = self.bend.at(x, y);
         let d = y - self.track_mm(track);
@@ -425,7 +431,8 @@ impl Part {
         Self { shape: spec.shape.build(), aperture: spec.aperture, height, grooves: None }
     }
 
-    /// Returns the deviation of the real surface at (x, y), along the nominal normal, in mm.
+    /// Returns the deviation of the real surface from the nominal surface at (x, y), in mm along the nominal normal.
+    /// The deviation is positive for excess material and includes the grooves.
     pub fn deviation_mm(&self, x: f64, y: f64) -> f64 {
         self.height_and_gradient(x, y, self.nearest_track(y)).0
     }
@@ -440,8 +447,9 @@ impl Part {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.nearest(y))
     }
 
-    /// Returns the height in mm over the nominal surface at (x, y), and its gradient, with the groove of track number
-    /// `track`.
+    /// Returns the height of the real surface over the nominal surface at (x, y), in mm, and its derivatives with
+    /// respect to x and y. Uses the groove of track number `track`, even if another track is nearer. Without grooves,
+    /// `track` is ignored.
     fn height_and_gradient(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (h, slope) = self.height.at(x, y);
         let Some(grooves) = &self.grooves else { return (h, slope) };
@@ -456,8 +464,9 @@ impl Part {
         (point, unit_normal(tx, ty))
     }
 
-    /// Returns the point of the real surface at (x, y), and its derivatives with respect to x and to y. The groove of
-    /// track number `track` is continued beyond its borders.
+    /// Returns the point of the real surface at the nominal position (x, y) in mm, and the derivatives of this point
+    /// with respect to x and to y. Uses the groove of track number `track`, also at positions beyond the borders of
+    /// this groove.
     fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
         let (h, [hx, hy]) = self.height_and_gradient(x, y, track);
@@ -475,11 +484,11 @@ impl Part {
         ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], tx, ty)
     }
 
-    /// Moves a ball along the path `way` until it touches the part. The contact is unexpected if the ball touches
-    /// before its path begins.
+    /// Moves a ball along the straight path `way` until it touches the part. Returns the centre of the ball and the
+    /// contact. Returns `Contact::Unexpected` if the ball touches before the start of the path and this start is over
+    /// the aperture. Returns `Contact::Missed` if the path ends without a touch.
     ///
-    /// A touch whose contact lies beyond the aperture is a miss, because the side and the rim of the part are not
-    /// modelled.
+    /// A contact beyond the aperture also counts as a miss, because the side and the rim of the part are not modelled.
     pub fn touch(&self, way: &Approach) -> Contact {
         let start = way.centre(way.from_mm);
         let Some(t) = self.near_contact(way) else { return Contact::Missed };
@@ -504,8 +513,10 @@ impl Part {
         vertical / (1.0 + p * p + q * q).sqrt() - self.height.at(c[0], c[1]).0 - radius_mm
     }
 
-    /// Moves the ball along the path `way` in steps of its distance from the surface, until it is near contact. Returns
-    /// its position on the path, in mm from the target. Returns `None` if the ball does not come near contact.
+    /// Moves the ball along the path `way` until it nearly touches the part (distance below 0.02 mm), for 100 steps at
+    /// most. The length of each step is the distance between ball and surface. Returns the position on the path, in mm
+    /// from the target. Returns `None` if the ball passes the end of the path by more than 1 mm, or if the distance is
+    /// not finite.
     fn near_contact(&self, way: &Approach) -> Option<f64> {
         let mut t = way.from_mm;
         for _ in 0..100 {
@@ -521,8 +532,10 @@ impl Part {
         Some(t)
     }
 
-    /// Computes the contact of the ball by an iteration that begins at the position `t` on the path `way`. Returns (x,
-    /// y) of the contact and the position on the path in mm. Returns `None` if the iteration finds no contact.
+    /// Computes the contact of the ball on the path `way` with the part, by an iteration. `t` is the start of the
+    /// iteration: the position of the ball's centre on the path, in mm from the target. Returns (x, y) of the contact,
+    /// and the position of the ball's centre on the path, in mm from the target. Returns `None` if the iteration finds
+    /// no contact.
     fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
         let centre = way.centre(t);
         let [p, q] = self.shape.gradient(centre[0], centre[1]);
@@ -551,11 +564,13 @@ impl Part {
         None
     }
 
-    /// Computes the contact of the ball with the ridge at `y` by Newton's method, from the start `[x, t]`. Returns (x,
-    /// y) of the contact and the position t on the path in mm. Returns `None` if the iteration does not converge.
+    /// Computes the contact of the ball with a ridge (the line at constant `y` where two grooves meet) by Newton's
+    /// method. The iteration starts at `x` on the ridge and at the position `t` of the ball on the path `way`. Returns
+    /// (x, y) of the contact and the position t on the path, in mm from the target. Returns `None` if the iteration
+    /// does not converge.
     ///
     /// Solves |r - c| = R and (r - c) . r_x = 0. Here r is the point of the ridge, r_x its derivative with respect to
-    /// x, R the radius of the ball and c = p + t d its centre on the path.
+    /// x, R the radius of the ball and c = p + t d its centre on the path, with the target p and the direction d.
     fn contact_on_ridge(&self, way: &Approach, [mut x, mut t]: [f64; 2], y: f64) -> Option<([f64; 2], f64)> {
         let track = self.nearest_track(y);
         let mut last = f64::INFINITY;
@@ -584,12 +599,13 @@ impl Part {
         (last < 1e-10).then_some(([x, y], t))
     }
 
-    /// Computes the contact of the ball with the groove of track number `track` by Newton's method, from the start
-    /// `from` = (x, y, t). Returns (x, y) of the contact and the position t on the path in mm. Returns `None` if the
-    /// iteration does not converge.
+    /// Computes the contact of the ball with the groove of track number `track` by Newton's method. The iteration
+    /// starts at `from` = (x, y, t): the position (x, y) of the contact, and the position t of the ball on the path
+    /// `way`. Returns (x, y) of the contact and the position t, in mm from the target. Returns `None` if the iteration
+    /// does not converge.
     ///
     /// Solves r + R m = p + t d. Here r is the point of the surface, m its unit normal, R the radius of the ball and p
-    /// + t d its centre on the path.
+    /// + t d its centre on the path, with the target p and the direction d.
     fn contact_in(&self, way: &Approach, from: Vec3, track: f64) -> Option<([f64; 2], f64)> {
         let offset = |x: f64, y: f64| -> Vec3 {
             let (r, tx, ty) = self.tangents(x, y, track);
@@ -644,7 +660,10 @@ fn solve([a, b, c]: [Vec3; 3], right: Vec3) -> Option<Vec3> {
     x.iter().all(|value| value.is_finite()).then_some(x)
 }
 
-/// Computes the contact of a ball that moves along the path `way` with a sphere, from the outside.
+/// Computes the contact of a ball on the path `way` with the outside of a sphere. `centre_mm` and `sphere_radius_mm`
+/// describe the sphere, in the frame of `way`. Returns `Contact::Unexpected` if the ball overlaps the sphere at the
+/// start of the path. Returns `Contact::Missed` if the ball does not meet the sphere on the path. The (x, y) of the
+/// returned contact is the (x, y) of the ball's centre.
 pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> Contact {
     let from_centre: Vec3 = std::array::from_fn(|i| way.point_mm[i] - centre_mm[i]);
     let along = dot(from_centre, way.direction);

@@ -207,7 +207,10 @@ impl Reader<'_> {
     }
 }
 
-/// Returns an error unless the length of the bytes is exactly `header` + `records` times `size`.
+/// Checks that the length of `bytes` is `header` + `records` × `size`: a header, then records of `size` bytes each.
+///
+/// # Errors
+/// Returns a refusal if the length is different.
 fn exact(bytes: &[u8], header: u64, records: u64, size: u64) -> Result<(), Refusal> {
     let expected = header + records * size;
     if bytes.len() as u64 == expected {
@@ -274,7 +277,7 @@ impl Plan {
         Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful, targets })
     }
 
-    /// Encodes the measuring plan.
+    /// Returns the measuring plan as the bytes of a payload of kind 1 in docs/modbus.md, high word first.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 0];
         bytes.extend((self.targets.len() as u32).to_be_bytes());
@@ -295,11 +298,11 @@ impl Plan {
 }
 
 impl Map {
-    /// Decodes a correction map.
+    /// Decodes a correction map from the bytes of a payload of kind 2 in docs/modbus.md.
     ///
     /// # Errors
-    /// The bytes are not a map, the map has more nodes than the machine can store, or its header states another largest
-    /// absolute value than its nodes have.
+    /// Returns a refusal if the bytes are not a map, or if the map has too many nodes. Also returns a refusal if the
+    /// largest absolute value in the header differs from the largest absolute value of the nodes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         let mut reader = Reader { rest: bytes };
         reader.format()?;
@@ -333,7 +336,7 @@ impl Map {
         Ok(map)
     }
 
-    /// Encodes the correction map.
+    /// Returns the correction map as the bytes of a payload of kind 2 in docs/modbus.md, high word first.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 1];
         bytes.extend(self.columns.to_be_bytes());
@@ -406,7 +409,7 @@ impl Pass {
         Err(broken(format!("the part's extent is x {x0} to {x1}, y {y0} to {y1} mm")))
     }
 
-    /// Encodes the settings of the pass.
+    /// Returns the settings of the pass as the bytes of a payload of kind 3 in docs/modbus.md, high word first.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1];
         bytes.extend(self.spark_out.to_be_bytes());
@@ -421,8 +424,9 @@ impl Pass {
     }
 }
 
-/// Encodes the records of points. Without `scale_mm`, the coordinates are floats (format 1). With it, they are whole
-/// multiples of `scale_mm` (format 2).
+/// Returns the measured points as bytes, high word first (kind 4 in docs/modbus.md). If `scale_mm` is `None`, a
+/// coordinate is a 64-bit float in mm (format 1). Otherwise a coordinate is a whole number of steps of `scale_mm`
+/// (format 2).
 pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(32 * records.len());
     for record in records {
@@ -440,10 +444,12 @@ pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> 
     bytes
 }
 
-/// Decodes records of points, for tests and truth queries. `scale_mm` is as in [`encode_points`].
+/// Decodes measured points from bytes, for tests and for queries of the simulated truth. `scale_mm` must be the value
+/// with which the points were encoded: `None` for float coordinates, otherwise the step of the whole-number coordinates
+/// in mm.
 ///
 /// # Errors
-/// The length is not a multiple of the length of a record, or a value is invalid.
+/// Returns a refusal if the length is not a multiple of the length of a record, or if a value is invalid.
 pub fn decode_points(bytes: &[u8], scale_mm: Option<f64>) -> Result<Vec<PointRecord>, Refusal> {
     let size = if scale_mm.is_some() { 20 } else { 32 };
     exact(bytes, 0, (bytes.len() / size) as u64, size as u64)?;
@@ -474,7 +480,8 @@ fn point(reader: &mut Reader, scale_mm: Option<f64>) -> Result<PointRecord, Refu
 }
 
 impl PassRecord {
-    /// Encodes the pass record.
+    /// Returns the pass record (the result of a grinding pass) as bytes, high word first: one record of kind 5 in
+    /// docs/modbus.md.
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(64);
         bytes.extend(self.job.to_be_bytes());

@@ -20,8 +20,9 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         Self(Arc::default())
     }
 
-    /// Adds a fault that happens once, at `place`, for example at a command. The first `skip` occurrences of the place
-    /// pass without the fault.
+    /// Adds `fault` to the list. The fault happens once, at a line or command that `place` matches. `place` is the
+    /// number, the beginning or the name of a line or command. The first `skip` matching lines or commands pass without
+    /// the fault.
     pub fn add(&self, place: impl Into<Place>, skip: u32, fault: Fault) {
         self.rules().push(Rule { place: place.into(), skip, fault });
     }
@@ -31,9 +32,12 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         self.rules().clear();
     }
 
-    /// Returns the fault that happens now, and removes it from the list. `is_meant` returns true for the places that
-    /// match the present event. If several faults are due, only the first happens, and the others stay in the list.
-    /// Returns `None` if no fault is due.
+    /// Returns the fault that is due at the present line or command, and removes this fault from the list. `is_meant`
+    /// returns true for each place that matches the present line or command.
+    ///
+    /// A fault is due if its place matches and no occurrences are left to skip. A matching fault that is not yet due
+    /// skips one occurrence less from now on. If several faults are due, returns the one that was added first; the
+    /// others stay in the list. Returns `None` if no fault is due.
     pub(crate) fn next_at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

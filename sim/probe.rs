@@ -21,7 +21,9 @@ impl Placement {
     pub const IDENTITY: Self =
         Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation_mm: [0.0; 3] };
 
-    /// Returns the placement that rotates about x, then y, then z (fixed axes), then translates.
+    /// Returns the placement that first rotates and then translates by `translation_mm`, in mm. `angles_deg` are the
+    /// angles of rotation about x, y and z, in degrees. The rotation is about x first, then about y, then about z;
+    /// these axes are fixed.
     pub fn new(translation_mm: Vec3, angles_deg: Vec3) -> Self {
         let [(sx, cx), (sy, cy), (sz, cz)] = angles_deg.map(|a| a.to_radians().sin_cos());
         Self {
@@ -66,11 +68,12 @@ fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
     v.map(|c| c / norm)
 }
 
-/// Returns the centre of a ball that touches the ground surface at its point S + e n over (x, y). S is the nominal
-/// point, n the nominal unit normal and e the form error.
+/// Returns the centre, in mm, of a probe ball that touches the ground surface. The ball has the radius `radius_mm`. The
+/// contact point is S + e n: S is the nominal point of `shape` at (x, y), n the nominal unit normal at S, and e the
+/// error of `form` at (x, y), in mm.
 ///
-/// The ball touches along the normal of the ground surface, not along n. The offset is computed exactly from n and the
-/// gradient of e, so the second-order term of the paper's eq. (6) is in the data.
+/// The ball touches along the normal of the ground surface, not along n. This normal is computed from n, e and the
+/// gradient of e, without linearization. The data therefore contain the second-order term of the paper's eq. (6).
 pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f64) -> Vec3 {
     let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
     let [p, q] = shape.gradient(x, y);
@@ -89,7 +92,7 @@ pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f6
     std::array::from_fn(|i| s[i] + e * n[i] + radius_mm * m[i] / norm)
 }
 
-/// Adds Gaussian noise with this standard deviation per axis to every point.
+/// Adds Gaussian noise to each coordinate of every point. `sigma_mm` is the standard deviation of the noise, in mm.
 pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     for c in points.iter_mut().flatten() {
         let z: f64 = StandardNormal.sample(&mut *rng);
@@ -97,8 +100,9 @@ pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     }
 }
 
-/// Moves the fraction `share` of the points by `least_mm` to `most_mm` in random directions. Returns the indices of the
-/// moved points, in ascending order.
+/// Changes some of the points into outliers. Selects each point with the probability `share`, from 0 to 1, and moves it
+/// in a random direction. The distance is uniform from `least_mm` to `most_mm`, in mm; `least_mm` must be less than
+/// `most_mm`. Returns the indices of the moved points, in ascending order.
 pub fn add_outliers(rng: &mut Rng, points: &mut [Vec3], share: f64, least_mm: f64, most_mm: f64) -> Vec<usize> {
     let mut moved = Vec::new();
     for (index, point) in points.iter_mut().enumerate() {

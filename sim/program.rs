@@ -42,12 +42,17 @@ pub struct CircularArc {
 }
 
 impl CircularArc {
-    /// Computes the arc from one position to another. `axes` are the indices of the two axes of its plane, then of the
-    /// third axis; `centre_mm` is its centre in that plane. `takes_mm` is the maximum difference of the radii at both
-    /// ends that the control accepts, in mm.
+    /// Computes the circular arc from the first position to the second, both in mm. `axes` are three axis indices, from
+    /// 0 to 2: the first two axes span the plane of the arc, and the third axis is normal to the plane. `centre_mm` is
+    /// the centre of the arc, in mm along the first two axes. If `clockwise` is true, the arc turns from the second
+    /// axis towards the first.
+    ///
+    /// `takes_mm` is a tolerance of the control: the maximum difference, in mm, between the radius at the start and the
+    /// radius at the end.
     ///
     /// # Errors
-    /// The radii at both ends differ by more than `takes_mm`, or the arc has no length.
+    /// Returns an error if the two radii differ by more than `takes_mm`, if the radius at the start is 0, or if the arc
+    /// has no length. A full circle is refused too, because its two ends are the same point.
     pub fn new(
         axes: [usize; 3],
         [from, to]: [[f64; 3]; 2],
@@ -156,10 +161,12 @@ pub struct Program {
 }
 
 impl Program {
-    /// Sets the head of the machine that executes the program; `None` for a machine without a rotary axis.
+    /// Sets the rotary head of the machine that executes the program. `head` is `None` for a machine without a rotary
+    /// axis.
     ///
     /// # Errors
-    /// Returns the reason why this machine cannot execute the program.
+    /// Returns the reason if this machine cannot execute the program, for example because the program turns an axis
+    /// that the machine does not have, or turns the head beyond its range.
     pub fn with_head(mut self, head: Option<Head>) -> Result<Self, String> {
         let why = match (self.axis, head) {
             (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
@@ -179,8 +186,8 @@ impl Program {
         }
     }
 
-    /// Returns the length of the path of the wheel's centre on a move, in mm. If a head turns, returns the distance
-    /// between its end points.
+    /// Returns the length, in mm, of the path of the wheel's centre on the move from `from` to `to`. If the program
+    /// turns a rotary axis, returns instead the straight distance between the two ends of this path.
     pub fn length_mm(&self, from: &Waypoint, to: &Waypoint) -> f64 {
         match self.axis {
             Some(_) => {
@@ -204,11 +211,12 @@ impl Control {
         known.into_iter().find(|(name, _)| *name == dialect).map(|(_, control)| control)
     }
 
-    /// Parses a program as this control would.
+    /// Parses the program `text` as this control would.
     ///
     /// # Errors
-    /// Returns the first line at which the control would stop or would not do what the program seems to say, with the
-    /// reason.
+    /// Returns a message if the control would stop, or if it would do something other than the program seems to say.
+    /// The message names the first such line and the reason. Also returns an error if the program is not complete, for
+    /// example if it has no end.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
         reader.program.by_kinematics = self == Self::Linuxcnc;
@@ -296,10 +304,11 @@ impl Reader {
         Ok(self.program)
     }
 
-    /// Reads a block, that is a line of words, each of which is a letter and a number.
+    /// Parses a block, which is one line of a program. A block consists of words; most words are letters with a number,
+    /// for example `G1` or `X2.5`. Adds a waypoint to the program if the block contains coordinates.
     ///
     /// # Errors
-    /// Returns the reason why the block is not allowed in the program of a pass.
+    /// Returns the reason if the block is not allowed in the program of a grinding pass.
     fn block(&mut self, line: &str) -> Result<(), String> {
         if line == "%" {
             self.percents += 1;
@@ -355,11 +364,12 @@ impl Reader {
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
 
-    /// Handles a G word, given as its number times 10 (640 for G64). Returns this number if the word sets the path
-    /// mode, otherwise `None`.
+    /// Applies a G word. `tenths` is the number of the word times 10, for example 640 for G64. Returns `Some(tenths)`
+    /// if the word selects the path mode (how the control rounds corners). Applies every other allowed word at once and
+    /// returns `None`.
     ///
     /// # Errors
-    /// The word is not allowed in the program of a pass.
+    /// Returns an error if the word is not allowed in the program of a grinding pass.
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
             (_, 0 | 10 | 20 | 30) => self.motion = Some((tenths / 10) as u8),
@@ -383,8 +393,9 @@ impl Reader {
         Ok(None)
     }
 
-    /// Handles the G word `smooth`, as its number times 10, that sets the path mode, and its parameter `level`. The
-    /// path counts as exact only if the mode limits how far corners are rounded. Without a word, nothing changes.
+    /// Records whether the selected path mode is exact. A path mode is exact only if it limits how far the control
+    /// rounds corners. `smooth` is the number of the G word that selects the path mode, times 10. `level` is the number
+    /// of the Q word; only a Fanuc control uses it. If `smooth` is `None`, nothing changes. Always returns `Ok`.
     fn exactness(&mut self, smooth: Option<i64>, level: Option<f64>) -> Result<(), String> {
         let tolerance = self.program.tolerance_mm.is_some_and(|mm| mm > 0.0);
         self.exact = match (self.control, smooth) {
@@ -441,11 +452,13 @@ impl Reader {
         Ok(())
     }
 
-    /// Turns a rotary axis to the angle `to_deg`. A program may turn only one axis, and it must use tool centre point
-    /// control either in all turns or in none.
+    /// Records that the program turns the rotary axis `axis` to the angle `to_deg`, in degrees on the scale of this
+    /// axis. A program may turn only one rotary axis. Tool centre point control must be active in all turns of the
+    /// program or in none.
     ///
     /// # Errors
-    /// Returns the reason why this turn is not allowed.
+    /// Returns the reason if the turn breaks one of these rules, or if a Sinumerik program turns the axis with tool
+    /// centre point control before the word `ORIAXES`.
     fn tilt(&mut self, axis: char, to_deg: f64) -> Result<(), String> {
         let first = self.program.axis.is_none();
         if *self.program.axis.get_or_insert(axis) != axis {
@@ -464,11 +477,17 @@ impl Reader {
         Ok(())
     }
 
-    /// Computes the arc of a block. `ends` are the positions where it begins and ends, and `told` are the coordinates
-    /// in the block.
+    /// Computes the circular arc that a block commands. `ends` are the positions, in mm, where the arc begins and ends.
+    /// `told` contains the numbers of the block's coordinate words, each under its letter, for example X or I.
+    /// `clockwise` is true for a clockwise arc.
     ///
     /// # Errors
-    /// No plane is selected, the end or the centre is not given along both axes of the plane, or there is no such arc.
+    /// Returns the reason in these cases:
+    ///
+    /// - No plane is selected, or no circular arc fits these points.
+    /// - The end or the centre is not given along both axes of the plane.
+    /// - The centre has a coordinate outside of the plane.
+    /// - A LinuxCNC program has set neither G90.1 nor G91.1, which select how the centre is given.
     fn read_arc(
         &self,
         ends: [[f64; 3]; 2],
@@ -556,8 +575,9 @@ impl Reader {
         }
     }
 
-    /// Reads the centre of a circle (CC) with the coordinates `rest`. It must have two axes, which select the plane of
-    /// the following arcs.
+    /// Parses the centre of a circle (`CC`) in Klartext. `rest` contains the coordinates of the centre, for example
+    /// `X+3 Z+7`. The axes of the coordinates select the plane of the following arcs. Returns an error if the
+    /// coordinates do not belong to exactly two of the axes X, Y and Z, or if a coordinate is not a signed number.
     fn read_centre(&mut self, rest: &str) -> Result<(), String> {
         self.centre.clear();
         for word in rest.split_whitespace() {
@@ -578,8 +598,10 @@ impl Reader {
         Ok(())
     }
 
-    /// Reads the target `rest` of a straight move (L) or of an arc (C). `motion` is the motion mode of the move; `None`
-    /// for an arc, whose word DR+ or DR- gives the direction.
+    /// Parses a straight move (`L`) or an arc (`C`) in Klartext, and adds the move to the program. `rest` contains the
+    /// words after `L` or `C`. `motion` is `Some(1)` for a straight move at the programmed feed; the word `FMAX` makes
+    /// this move rapid. `motion` is `None` for an arc; the word `DR+` or `DR-` then gives the direction. Returns an
+    /// error if a word is not allowed, if no coordinate is given, or if the move itself is not allowed.
     fn straight(&mut self, rest: &str, motion: Option<u8>) -> Result<(), String> {
         let mut to = BTreeMap::new();
         self.motion = motion;

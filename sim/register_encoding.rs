@@ -80,8 +80,9 @@ impl RegisterBlock {
         self.words(offset, &words)
     }
 
-    /// Writes bytes, for example of a text or an identity, from the register `offset` on. The word order does not apply
-    /// to them.
+    /// Writes raw bytes into the block, two bytes into each register, from the register with the index `offset` on. The
+    /// word order of the block does not change the order of these bytes. If the number of bytes is odd, the low byte of
+    /// the last register is 0.
     pub(crate) fn bytes(self, offset: usize, bytes: &[u8]) -> Self {
         self.words(offset, &registers_of(bytes))
     }
@@ -101,7 +102,8 @@ pub fn bytes_of(registers: &[u16]) -> Vec<u8> {
     registers.iter().flat_map(|register| register.to_be_bytes()).collect()
 }
 
-/// Packs bytes into registers, the high byte of each register first. An odd last byte is followed by a zero byte.
+/// Packs bytes into registers, two bytes into each register and the high byte first. If the number of bytes is odd, the
+/// low byte of the last register is 0.
 pub fn registers_of(bytes: &[u8]) -> Vec<u16> {
     bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair.get(1).copied().unwrap_or(0)])).collect()
 }
@@ -113,9 +115,12 @@ pub fn crc16(bytes: &[u8]) -> u16 {
     })
 }
 
-/// Converts a payload from one word order to the other, in place. Bytes after the last complete record do not change.
+/// Converts a payload from one word order to the other, in place: reverses the 16-bit words of each value that has a
+/// word order. A second call restores the payload.
 ///
-/// `kind` and `format` are those of docs/modbus.md. A payload of an unknown kind does not change.
+/// `kind` and `format` are the numbers of the payload's kind and of its record format in docs/modbus.md. `bytes`
+/// contains the header and the records of the payload. Bytes after the last complete record do not change. A payload of
+/// an unknown kind does not change.
 pub fn turn_payload(kind: u16, format: u16, bytes: &mut [u8]) {
     let (header, record) = fields(kind, format);
     let length = header.iter().map(|field| field.unsigned_abs()).sum::<usize>().min(bytes.len());
@@ -140,8 +145,9 @@ fn turn_fields(bytes: &mut [u8], fields: &[isize]) {
     }
 }
 
-/// Returns the lengths in bytes of the values in the header and in each record of a payload. A negative length marks
-/// raw bytes, which have no word order.
+/// Returns the layout of a payload as two lists: the lengths of the values in the header, and the lengths of the values
+/// in one record, both in bytes. A negative length marks raw bytes, which have no word order. `kind` and `format` are
+/// numbers in docs/modbus.md. Both lists are empty for an unknown kind.
 fn fields(kind: u16, format: u16) -> (&'static [isize], &'static [isize]) {
     match (kind, format) {
         (1, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, 4, -4, 8], &[4, 2, 2, 8, 8, 8, 8, 8, 8]),

@@ -58,7 +58,9 @@ pub struct SimulatedMachine {
 }
 
 impl SimulatedMachine {
-    /// Switches a machine on. `boot_id` should differ at every start of the program; 0 is replaced by 1.
+    /// Creates a simulated machine that has just been switched on. `body` simulates the physics of the machine.
+    /// `boot_id` identifies this start of the machine's program and should differ at every start; 0 is replaced by 1.
+    /// `options` sets the properties of the machine's interface, for example the addresses of the registers.
     pub fn new(body: Box<dyn Physics>, boot_id: u32, options: MachineOptions) -> Self {
         let mut machine = Self {
             handshake: Handshake::new(body, boot_id, &options),
@@ -102,8 +104,8 @@ impl SimulatedMachine {
         Ok(self.to_line_order(registers))
     }
 
-    /// Converts registers between the machine's byte order and the byte order on the line. Swaps the two bytes of each
-    /// register if they differ.
+    /// Swaps the two bytes of each register if the machine's options require it (`swaps_bytes`). This converts
+    /// registers from the machine's byte order to the byte order on the line, or back.
     fn to_line_order(&self, mut registers: Vec<u16>) -> Vec<u16> {
         if self.options.swaps_bytes {
             registers.iter_mut().for_each(|register| *register = register.swap_bytes());
@@ -111,11 +113,14 @@ impl SimulatedMachine {
         registers
     }
 
-    /// Writes registers from `address` on. The machine has reacted to them when this returns.
+    /// Writes `values` to consecutive registers. `address` is the address of the first register. The machine has
+    /// already reacted to the values when this function returns. A frozen application ([`Self::freeze`]) reacts to a
+    /// command only later.
     ///
     /// # Errors
-    /// A register is in no block that a client may write, the write crosses the border of a block, or the machine does
-    /// not accept the values.
+    /// Returns [`Exception::Address`] if a register is in no block that a client may write, or if the write crosses the
+    /// border of a block. Returns [`Exception::Value`] if there are not 1 to 123 values, or if the machine does not
+    /// accept the values. Returns [`Exception::Busy`] if a payload is written while the application is frozen.
     pub fn write(&mut self, address: u16, values: &[u16]) -> Result<(), Exception> {
         if !(1..=123).contains(&values.len()) {
             return Err(Exception::Value);
@@ -144,7 +149,9 @@ impl SimulatedMachine {
         Ok(())
     }
 
-    /// Advances the machine by the real time `elapsed_real`.
+    /// Advances the machine by the real time `elapsed_real`. The physics of a running job advances by this time
+    /// multiplied by the speed of [`Self::set_speed`]. While the application is frozen, only the clock of the machine
+    /// advances.
     pub fn tick(&mut self, elapsed_real: Duration) {
         let mut left = elapsed_real;
         while !left.is_zero() {
@@ -168,10 +175,11 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Handles a written heartbeat: a counter and the id of the client. Only the heartbeat of the owner counts.
+    /// Stores a heartbeat that a client has written. `values` are a counter (one register) and the id of the client
+    /// (two registers). The heartbeat counts only if this client owns the machine and the counter has changed.
     ///
     /// # Errors
-    /// There are not exactly three registers.
+    /// Returns [`Exception::Value`] if `values` does not have exactly three registers.
     fn write_beat(&mut self, values: &[u16]) -> Result<(), Exception> {
         let [count, high, low]: [u16; 3] = values.try_into().map_err(|_| Exception::Value)?;
         self.beat_block = [count, high, low];
@@ -277,7 +285,8 @@ impl SimulatedMachine {
         image
     }
 
-    /// Updates the registers of the status block. Does nothing while the application is frozen.
+    /// Copies the present state of the machine into the registers of the status block. If a register changes, the
+    /// snapshot number of the block increases by 1. Does nothing while the application is frozen.
     fn publish(&mut self) {
         if self.frozen {
             return;
@@ -296,7 +305,8 @@ impl SimulatedMachine {
         self.handshake.body.kind()
     }
 
-    /// Returns the state of the machine, frozen or not.
+    /// Returns the state of the machine. While the application is frozen, this state can differ from the state in the
+    /// status registers.
     pub fn state(&self) -> State {
         self.handshake.state
     }
@@ -321,7 +331,8 @@ impl SimulatedMachine {
         self.options.word_order
     }
 
-    /// Returns the events in the log, the oldest first. Old events are removed from the log.
+    /// Returns the events in the log, the oldest first. When the log is full, the older half of the events is removed;
+    /// [`Self::forgotten`] counts the removed events.
     pub fn log(&self) -> &[LogEntry] {
         self.handshake.log.entries()
     }
@@ -336,7 +347,8 @@ impl SimulatedMachine {
         self.handshake.log.forgotten()
     }
 
-    /// Returns every START in the log that began a job, as (sequence number, job, cycle).
+    /// Returns one entry for each job that began, the oldest first: the sequence number of the START command, the
+    /// number of the job, and the number of the cycle. Jobs whose events were removed from the log are missing.
     pub fn began(&self) -> Vec<(u32, u32, u16)> {
         let began = |seen: &LogEntry| match seen.what {
             HandshakeEvent::Began { start, job, cycle } => Some((start, job, cycle)),
@@ -345,7 +357,8 @@ impl SimulatedMachine {
         self.log().iter().filter_map(began).collect()
     }
 
-    /// Returns the physics, for a test that changes it without the handshake.
+    /// Returns the simulated physics of the machine. A test can change the physics directly in this way, without a
+    /// command to the machine.
     pub fn body_mut(&mut self) -> &mut dyn Physics {
         &mut *self.handshake.body
     }
@@ -355,22 +368,24 @@ impl SimulatedMachine {
         self.handshake.speed = speed.max(0.0);
     }
 
-    /// Freezes the application, or continues it with `frozen` = false. While it is frozen, the wire still answers, with
-    /// registers that do not change.
+    /// Freezes the application of the machine if `frozen` is true, and lets it continue if `frozen` is false. A frozen
+    /// machine still answers Modbus requests, but its status registers do not change. The last command that is written
+    /// during this time is carried out only after the application continues.
     pub fn freeze(&mut self, frozen: bool) {
         self.frozen = frozen;
         self.publish();
     }
 
-    /// Restarts the program of the machine, with another boot id. It keeps only the list of the jobs that it began. If
-    /// the restart interrupts a job, the machine reports fault 30.
+    /// Restarts the program of the machine, with another boot id. The program loses its memory, except the list of the
+    /// jobs that began. If the restart interrupts a job, the machine reports fault 30.
     pub fn reboot(&mut self) {
         self.handshake.reboot();
         self.empty_memory();
     }
 
-    /// Restarts the program of the machine without a trace: it keeps its boot id, forgets which jobs it began, and
-    /// reports no fault. A real machine must not do this.
+    /// Simulates a restart of the machine's program that is not allowed on a real machine. The boot id stays the same,
+    /// the list of the jobs that began is lost, and the machine reports no fault. After the restart, the machine is
+    /// idle.
     pub fn forget(&mut self) {
         self.handshake.forget();
         self.empty_memory();
@@ -391,8 +406,9 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Opens the interlocks in `bits`, which are those of [`crate::command::interlock`], whatever their state in the
-    /// simulation. With `bits` = 0, they have the state of the simulation again.
+    /// Opens the interlocks whose bits are set in `bits`, even if the simulated physics reports them closed. The bits
+    /// are listed in [`crate::command::interlock`]. Each call replaces the bits of the previous call. With `bits` = 0,
+    /// all interlocks follow the physics again.
     pub fn open_interlocks(&mut self, bits: u16) {
         self.handshake.open(bits);
         self.publish();
@@ -404,15 +420,16 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Makes an idle machine move without a command if `strays` is true. If `strays` is false, ends such a motion: the
-    /// machine is idle again.
+    /// Simulates a motion without a command. If `strays` is true, an idle machine begins to move. If `strays` is false,
+    /// such a motion ends and the machine is idle again. Does nothing in any other case.
     pub fn stray(&mut self, strays: bool) {
         self.handshake.stray(strays);
         self.publish();
     }
 
-    /// Requests a fault that happens once: after the next payload has come into force and a client has read the slots,
-    /// the machine changes the identities of its payloads in force.
+    /// Requests a fault that happens once: the machine changes the identities of all payloads in force (the payloads
+    /// that the machine uses at present). The fault happens after two events: a new payload comes into force, and then
+    /// a client reads the registers that list the payloads in force.
     pub fn spoil(&mut self) {
         self.handshake.spoil();
     }
@@ -423,8 +440,8 @@ impl SimulatedMachine {
         self.publish();
     }
 
-    /// Makes the two snapshot numbers differ at the next read of the status block, as if its registers were of two
-    /// moments.
+    /// Makes the next read of the status block inconsistent. The snapshot numbers in the first and in the last register
+    /// of the block then differ, as if the registers were from two different moments. Later reads are correct again.
     pub fn tear_status(&mut self) {
         self.torn = true;
     }

@@ -27,7 +27,9 @@ pub trait Shape: Send + Sync {
         [-p * w, -q * w, w]
     }
 
-    /// Returns the points of a grid, row by row, x fastest, over the rectangle centred on the origin.
+    /// Returns the points of the surface on a rectangular grid, in mm. The rectangle has the size `width_mm` in x and
+    /// `depth_mm` in y, and its centre is the origin. The grid has `columns` points along x and `rows` points along y;
+    /// both numbers must be at least 2. The points are in row order: x changes fastest.
     fn grid(&self, width_mm: f64, depth_mm: f64, columns: usize, rows: usize) -> Vec<Vec3> {
         let at = |i: usize, n: usize, size: f64| size * (i as f64 / (n - 1) as f64 - 0.5);
         (0..rows)
@@ -144,7 +146,7 @@ impl Shape for Biconic {
         [along(c[0], k[0], x), along(c[1], k[1], y)]
     }
 
-    /// Returns the second derivatives of z: by x twice, by x and y, by y twice.
+    /// Returns the second derivatives d²z/dx², d²z/(dx dy) and d²z/dy² of the surface at (x, y), in 1/mm.
     ///
     /// z = N / (1 + r), with N = cx x^2 + cy y^2 and r = sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2). cx and cy are
     /// the curvatures, kx and ky the conic constants along x and y.
@@ -289,11 +291,13 @@ impl<S: Shape> Shape for ThroughOrigin<S> {
     }
 }
 
-/// Projects the point `centre` onto a surface by Newton's method, from the start (x, y). Returns (x, y) of the
-/// projection and the signed distance of the point along the normal. Returns `None` if the iteration does not converge.
+/// Projects the point `centre` onto the surface `shape` by Newton's method. The last parameter is the start (x, y) of
+/// the iteration, in mm. Returns two results: (x, y) of the projection, and the signed distance of `centre` from the
+/// surface, in mm. The distance is positive on the side to which the normal points. Returns `None` if the iteration
+/// does not converge.
 ///
-/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0. Here c is the point, S the point of the surface, and S_x and S_y are
-/// its derivatives with respect to x and y.
+/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0. Here c is the point `centre`, S the point of the surface at (x, y),
+/// and S_x and S_y are the derivatives of S with respect to x and y.
 pub(crate) fn project_onto(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
     for _ in 0..40 {
         let ([p, q], [r, s, t]) = (shape.gradient(x, y), shape.hessian(x, y));

@@ -405,11 +405,11 @@ impl WorldSpec {
         check_all("cmm.travel_mm_s", &[c.travel_mm_s], 0.1, 1e6, "0.1 to 1000000 mm/s")
     }
 
-    /// Checks that the surface has a height and a slope of at most 10 everywhere on the part. It is sufficient to check
-    /// the rim, because the domain of each shape is convex.
+    /// Checks that the surface has a finite height and a slope of at most 10 everywhere on the part. The domain of each
+    /// shape is convex, so only points on the rim of the part are checked.
     ///
     /// # Errors
-    /// A point of the rim has no height, or its slope is more than 10.
+    /// Returns an error if a point on the rim has no finite height, or if its slope is more than 10.
     fn check_shape(&self) -> Result<(), SpecError> {
         let (shape, [half_x, half_y]) = (self.part.shape.build(), self.part.aperture.half_mm());
         for k in 0..360 {

@@ -46,9 +46,12 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// Accepts the header of a payload, and then waits for its pages. `of` is the kind of machine, `limit_bytes` the
-    /// maximum length of a payload. Returns false if the machine does not use this kind of payload, or if the length is
-    /// 0 or above the limit.
+    /// Reads the header of a new payload and prepares the inbox for the pages of this payload. `order` is the word
+    /// order of the machine, and `words` are the registers of the header. `of` is the kind of machine. `limit_bytes` is
+    /// the maximum length of a payload, in bytes.
+    ///
+    /// Returns true if the header is accepted. Returns false, and changes nothing, if the machine does not use this
+    /// kind of payload, if its length is 0, or if its length is above the limit.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
         let (kind, announced_bytes) = (words[0], order.to_u32([words[2], words[3]]));
         if slot_of(of, kind).is_none() || announced_bytes == 0 || announced_bytes > limit_bytes {
@@ -67,8 +70,12 @@ impl Inbox {
         true
     }
 
-    /// Accepts the page in `words`. Returns `None` if the page is out of order or its length is wrong. Returns
-    /// `Some(Some(_))` with the payload if this page completes it and its CRC is right, otherwise `Some(None)`.
+    /// Reads one page of a payload. `order` is the word order of the machine, and `words` are the registers of the
+    /// page.
+    ///
+    /// Returns `None` if the page is refused: it is not the next page, its length is wrong, or no header came before.
+    /// Returns `Some(Some(_))` with the complete payload if this is the last page and the CRC is right. Returns
+    /// `Some(None)` if pages are still missing, if the page was already accepted, or if the CRC is wrong.
     pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
         if self.has_page(order, words) {
             return Some(None);
@@ -117,7 +124,8 @@ impl Inbox {
     }
 }
 
-/// Returns the index of the slot for the payload number `kind`, or `None` if this machine does not use such payloads.
+/// Returns the index, from 0, of the slot (the memory for one payload in use) for payloads of the kind `kind`. Returns
+/// `None` if this machine does not use payloads of this kind.
 pub(crate) fn slot_of(machine: Kind, kind: u16) -> Option<usize> {
     match (machine, kind) {
         (Kind::Cmm, 1) => Some(0),
@@ -180,8 +188,9 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
-    /// Packs the result so far of a running job as an outbox, without a CRC and without a `done` number. The outbox
-    /// contains only full pages. Returns `None` if a value in its header is not finite.
+    /// Packs the result so far of a running job as an outbox (the registers from which a client reads a result).
+    /// `order` is the word order of the machine, and `origin` identifies the job. The CRC and the `done` number in the
+    /// header are 0. The outbox contains only full pages. Returns `None` if a value in the header is not finite.
     pub(crate) fn partial(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);
@@ -190,8 +199,9 @@ impl Outbox {
         Some(outbox)
     }
 
-    /// Packs a result as an outbox. Returns `None` if a value in its header, for example the temperature, is not
-    /// finite.
+    /// Packs the result `outcome` as an outbox (the registers from which a client reads a result). `order` is the word
+    /// order of the machine, and `origin` identifies the job. Returns `None` if a value in the header, for example the
+    /// temperature, is not finite.
     pub(crate) fn new(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
         if !figures.iter().all(|figure| figure.is_finite()) {
@@ -225,15 +235,17 @@ impl Outbox {
         self.header.clone()
     }
 
-    /// Returns the 116 registers of the page with the number `page`. A page after the last one has 0 data registers.
+    /// Returns the 116 registers of one page of the outbox. `page` is the number of the page, from 0, and `order` is
+    /// the word order of the machine. A page after the last one contains no data: its number of data registers is 0.
     pub(crate) fn page_image(&self, order: WordOrder, page: u32) -> Vec<u16> {
         let data = self.registers.chunks(PAGE_REGISTERS).nth(page as usize).unwrap_or(&[]);
         page_image(order, page, data)
     }
 }
 
-/// Returns the registers of a page of an outbox: the number of the page, the number of its data registers, and the data
-/// registers.
+/// Returns the 116 registers of one page of an outbox: the number of the page, the number of its data registers, and
+/// the data registers. `data` contains at most 112 registers; the registers after them are 0. `order` is the word order
+/// of the machine.
 pub(crate) fn page_image(order: WordOrder, page: u32, data: &[u16]) -> Vec<u16> {
     RegisterBlock::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
 }

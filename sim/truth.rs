@@ -63,8 +63,9 @@ pub(crate) enum Source {
     NotFound = 7,
 }
 
-/// Creates the random number generator for one use of a source of noise; `number` counts the uses. Equal arguments give
-/// equal random numbers.
+/// Creates the random number generator for one use of the noise source `source`. `number` is the number of this use.
+/// Equal arguments give equal random numbers. The numbers of one source or use do not depend on the other sources and
+/// uses.
 pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
     let mut rng = crate::rng(seed);
     rng.set_stream((source as u64) << 32 | u64::from(number));
@@ -111,8 +112,9 @@ pub(crate) struct WorldState {
 }
 
 impl WorldState {
-    /// Creates the initial state of the simulated cell. `systematic_mm` returns the systematic error of the grinder at
-    /// the nodes of the part, in mm.
+    /// Creates the initial state of the simulated cell from the specification `spec`, with the first blank. The
+    /// function `systematic_mm` returns the systematic error of the grinder at each node of the part's height grid, in
+    /// mm.
     pub fn new(spec: WorldSpec, systematic_mm: impl FnOnce(&WorldSpec, &Part) -> Vec<f64>) -> Self {
         let part = Part::blank(&spec.part, blank_seed(spec.seed, 1));
         let systematic_mm = systematic_mm(&spec, &part);
@@ -158,8 +160,10 @@ impl WorldState {
         self.job = Some(job);
     }
 
-    /// Returns the placement for a measurement. It is the last placement if the part has stayed on the CMM, otherwise a
-    /// new one with the random error of loading.
+    /// Loads the part on the CMM, and returns the placement of the part for a measurement. If the part has stayed on
+    /// the CMM since the last measurement, the placement does not change. Otherwise, draws a new placement with a
+    /// random loading error. In this case, also adds the defects that the specification requires after the present
+    /// number of passes.
     pub fn load_on_table(&mut self) -> Placement {
         if !self.on_table {
             self.damage();
@@ -244,7 +248,8 @@ fn blank_seed(seed: u64, number: u32) -> u64 {
     stream(seed, Source::Blank, number).random()
 }
 
-/// Locks the state. After a panic elsewhere, the state is still the truth about the part, so poisoning is ignored.
+/// Locks the state and returns the lock guard. If another thread panicked while it held the lock, the mutex is
+/// poisoned. This is ignored, because the state still describes the true part.
 pub(crate) fn locked(state: &Mutex<WorldState>) -> MutexGuard<'_, WorldState> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }

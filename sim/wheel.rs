@@ -49,13 +49,15 @@ pub struct PlainWheel {
 }
 
 impl PlainWheel {
-    /// Creates a wheel whose controller assumes the radius `stated_mm`.
+    /// Creates the wheel of the grinder in `world`. `stated_mm` is the wheel radius that the controller assumes, in mm.
+    /// The true radius is `stated_mm` plus the radius error in the specification.
     pub(crate) fn new(world: Arc<Mutex<WorldState>>, stated_mm: f64) -> Self {
         let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;
         Self { world, radius_mm, first_track: None, previous_track: None, current_track: None }
     }
 
-    /// Clamps the part for a program. Returns true if the part is in the grinder.
+    /// Clamps the part in the grinder at the start of a program, and forgets the tracks of the previous program.
+    /// Returns true if the part is in the grinder, and false if the other machine has the part.
     pub fn claim_part(&mut self) -> bool {
         let mut state = locked(&self.world);
         (self.first_track, self.previous_track, self.current_track) = (None, None, None);
@@ -68,7 +70,9 @@ impl PlainWheel {
         locked(&self.world).release(Kind::Grinder);
     }
 
-    /// Moves the centre of the wheel to a position in the model frame.
+    /// Moves the centre of the wheel to `centre_mm`, a position in the model frame. Grinds the part between the present
+    /// track and the previous one. A wheel that is more than 1 mm away from the nominal surface ends the present track.
+    /// Does nothing if the position cannot be projected onto the surface.
     pub fn move_to(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
@@ -101,8 +105,8 @@ impl PlainWheel {
         }
     }
 
-    /// Ends a complete sweep over the part. Grinds the strips beyond the first and the last track to the heights of
-    /// those tracks.
+    /// Ends a complete sweep over the part. Grinds the two strips outside the first and the last track, up to the edges
+    /// of the part. Each strip gets the height of the track next to it. Does nothing if the sweep has no track.
     pub fn finish_sweep(&mut self) {
         self.next_track();
         let world = Arc::clone(&self.world);
@@ -116,8 +120,11 @@ impl PlainWheel {
     }
 }
 
-/// Grinds all nodes within the limits `along` of x and `across` of y. `wanted` returns the commanded height of a node
-/// over the nominal surface in mm, or `None` to leave the node unchanged. A node that is already lower does not change.
+/// Grinds all nodes of the part within a rectangle. `along` are the limits of x and `across` the limits of y, each as
+/// minimum and maximum in mm. The function `wanted` receives (x, y) of a node, and returns the commanded height of the
+/// surface over the nominal surface, in mm. If `wanted` returns `None`, the node does not change. The target is this
+/// height plus the systematic error of the grinder. A node that is already lower than the target does not change. A
+/// higher node keeps the fraction `error_copying` of its excess over the target.
 fn grind(state: &mut WorldState, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
     let mu = state.spec.grinder.error_copying;
     let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);

@@ -43,34 +43,42 @@ impl World {
         Ok(Self { state: Arc::new(Mutex::new(WorldState::new(spec, systematic_mm))) })
     }
 
-    /// Returns the simulated grinder. A world has only one grinder, so serve it on only one wire.
+    /// Returns the simulated grinder. A world has only one grinder, so connect it to only one wire (simulated
+    /// interface).
     pub fn grinder(&self) -> Grinder {
         Grinder::new(self.state.clone())
     }
 
-    /// Returns the simulated measuring machine. A world has only one, so serve it on only one wire.
+    /// Returns the simulated measuring machine, which measures by a plan. A world has only one measuring machine, so
+    /// connect it to only one wire (simulated interface).
     pub fn cmm(&self) -> Cmm {
         Cmm::new(self.state.clone())
     }
 
-    /// Returns the probe of the measuring machine, which makes one touch for each call. A world has only one measuring
-    /// machine, so serve it on only one wire.
+    /// Returns the probe of the simulated measuring machine, for a server that commands each touch. A world has only
+    /// one measuring machine, so connect it to only one wire (simulated interface).
     pub fn touch_probe(&self) -> TouchProbe {
         TouchProbe::new(self.state.clone())
     }
 
-    /// Returns the wheel of the grinder, for a controller that moves it from position to position on widely spaced
-    /// tracks; see [`crate::wheel`]. `stated_mm` is the radius that the controller assumes. There is one grinder, so
-    /// take only one of this, [`World::wheel`] and [`World::grinder`].
+    /// Returns the wheel of the grinder, for a controller that moves the wheel from position to position. The surface
+    /// between two tracks is interpolated, and single grooves are not modelled; see [`crate::wheel`]. `stated_mm` is
+    /// the radius of the wheel that the controller assumes, in mm.
+    ///
+    /// A world has only one grinder, so use only one of [`World::plain_wheel`], [`World::wheel`] and
+    /// [`World::grinder`].
     pub fn plain_wheel(&self, stated_mm: f64) -> PlainWheel {
         PlainWheel::new(self.state.clone(), stated_mm)
     }
 
-    /// Returns the wheel of the grinder, for an external controller; it is moved along the path that the controller
-    /// executes. There is one grinder, so take only one of this, [`World::plain_wheel`] and [`World::grinder`].
+    /// Returns the wheel of the grinder, for an external controller that reports its executed path. The wheel grinds
+    /// along this path, groove by groove. `stated_radius_mm` is the radius of the wheel that the controller assumes.
+    ///
+    /// A world has only one grinder, so use only one of [`World::wheel`], [`World::plain_wheel`] and
+    /// [`World::grinder`].
     ///
     /// # Errors
-    /// The radius is not possible for a wheel.
+    /// The radius is outside 0.1 mm to 1000 mm.
     pub fn wheel(&self, stated_radius_mm: f64) -> Result<Wheel, SpecError> {
         Wheel::new(self.state.clone(), stated_radius_mm)
     }
@@ -80,7 +88,8 @@ impl World {
         locked(&self.state).load_blank();
     }
 
-    /// Sets the faults, from the next job on.
+    /// Sets the simulated faults, from the next job on. The next measurement loads the part again, with a new random
+    /// error of its placement.
     pub fn set_faults(&self, faults: WorldFaults) {
         let mut state = locked(&self.state);
         state.spec.faults = faults;
@@ -92,24 +101,28 @@ impl World {
         locked(&self.state).spec.clone()
     }
 
-    /// Returns the true deviation of the real surface from the nominal at (x, y) of the model frame, along the normal,
-    /// in mm. The ridges between the grinder's tracks are included.
+    /// Returns the true deviation of the real surface from the nominal surface, in mm along the normal. Positive means
+    /// too much material. `x_mm` and `y_mm` are a position in the model frame. The ridges between the grinder's tracks
+    /// are included.
     pub fn deviation_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
         locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
-    /// Returns the true deviations of the real surface from the nominal at many positions (x, y), in mm. All values are
-    /// of one moment.
+    /// Returns the true deviation of the real surface from the nominal surface for each position (x, y) in `places_mm`,
+    /// in mm along the normal. The positions are in the model frame. The part does not change between two values.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
     }
 
-    /// Returns the true height in mm of the centre of a ball above the offset of the nominal surface, for each position
-    /// (x, y), where the ball touches the real surface along the nominal normal. All values are of one moment.
+    /// Returns a true ball height in mm for each position (x, y) in `places_mm`, in the model frame. A ball of radius
+    /// `radius_mm` moves along the normal of the nominal surface at (x, y) until it touches the real surface. The
+    /// height is the distance of its centre from the nominal surface along this normal, minus the radius.
     ///
-    /// In a groove, this differs from [`Self::deviation_mm`], because the ball touches beside its centre. Beyond the
-    /// part the ball touches nothing.
+    /// In a groove, this height differs from [`Self::deviation_mm`], because the ball touches the surface beside the
+    /// normal.
+    ///
+    /// A value is `None` if the contact is beyond the part, or if the height is not between -1 mm and 1 mm.
     pub fn ball_heights_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
         const REACH_MM: f64 = 1.0;
         let state = locked(&self.state);
@@ -124,19 +137,22 @@ impl World {
         places_mm.iter().map(height_mm).collect()
     }
 
-    /// Returns the point of the nominal surface over (x, y) and its unit normal.
+    /// Returns a point of the nominal surface in mm, and the unit normal at this point. The point has the coordinates
+    /// `x_mm` and `y_mm` in the model frame.
     pub fn nominal(&self, x_mm: f64, y_mm: f64) -> (crate::Vec3, crate::Vec3) {
         let state = locked(&self.state);
         (state.part.shape.point(x_mm, y_mm), state.part.shape.normal(x_mm, y_mm))
     }
 
-    /// Returns the true placement of the part in the last measurement, half a turn included; before the first
-    /// measurement, the placement without the random error of loading. It maps the model frame to the CMM's at 20 °C.
+    /// Returns the true placement of the part in the last measurement: the rigid motion from the model frame to the
+    /// frame of the CMM at 20 °C. The simulated fault "part turned by 180°" is included. Before the first measurement,
+    /// the placement has no random error of loading.
     pub fn placement(&self) -> Placement {
         locked(&self.state).placement
     }
 
-    /// Returns the mean, over the part, of the true deviation of the real surface from the nominal, in mm.
+    /// Returns the true deviation of the real surface from the nominal surface, averaged over the part, in mm. The
+    /// ridges between the grinder's tracks are included.
     pub fn level_mm(&self) -> f64 {
         let state = locked(&self.state);
         let part = &state.part;
@@ -156,12 +172,13 @@ impl World {
         locked(&self.state).spec.grinder.repeatability_um * 1e-3
     }
 
-    /// Returns every pass that was begun, in order.
+    /// Returns one entry for each pass that [`World::grinder`] has begun, in order of time. A running pass is included.
     pub fn history(&self) -> Vec<GrindEntry> {
         locked(&self.state).history.clone()
     }
 
-    /// Returns every pass along an executed path, in order.
+    /// Returns one entry for each pass of [`World::wheel`], in order of time. In these passes, the wheel follows the
+    /// path that an external controller executes. A running pass is included.
     pub fn executed_passes(&self) -> Vec<ExecutedPass> {
         locked(&self.state).executed_passes.clone()
     }
@@ -176,7 +193,7 @@ impl World {
         locked(&self.state).measurements_begun
     }
 
-    /// Returns the number of the blank in the grinder, from 1.
+    /// Returns the number of the present blank (the part in the cell). The first blank has the number 1.
     pub fn blank(&self) -> u32 {
         locked(&self.state).blanks
     }

@@ -107,12 +107,12 @@ const MIN_MANUAL_POLL_INTERVAL: Duration = Duration::from_millis(250);
 /// a fifth.
 pub const MAX_SCALLOP_SHARE: f64 = 0.2;
 
-/// Builds the task of a run (data and options of its computations) and the plan of its cell (parameters of its
-/// decisions).
+/// Returns the task and the cell plan of a run. The task contains the data and the options of the computations. The
+/// cell plan contains the parameters by which the cell decides, such as limits and timeouts.
 ///
 /// # Errors
-/// Returns an error if the nominal surface or the pattern is not available, or if the recipe exceeds the limits of the
-/// cell.
+/// Returns an error if the nominal surface or the measuring pattern cannot be read or computed, or if the recipe and
+/// the cell do not fit together, for example because a value of the recipe exceeds a limit of the cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
     let (nominal, nominal_file, part_identity) = read_nominal(recipe)?;
     let side = recipe.measure.side.side().unwrap_or_default();
@@ -189,11 +189,13 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     Ok((task, plan))
 }
 
-/// Returns the settings for the compensation of machine parameters: the tolerances, and the points of the surface under
-/// the nodes of a correction. Returns `None` if the recipe compensates no parameter.
+/// Returns the settings for the compensation of machine parameters: the tolerances of the parameters, the effect of the
+/// wheel radius, and a point of the surface for each node of the correction grid. `ground` is the surface to grind with
+/// the outline of the part, or the reason why no path can be planned. Returns `None` if the recipe compensates no
+/// parameters.
 ///
 /// # Errors
-/// No tracks of the wheel can be planned on the surface (`ground` is an error).
+/// Returns an error if parameters are to be compensated and `ground` is an error.
 fn parameter_compensation(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -216,9 +218,10 @@ fn parameter_compensation(
     }))
 }
 
-/// Returns two standard uncertainties of the pose in the fixture: of the position in mm, and of the rotation in rad.
-/// The first is half of `lock_uncertainty_um` (k = 2). The second is the rotation that displaces the edge of the part
-/// by the first. Returns `None` if the recipe does not state `lock_uncertainty_um`.
+/// Returns the standard uncertainties of the part's position (mm) and rotation (rad) in the fixture. The standard
+/// uncertainty of the position is half of `lock_uncertainty_um` of the recipe, which is an expanded uncertainty (k =
+/// 2). The standard uncertainty of the rotation is that of the position divided by half the larger extent of the part
+/// in x or y. Returns `None` if the recipe does not state `lock_uncertainty_um`.
 fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
@@ -226,7 +229,8 @@ fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
-/// Returns the options of an adaptive measurement; `None` if the recipe has mode fixed.
+/// Returns the options of an adaptive measurement. Returns `None` if the recipe does not select the adaptive mode, or
+/// states no accepted risk.
 fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == SelectionMode::Adaptive)?;
     Some(AdaptiveOptions {
@@ -236,7 +240,8 @@ fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     })
 }
 
-/// Returns the minimum share (0 to 1) of the targets of a plan that the probe must find.
+/// Returns the minimum share (0 to 1) of planned targets for which the probe must find a point. It is `min_coverage` of
+/// the recipe. For an adaptive measurement it is less, so that one touch of the first batch can miss the part.
 fn min_found_share(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
     let share =
@@ -244,7 +249,8 @@ fn min_found_share(recipe: &Recipe) -> f64 {
     share * recipe.measure.min_coverage
 }
 
-/// Returns the acceptance limits of the recipe. A missing limit is infinite.
+/// Returns the acceptance criteria of the recipe: the limits of PV and RMS in mm, and how the figures are compared with
+/// them. A limit that the recipe does not state is infinite.
 fn tolerance(recipe: &Recipe) -> Tolerance {
     let limit = |um: Option<Micrometres>| um.map_or(f64::INFINITY, Micrometres::mm);
     Tolerance {
@@ -256,8 +262,9 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
     }
 }
 
-/// Returns the maximum time for the transfer of `bytes` bytes to a machine over a serial Modbus line, with a margin for
-/// retries. Returns zero for a machine with another wire.
+/// Returns the timeout for the transfer of `bytes` bytes to a machine on a serial Modbus line (RTU). The timeout is
+/// three times the computed duration, to allow for retries. Returns zero for every other kind of connection, including
+/// Modbus TCP.
 fn transfer_timeout(link: &LinkConfig, bytes: usize) -> Duration {
     let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
@@ -278,8 +285,9 @@ fn map_options(recipe: &Recipe) -> MapOptions {
     }
 }
 
-/// Returns a text of the settings that determine the errors of a pass: the cell, and the text `kind` from
-/// [`learning_kind`]. A run can start from the results of an earlier run only if both have the same text.
+/// Returns a text that identifies all settings that affect the errors of a pass. The text consists of the name of the
+/// cell and of `kind`, the text from [`learning_kind`]. In a simulated cell, the settings of the simulation are added.
+/// A run can start from the results of an earlier run only if this text is the same for both runs.
 fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     let mut said = format!("cell {:?}, {kind}", cell.name);
     // Another simulated world counts as another grinder.
@@ -289,9 +297,12 @@ fn learning_setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     said
 }
 
-/// Returns a text of the settings that determine the errors of a pass, without the cell: the part, and the settings of
-/// grinding, measuring and compensation. A run can start from the results of another cell only if both runs have the
-/// same text. `part` is the identity of the nominal surface.
+/// Returns a text that identifies the settings that affect the errors of a pass, except the cell. These are the part
+/// and the settings of grinding, measuring and compensation. A run can start from the results of a run in another cell
+/// only if this text is the same for both runs.
+///
+/// `part` is the SHA-256 that identifies the nominal surface, `track_mm` the distance between the tracks of the wheel,
+/// and `targets` the number of points to measure.
 fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
@@ -345,18 +356,20 @@ fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupEr
     }
 }
 
-/// Returns the format of the file of nominal points, as the recipe states it: columns and units.
+/// Converts the table settings of the nominal file from text into a table format: columns, unit, and unit of z. `words`
+/// are the settings from the recipe.
 ///
 /// # Errors
-/// Returns the key with an invalid value, and the reason.
+/// Returns the recipe key of a setting that is not valid, and the reason.
 pub fn nominal_table_format(words: &TableSettings) -> Result<formats::Table, (&'static str, String)> {
     table_format(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
 }
 
-/// Returns the format of the file of points to measure, as the recipe states it: columns and units.
+/// Converts the table settings of the file of points to measure from text into a table format: columns, unit, and unit
+/// of z. `words` are the settings from the recipe.
 ///
 /// # Errors
-/// Returns the key with an invalid value, and the reason.
+/// Returns the recipe key of a setting that is not valid, and the reason.
 pub fn plan_table_format(words: &TableSettings) -> Result<formats::Table, (&'static str, String)> {
     table_format(words, ["measure.file_columns", "measure.file_unit", "measure.file_height_unit"])
 }
@@ -370,10 +383,12 @@ fn table_format(words: &TableSettings, keys: [&'static str; 3]) -> Result<format
     })
 }
 
-/// Builds the nominal surface from the content of the file at `path`. `projection` is used for scattered points only.
+/// Builds the nominal surface from `file`, the content of the file at `path`. The content is points, a mesh or the
+/// definition of a surface by a formula. `projection` is used for points only: it selects the surface onto which the
+/// points are projected for their triangulation.
 ///
 /// # Errors
-/// Returns an error with the path of the file if its content does not make a surface.
+/// Returns an error with `path` if no surface can be built from the content, or if a mesh encloses a solid.
 pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjection) -> Result<Nominal, SetupError> {
     let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
     match file {
@@ -390,8 +405,9 @@ pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjec
     }
 }
 
-/// Samples a surface that is defined by a formula: at the spacing of its definition, within its outline. `path` is used
-/// in errors.
+/// Returns the nominal surface that is sampled from a formula. The definition `surface` gives the node spacing, or an
+/// accuracy from which the spacing is computed. The outline of `surface` limits the result. `path` is the file that
+/// error messages name.
 fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
     let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm));
     let grid = grid.map_err(|source| SetupError::Definition { path: path.to_owned(), source })?;
@@ -400,8 +416,8 @@ fn sample_surface(path: &Path, surface: &DefinedSurface) -> Result<Nominal, Setu
         .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
-/// Returns the SHA-256 of the nodes of a surface. The same surface thus has the same identity, however its formula is
-/// written.
+/// Returns the SHA-256 of the coordinates of all points of a sampled surface. Thus two formulas that give exactly the
+/// same points have the same SHA-256.
 fn surface_identity(nominal: &Nominal) -> [u8; 32] {
     let mut hash = Sha256::new();
     for point in nominal.points() {
@@ -441,9 +457,13 @@ fn reference_sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Referen
     }
 }
 
-/// Checks that the gap between the reference sphere and the part is large enough for the probe. The part is
-/// approximated by the box around its nominal points in the pose of the fixture; the box is extended downwards without
-/// limit. Returns an error if the gap is too small.
+/// Checks that the probe has enough room between the reference sphere and the part in its fixture. The part is
+/// approximated by the box around its nominal points. This box is aligned with the axes of the model frame and extended
+/// without limit towards -z. The gap is the distance from the box to the surface of the sphere. It must be at least the
+/// diameter of the probe plus the approach distance of the recipe.
+///
+/// # Errors
+/// Returns an error if the gap is too small.
 fn check_sphere(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -559,12 +579,19 @@ fn is_from_below(recipe: &Recipe) -> bool {
     recipe.measure.side.side() == Some(Side::Opposite)
 }
 
-/// Returns the distance between the tracks of the wheel in mm, and the scallops (the ridges between the tracks). The
-/// distance is that of the recipe, or the largest one with which the scallops stay small enough. The scallops are
-/// `None` if no path over the part can be planned (`ground` is an error) and the recipe sets the distance.
+/// Returns the distance between the tracks of the wheel in mm, and the scallops (the ridges between the tracks) at this
+/// distance. `ground` is the surface to grind with the outline of the part, or the reason why no path can be planned.
+///
+/// The distance is `track_mm` of the recipe. If the recipe limits the scallop height by `scallop_nm`, it is the largest
+/// distance that respects this limit, and `track_mm` is its upper bound. If the recipe states neither, the distance
+/// follows from the tolerances of the recipe. Without `track_mm`, the distance is at most the radius of the wheel and
+/// half of the shorter side of the part.
+///
+/// The scallops are `None` if `ground` is an error. The distance is then `track_mm`.
 ///
 /// # Errors
-/// No path can be planned, and the recipe sets no distance.
+/// Returns an error if no path can be planned and the recipe does not state `track_mm`, or if the target surface cannot
+/// be computed.
 fn track_distance(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -598,8 +625,10 @@ fn track_distance(
     Ok((track_mm, Some(unit.with_track_mm(track_mm))))
 }
 
-/// Returns the maximum track distance in mm at which the scallops use at most the share [`MAX_SCALLOP_SHARE`] of each
-/// tolerance. The result is rounded down to two significant digits. It is infinite if the recipe has no tolerance.
+/// Returns the maximum distance between tracks in mm at which the scallops (the ridges between the tracks) are small
+/// enough. Their height may be at most [`MAX_SCALLOP_SHARE`] times the PV limit of the recipe, and their rms at most
+/// [`MAX_SCALLOP_SHARE`] times the RMS limit. The result is rounded down to two significant digits. The result is
+/// infinite if the recipe states neither limit, or if there are no scallops at any distance.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     let share = |limit: Option<Micrometres>| limit.map_or(f64::INFINITY, |um| MAX_SCALLOP_SHARE * um.mm());
     let most_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
@@ -610,8 +639,9 @@ pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     (most_mm * per_mm).floor() / per_mm
 }
 
-/// Returns the settings from which the program of each pass of a part is written. `ground` is the surface as a height
-/// over x and y with its outline, `track_mm` the distance between the tracks.
+/// Returns the settings that all grinding programs of a part have in common, such as path options, machine limits and
+/// program dialect. `ground` is the surface to grind, as a height over x and y, with the outline of the part.
+/// `track_mm` is the distance between the tracks. `part_identity` is the SHA-256 that identifies the nominal surface.
 fn programs(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -663,8 +693,8 @@ fn programs(
     }
 }
 
-/// Returns the path options `plain`, completed by the rotary axis of the grinder, from the cell, and by the tilt of the
-/// wheel, from the recipe.
+/// Returns a copy of the path options `plain` with the rotary axis of the grinder from the cell file and the tilt of
+/// the wheel from the recipe. Each of the two options is `None` if its file does not state it.
 fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
     let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
     let rotary = cell.grinder.rotary.map(|head| {
@@ -689,8 +719,8 @@ fn with_tilt(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOpti
     PathOptions { rotary, tilt: lean, ..plain }
 }
 
-/// Converts the wheel of a recipe into the form for path planning. If the recipe sets no tilt for a cup wheel, the tilt
-/// is the largest slope of the part plus a margin.
+/// Converts the wheel of a recipe into the wheel for path planning. If the recipe states no tilt for a cup wheel, the
+/// tilt is the largest slope of the part plus 0.0873 rad (about 5°).
 fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
     const CUP_TILT_MARGIN_RAD: f64 = 0.0873;
     match *wheel {
@@ -710,8 +740,9 @@ fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
     }
 }
 
-/// Returns the thermal expansion of the part and of the scales of the measuring machine. Returns `None` if the recipe
-/// does not state the expansion of the part.
+/// Returns the thermal expansion coefficients, in 1/K, of the part and of the scales of the CMM, with the uncertainties
+/// of the part's coefficient and of the temperature. If the recipe does not state the uncertainty of the coefficient,
+/// it is 10 % of the coefficient. Returns `None` if the recipe does not state the coefficient of the part.
 fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<ThermalExpansion> {
     const MILLIONTH: f64 = 1e-6;
     let of_part = recipe.part.expansion_um_m_k?;
@@ -757,12 +788,12 @@ fn cell_plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     }
 }
 
-/// Builds the drivers of both machines. Sends nothing to a machine. `part` is the name of the part in files, `folder`
-/// the folder of the run. `owner` and `epoch` identify this client to machines that several clients can reach. The
-/// epoch increases with each start.
+/// Creates the drivers of the CMM and the grinder. Sends nothing to a machine. `part` is the name of the part in files
+/// and prompts. `folder` is the run folder. `owner` is the number of this client, and `epoch` increases with each start
+/// of the client. A machine that several clients can reach uses these two numbers to distinguish the clients.
 ///
 /// # Errors
-/// Returns an error if a wire cannot be opened, a folder does not exist, or reference points cannot be read.
+/// Returns an error if a connection cannot be opened, a folder does not exist, or reference points cannot be read.
 pub fn create_drivers(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -792,19 +823,21 @@ pub fn create_drivers(
     Ok((cmm, grinder))
 }
 
-/// Returns the settings for the driver of a machine on a Modbus line; `None` for a machine with another wire. `owner`
-/// and `epoch` identify this client to the machine.
+/// Returns the driver settings of a machine that is connected by Modbus. Returns `None` for a machine with another kind
+/// of connection. `owner` is the number of this client, and `epoch` increases with each start of the client.
 ///
-/// `simulated` is true if the machines of the cell are simulated. A machine that reports the opposite is refused.
+/// `simulated` is true if the cell file declares its machines as simulated. The driver refuses a real machine in a
+/// simulated cell and a simulated machine in a real cell.
 pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (line, unit) = link.wire.modbus_line()?;
     Some(ModbusSettings::from_context(line, unit, &driver_context(link, simulated, [owner, epoch])))
 }
 
-/// Checks that the resources of a machine exist, such as its exchange folders. Sends nothing to the machine.
+/// Checks that the resources of a machine exist, such as its exchange folders. For this check the driver of the machine
+/// is created and dropped. Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`create_drivers`].
+/// Returns an error if the connection cannot be opened, a folder does not exist, or reference points cannot be read.
 pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
     let link = match device {
         Device::Cmm => &cell.cmm.link,
@@ -819,10 +852,11 @@ pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverErro
     }
 }
 
-/// Builds the driver of the measuring machine without a part, for inspection only. Sends nothing to the machine.
+/// Creates the driver of the CMM without data of a part or a run. The driver can be used only to inspect the machine.
+/// Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`create_drivers`].
+/// Returns an error if the connection cannot be opened, a folder does not exist, or reference points cannot be read.
 pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.cmm.link;
@@ -833,10 +867,11 @@ pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     })
 }
 
-/// Builds the driver of the grinder without a part, for inspection only. Sends nothing to the machine.
+/// Creates the driver of the grinder without data of a part or a run. The driver can be used only to inspect the
+/// machine. Sends nothing to the machine.
 ///
 /// # Errors
-/// Those of [`create_drivers`].
+/// Returns an error if the connection cannot be opened or a folder does not exist.
 pub fn create_grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.grinder.link;
@@ -849,8 +884,9 @@ fn probe_travel_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.min_mm, travel.max_mm])
 }
 
-/// Returns a context for the driver of a machine in which all values of the part and of the run are empty. A caller
-/// that needs them sets them. `owner` and `epoch` identify this client to the machine.
+/// Returns a driver context with the connection settings of one machine from `link`. The fields for the part, the run
+/// and the folders are empty. A caller that needs these fields sets them afterwards. `owner` is the number of this
+/// client, and `epoch` increases with each start of the client.
 fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
     DriverContext {
         part: "",
@@ -871,7 +907,8 @@ fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) 
     }
 }
 
-/// Returns the interval at which the status of a machine is read.
+/// Returns the time between two reads of the status of a machine. The cell file states it. For a machine that a person
+/// operates, it is at least 250 ms.
 pub fn poll_interval(link: &LinkConfig) -> Duration {
     if link.wire.is_by_person() { link.timing.poll.max(MIN_MANUAL_POLL_INTERVAL) } else { link.timing.poll }
 }

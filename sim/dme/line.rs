@@ -152,12 +152,12 @@ fn command(text: &str) -> Result<Command, u16> {
     Ok(Command { name: name.to_owned(), arguments, fault: None })
 }
 
-/// Parses the arguments of a command. `inside` is the text between its parentheses. A comma within a string or within
-/// inner parentheses does not separate arguments.
+/// Parses the arguments of a command. `inside` is the text between the parentheses of the command. Arguments are
+/// separated by commas. A comma in a string or in inner parentheses is part of an argument.
 ///
 /// # Errors
-/// Returns the error number of the standard: 502 if a string or a parenthesis is not closed, otherwise that of the
-/// first invalid argument.
+/// Returns an error number of the I++ DME standard. The number is 502 if a string or a parenthesis is not closed.
+/// Otherwise it is the error number of the first invalid argument.
 fn arguments(inside: &str) -> Result<Vec<Argument>, u16> {
     let (mut depth, mut quoted, mut from, mut parts) = (0i32, false, 0, Vec::new());
     for (at, c) in inside.char_indices() {

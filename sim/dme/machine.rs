@@ -81,8 +81,9 @@ impl Frame {
     const MACHINE: Self =
         Self { rows: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3], written: [0.0; 6] };
 
-    /// Creates a frame from six numbers: the origin x, y, z in mm, then the Euler angles theta, psi, phi in degrees.
-    /// The rotation matrix is Rz(phi) Rx(theta) Rz(psi).
+    /// Creates a frame from `written`, six numbers. The first three are x, y, z of the machine's origin in this frame,
+    /// in mm. The last three are the Euler angles theta, psi, phi in degrees. The matrix Rz(phi) Rx(theta) Rz(psi)
+    /// rotates a direction from the machine's frame to this frame.
     fn new(written: [f64; 6]) -> Self {
         let [x, y, z, theta, psi, phi] = written;
         let about_z = |deg: f64| {
@@ -185,7 +186,7 @@ impl DmeMachine {
         self.can_scan = false;
     }
 
-    /// Makes the server report no radius of its tool from now on.
+    /// Makes the server refuse queries of the tool's radius from now on, with error 510 (bad property).
     pub fn hide_radius(&mut self) {
         self.reports_radius = false;
     }
@@ -208,10 +209,12 @@ impl DmeMachine {
         self.at_nominals = false;
     }
 
-    /// Re-arms the probe after errors are cleared: it can touch again. The simulated probe needs no action.
+    /// Makes the probe ready to touch again after the client has cleared the errors. Does nothing, because the
+    /// simulated probe is always ready.
     pub(super) fn arm(&mut self) {}
 
-    /// Restarts the machine: it must be homed, and has no tool, no parameters and no frame.
+    /// Resets the machine as after power-on. The machine must be homed again. No tool is selected, the parameters have
+    /// their first values, and the part frame equals the machine's frame.
     pub(super) fn restart(&mut self) {
         self.homed = false;
         self.tool = "NoTool".into();
@@ -229,8 +232,8 @@ impl DmeMachine {
         self.at_mm = at_mm;
     }
 
-    /// Ends the current motion after the fraction `share` of its path, from 0 to 1. Releases the part if the probe is
-    /// then high enough above its last contact.
+    /// Ends the current motion after the fraction `share` of its path, from 0 (start) to 1 (end). Releases the part if
+    /// there was no contact yet, or if the probe is then more than twice the approach distance above the last contact.
     pub(super) fn stop_short(&mut self, share: f64) {
         self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
         self.to_mm = self.at_mm;
@@ -241,10 +244,12 @@ impl DmeMachine {
         }
     }
 
-    /// Begins a command. Returns its duration and the result that the server sends at the end of that time.
+    /// Computes the effect of `command`, and starts its motion if it moves the machine. Returns the duration in s and
+    /// the data lines that the server sends.
     ///
     /// # Errors
-    /// Returns the error with which the machine refuses the command.
+    /// Returns the error with which the machine refuses the command, for example 508 before homing and 501 for an
+    /// unsupported command.
     pub(super) fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
         let no = |number| DmeError::new(number, &command.name);
         let arguments = &command.arguments[..];
@@ -352,8 +357,9 @@ impl DmeMachine {
         if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
     }
 
-    /// Returns the position in the machine's frame that the axes X, Y and Z of a command give. An axis that is not
-    /// named keeps its present value, and IJK is ignored. Returns `None` if there is any other argument.
+    /// Returns the position that the arguments X, Y and Z of a command describe, in mm. The arguments are in the
+    /// selected frame. The returned position is in the machine's frame. A missing axis keeps its present value. The
+    /// argument IJK is ignored. Returns `None` if `axes` contains any other argument.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
         let mut at = self.frame().machine_to_part(self.at_mm);
         for axis in axes {
@@ -387,11 +393,18 @@ impl DmeMachine {
         CommandResult { seconds: way_mm / speed, ..CommandResult::default() }
     }
 
-    /// Touches the surface of the simulated part. `axes` are the arguments of the command: the point X, Y, Z and the
-    /// normal IJK.
+    /// Touches the simulated part or the reference sphere. `axes` are the arguments of PtMeas: the target X, Y, Z in mm
+    /// and the outward normal IJK, in the selected frame. Returns the duration and the measured point as data fields.
     ///
     /// # Errors
-    /// Returns the error number of the standard, for example 502 if the normal is missing or an argument is invalid.
+    /// Returns an error number of the I++ DME standard:
+    ///
+    /// - 502 if the normal is missing or an argument is invalid
+    /// - 508 if the tool has no radius
+    /// - 1001 if the ball touches before the search begins
+    /// - 1006 if no surface is found
+    /// - 1008 if the path is outside the travel
+    /// - 1010 if the normal has the length 0
     fn touch(&mut self, axes: &[Argument]) -> Result<CommandResult, u16> {
         let point_mm = self.place(axes).ok_or(502u16)?;
         let direction = axes.iter().find_map(|axis| match axis {

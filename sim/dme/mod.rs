@@ -52,8 +52,8 @@ struct Running {
 }
 
 impl Running {
-    /// Returns the time at which this command sends its next output: a line of a scan, or its end. `speed` is the
-    /// number of simulated seconds in a real second.
+    /// Returns the real time at which this command sends its next output. The output is the next line of a scan, or the
+    /// end of the command if no line is left. `speed` is the number of simulated seconds in a real second.
     fn next(&self, speed: f64) -> Duration {
         let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
         line.map_or(self.ends, |line| {
@@ -112,7 +112,8 @@ impl Server {
         (self.in_session, self.latched) = (false, false);
     }
 
-    /// Restarts the server: the running command is interrupted where it is, and the machine must be homed.
+    /// Restarts the server at the time `now`. The running command is interrupted where the machine is at that time.
+    /// Waiting commands are dropped, and the session ends. The machine must be homed again.
     pub fn restart(&mut self, now: Duration) {
         self.client_lost(now);
         self.abandon(now, &DmeError::new(500, "restart"));
@@ -133,18 +134,20 @@ impl Server {
         }
     }
 
-    /// Returns true if the machine moves.
+    /// Returns true if the running command is one that moves the machine, for example GoTo or PtMeas.
     pub fn is_moving(&self) -> bool {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
-    /// Returns the time of the next output that needs no further line of the client, or `None` if no output is pending.
+    /// Returns the earliest time at which the server has something to send, if the client sends nothing more. Returns
+    /// `None` if no line is queued and no command runs.
     pub fn due(&self) -> Option<Duration> {
         let running = self.running.as_ref().map(|running| running.next(self.speed));
         running.into_iter().chain(self.out.front().map(|out| out.at)).min()
     }
 
-    /// Opens the stop circuit: aborts all commands. The server then refuses commands until its errors are cleared.
+    /// Simulates an emergency stop at the time `now`. The running command and all waiting commands end with error 500.
+    /// The server then refuses commands until the client sends ClearAllErrors.
     pub fn emergency_stop(&mut self, now: Duration) {
         self.abandon(now, &DmeError::new(500, "emergency"));
         self.notify(&[MachineEvent::Stopped]);
@@ -173,7 +176,8 @@ impl Server {
         }
     }
 
-    /// Handles a line that the client has sent, without its line end: carries out or queues its command, or refuses it.
+    /// Handles the line `text` from the client, received at the time `now`. `text` has no line end. An event command is
+    /// carried out at once, any other command is queued. An invalid line is answered with an error.
     pub fn receive(&mut self, text: &str, now: Duration) {
         match line::read(text) {
             Err((tag, error)) => {
@@ -216,8 +220,9 @@ impl Server {
         self.say(now, format!("{tag} %"));
     }
 
-    /// Aborts the running command and the waiting commands with `error`. Returns true if the error was sent for at
-    /// least one of them.
+    /// Aborts the running command and all waiting commands at the time `now`. A motion stops where the machine is.
+    /// Queues `error` for the client once for each aborted command, with the name of the command as the cause. Returns
+    /// false if there was no command to answer.
     fn abandon(&mut self, now: Duration, error: &DmeError) -> bool {
         let running = self.running.take();
         if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {
@@ -274,7 +279,9 @@ impl Server {
         Ok(CommandResult::default())
     }
 
-    /// Sends the next line of the running scan. Returns false if no line is left or no scan runs.
+    /// Queues the next data line of the running scan for the client, and moves the probe to the position of that line.
+    /// If the client has disconnected, only moves the probe. Returns false and does nothing if no command runs or no
+    /// line of a scan is left.
     fn say_scanned(&mut self) -> bool {
         let Some(running) = &mut self.running else { return false };
         let at = running.next(self.speed);

@@ -21,12 +21,17 @@ pub(super) struct Scanned {
 }
 
 impl DmeMachine {
-    /// Scans an open curve. `closed`, `format` and `data` are the arguments of ScanOnCurve; only the values that
-    /// Regrind sends are supported. The scan ends where the probe loses the surface.
+    /// Scans an open curve: touches each target of the curve, and returns the measured points and the duration.
+    /// `closed`, `format` and `data` are the three arguments of the command ScanOnCurve. Only the argument values that
+    /// Regrind sends are supported.
     ///
     /// # Errors
-    /// Returns the error number of the standard, for example 2002 if the probe cannot scan, and 506 for arguments that
-    /// are not supported.
+    /// Returns an error number of the I++ DME standard, for example:
+    ///
+    /// - 506 if an argument is not supported
+    /// - 1001 if the ball touches before the search begins
+    /// - 1006 if the probe does not find the surface at a target
+    /// - 2002 if the probe cannot scan
     pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<CommandResult, u16> {
         let open = Argument::Name("Closed".into(), Some(vec![0.0]));
         let written =
@@ -95,7 +100,8 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the fields of a line of a scan, changed by `fault` if it is a fault of such lines.
+/// Returns the fields of all points of a scan line, joined in their order. The faults `UnaskedQuality`, `PointLost` and
+/// `PointsShifted` change the points before. Any other `fault` changes nothing.
 pub(super) fn spoilt(mut line: Scanned, fault: Option<&Fault>) -> Vec<String> {
     match fault {
         Some(Fault::UnaskedQuality) => line.points.iter_mut().for_each(|point| point.insert(0, "0".to_owned())),

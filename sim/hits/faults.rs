@@ -20,7 +20,9 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Returns the bytes that are sent instead of `line` if this fault happens.
+    /// Returns the bytes that the machine sends instead of `line` because of this fault. `line` includes the line end.
+    /// The bytes are empty if the line is dropped. They equal `line` for [`Self::HangUp`], which only ends the
+    /// connection.
     pub fn spoil(&self, mut line: Vec<u8>) -> Vec<u8> {
         match self {
             Self::Lost(at) => drop(line.remove((*at).min(line.len() - 3))),

@@ -26,8 +26,9 @@ pub struct List {
 }
 
 impl List {
-    /// Parses the text of a list of targets (`plan.csv`). Returns `None` if a row is not a target, or if there are no
-    /// rows.
+    /// Parses a list of targets (`plan.csv`). Each row has eight numbers: index, x, y, z, nx, ny, nz, what. The value 2
+    /// of `what` means the reference sphere. Lines with `#` and the header are not rows. Returns `None` if a row is
+    /// invalid, or if there are no rows.
     pub fn read(text: &str) -> Option<Self> {
         let (about, rows): (Vec<&str>, Vec<&str>) = text.lines().partition(|line| line.starts_with('#'));
         let rows = rows.into_iter().filter(|row| !row.starts_with("index"));

@@ -59,8 +59,8 @@ impl PartProgram {
         Self { probe, options, faults, list: None, next: 0, printed: 0 }
     }
 
-    /// Begins to measure the list of targets in `text`. Does nothing if the text is not a list, or if it is the present
-    /// list.
+    /// Replaces the list of targets by the list in `text` (a `plan.csv`), and starts with its first target. Does
+    /// nothing if `text` is not a valid list, or if it equals the present list.
     pub fn begin(&mut self, text: &str) {
         let list = List::read(text);
         if list.is_some() && list != self.list {

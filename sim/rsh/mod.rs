@@ -90,8 +90,9 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// Creates a controller that is switched on and homed, with no program open. `speed` is the number of simulated
-    /// seconds in a real second.
+    /// Creates a controller that is switched on and homed, with no program open. `wheel` is the simulated wheel that
+    /// the controller moves. `speed` is the number of simulated seconds in one real second. `faults` contains the
+    /// faults that happen at certain lines of a client.
     pub fn new(wheel: PlainWheel, speed: f64, faults: LineFaults) -> Self {
         Self {
             wheel,
@@ -140,14 +141,14 @@ impl Controller {
 
     // ---- people at the machine ----------------------------------------------------------------------------------------------------
 
-    /// Opens the stop circuit.
+    /// Simulates an emergency stop: opens the stop circuit, switches the drives off and ends the active program.
     pub fn emergency_stop(&mut self) {
         (self.stopped, self.on) = (true, false);
         self.break_off();
         self.notify(ControllerEvent::Stopped);
     }
 
-    /// Switches the drives off.
+    /// Switches the drives off and ends the active program.
     pub fn switch_off(&mut self) {
         self.on = false;
         self.break_off();
@@ -173,7 +174,8 @@ impl Controller {
         }
     }
 
-    /// Moves the wheel away from the part, as a person would.
+    /// Moves the wheel away from the part, as an operator would, so that the other machine can take the part. Does
+    /// nothing while a program is active.
     pub fn lead_away(&mut self) {
         if !self.is_busy() {
             self.at_mm = AWAY_MM;
@@ -181,8 +183,9 @@ impl Controller {
         }
     }
 
-    /// Gives control to another client, which aborts the running program if `aborts` is true. If no program runs after
-    /// that, this client opens the program `program`.
+    /// Simulates another client that takes control. If `aborts` is true, this other client first aborts the active
+    /// program. Then, if no program is active, it opens the file at the path `program`. With `program` = `None`, it
+    /// opens no file.
     pub fn steal(&mut self, program: Option<&str>, aborts: bool) {
         self.owner = Some(u64::MAX);
         if aborts {
@@ -193,8 +196,8 @@ impl Controller {
         }
     }
 
-    /// Simulates a crash and a new start of the controller: it has then no clients and no program, and its drives are
-    /// off.
+    /// Simulates a crash and a restart of the controller. After the restart, no client is connected and no program is
+    /// open. The stop circuit is open, the drives are off, and the machine is not homed.
     pub fn kill(&mut self) {
         self.break_off();
         (self.clients, self.owner, self.program, self.log) = (BTreeMap::new(), None, None, None);
@@ -211,7 +214,7 @@ impl Controller {
         self.clients.insert(client, Client::default());
     }
 
-    /// Handles the loss of a client. A running program continues.
+    /// Removes the client `client`, whose connection was lost. A running program continues.
     pub fn client_lost(&mut self, client: u64) {
         self.clients.remove(&client);
     }
@@ -221,15 +224,16 @@ impl Controller {
         self.clients.contains_key(&client)
     }
 
-    /// Returns the time at which the controller next handles a queued line of this client, or sends a line to it,
-    /// without a further line of the client. Returns `None` if nothing is queued.
+    /// Returns the time of the controller's next action for the client `client`. The action is to carry out a queued
+    /// line or to send a queued answer. Returns `None` if nothing is queued, or if the client is not connected.
     pub fn due(&self, client: u64) -> Option<Duration> {
         let client = self.clients.get(&client)?;
         let next = client.lines.front().map(|_| client.free_at);
         next.into_iter().chain(client.out.front().map(|out| out.at)).min()
     }
 
-    /// Handles a line that a client has sent, without its line end, at the time `now`.
+    /// Queues a line that a client has sent, and carries out the queued lines that are due at the time `now`. `client`
+    /// is the number of the client. Ignores the line if this client is not connected.
     pub fn receive(&mut self, client: u64, line: &str, now: Duration) {
         if let Some(client) = self.clients.get_mut(&client) {
             client.lines.push_back(line.trim().to_owned());
@@ -237,7 +241,9 @@ impl Controller {
         self.attend(client, now);
     }
 
-    /// Advances the simulation to the time `now`, and returns the lines that are due for a client.
+    /// Advances the simulation to the time `now`, and carries out the queued lines of the client `client` that are due.
+    /// Returns the answers to this client that are due at this time. Returns an empty list if the client is not
+    /// connected.
     pub fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
         self.attend(client, now);
         let Some(client) = self.clients.get_mut(&client) else { return Vec::new() };
@@ -299,7 +305,8 @@ impl Controller {
         }
     }
 
-    /// Carries out a line of the client `number` and returns the answer; `None` if the line has no answer.
+    /// Carries out a line of the client `number`, and returns the answer with its line end. Returns `None` if the line
+    /// has no answer, for example `quit` or an unknown command.
     fn obey(&mut self, number: u64, line: &str) -> Option<String> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default().to_ascii_lowercase();
@@ -358,8 +365,10 @@ impl Controller {
         })
     }
 
-    /// Carries out a `set` of the client `number`: `what` is the word after `set`, `rest` the text after that. Returns
-    /// true if it is acknowledged, false if it is refused, and `None` if the client has no control.
+    /// Carries out a `set` command of the client `number`. `what` is the word after `set`, and `rest` is the text after
+    /// that word. Returns `Some(true)` if the command is acknowledged. An acknowledged command can still fail; its
+    /// error is then queued. Returns `Some(false)` if the command is refused. Returns `None` if the client does not
+    /// have control or is not connected.
     fn set(&mut self, number: u64, what: &str, rest: &str) -> Option<bool> {
         let client = self.clients.get_mut(&number)?;
         match (what, rest.to_ascii_lowercase().as_str()) {
@@ -474,7 +483,8 @@ impl Controller {
         }
     }
 
-    /// Advances the simulation to the time `now`: the machine moves along its program.
+    /// Advances the simulation to the time `now`. If a program runs, moves the wheel along the program for the
+    /// simulated time since the previous call.
     pub fn advance_time(&mut self, now: Duration) {
         let mut left_s = now.saturating_sub(self.last_time).as_secs_f64() * self.speed;
         self.last_time = now;

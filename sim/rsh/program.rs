@@ -92,13 +92,15 @@ impl Program {
         (self.plane, self.centres_are_absolute) = ([0, 1, 2], false);
     }
 
-    /// Lets the reading of lines continue after a line that waits until all queued steps are carried out.
+    /// Allows [`Self::read_on`] to read further lines. This is necessary after a line that waits for the motion (M66);
+    /// the caller calls this function when all steps before that line have been carried out.
     pub(super) fn go_on(&mut self) {
         self.waits = false;
     }
 
-    /// Reads lines ahead of the motion and adds their steps to `steps`, until the queue is full, the program ends, or a
-    /// line waits for the motion. Returns the actions on the log file, which happen when a line is read.
+    /// Reads lines ahead of the motion and appends their steps to `steps`. Stops when the queue `steps` is full (200
+    /// steps or more), when the program ends, or at a line that waits for the motion. Returns the actions on the log
+    /// file that these lines request, in order. The caller must carry out these actions at once, before the steps.
     pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<LogAction> {
         let mut said = Vec::new();
         while !self.waits && steps.len() < MAX_QUEUED_STEPS && self.next < self.lines.len() {
@@ -169,11 +171,12 @@ impl Program {
         }
     }
 
-    /// Returns the move to `to_mm`: straight, or an arc about `centre` if an arc mode is active. A missing coordinate
-    /// of the centre is 0.
+    /// Returns the move from the present position to `to_mm`, in mm. The move is an arc if an arc mode (G2 or G3) is
+    /// active, otherwise it is straight. `centre` contains the words I, J and K of the line, in mm, which give the
+    /// centre of the arc; a missing word counts as 0.
     ///
     /// # Errors
-    /// There is no such arc.
+    /// Returns the reason if no arc about this centre joins the two positions.
     fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Waypoint, String> {
         let turn = match self.motion {
             motion @ (2 | 3) => {
@@ -188,8 +191,8 @@ impl Program {
     }
 }
 
-/// Returns the action on the log file that the comment `text` requests, for example `(LOG,text)`; `None` for any other
-/// text.
+/// Returns the action on the log file that a line of the program requests. `text` is the line. It requests an action
+/// only if it is a comment such as `(LOG,text)` or `(LOGCLOSE)`. Returns `None` for any other line.
 pub(super) fn says(text: &str) -> Option<LogAction> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));

@@ -112,11 +112,12 @@ impl ServingDme {
         Self::tcp_after(addr, server, None).await
     }
 
-    /// Serves a machine over TCP. If `grinder` is given, each command first waits until the part is ground along the
-    /// whole path that the grinder's controller has executed.
+    /// Serves the I++ DME server `server` over TCP at the address `addr`. `grinder` follows the path that an external
+    /// controller of the grinder executes. If `grinder` is given, each command except an abort first waits until the
+    /// part is ground along the whole executed path.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// Returns an error if the address cannot be bound.
     pub async fn tcp_after(
         addr: impl ToSocketAddrs,
         server: Server,
@@ -141,8 +142,8 @@ impl ServingDme {
     }
 }
 
-/// Serves one client after another. If `grinder` is given, each command first waits until the part is ground along the
-/// whole path that the grinder's controller has executed.
+/// Accepts clients on `listener` and serves one after another. If `grinder` is given, each command except an abort
+/// first waits until the part is ground along the whole path that the grinder's controller has executed.
 async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<ExecutedPath>) {
     loop {
         match listener.accept().await {
@@ -156,8 +157,9 @@ async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<Exec
     }
 }
 
-/// Sends lines to the client together, but a line marked `split` byte by byte. Returns true if the last line requires
-/// that the connection is closed.
+/// Sends the lines `outgoing` to the client, in order. Sends a line marked `split` byte by byte, and the lines between
+/// such lines in one write. Stops after a line marked `closes` and returns true; the caller must then close the
+/// connection. Returns false if no line is marked `closes`.
 async fn send(stream: &mut (impl AsyncWrite + Unpin), outgoing: &[Outgoing]) -> io::Result<bool> {
     let mut together = Vec::new();
     for line in outgoing {

@@ -65,11 +65,12 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl ExecutedPath {
-    /// Starts a helper program that reports the path that the controller executes, and moves the wheel along that path.
-    /// Restarts the program whenever it ends.
+    /// Starts the helper program `command` and moves `wheel` in a background thread. The program reports the path that
+    /// the external controller executes, and the wheel follows this path. Restarts the program whenever it ends, until
+    /// the returned value is dropped.
     ///
     /// # Errors
-    /// The first start of the program fails.
+    /// Returns an error if the program cannot be started the first time.
     pub fn follow(command: Command, wheel: Wheel) -> io::Result<Self> {
         let mut command = command;
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
@@ -83,8 +84,10 @@ impl ExecutedPath {
         Ok(Self { shared, last_question: Mutex::new((rand::random(), None)) })
     }
 
-    /// Waits until the wheel has been moved along the whole path that the controller has executed before this call.
-    /// Returns at once if no helper program runs, because then no path is reported. Also returns after a time limit.
+    /// Waits until the wheel has followed the whole path that the controller executed before this call.
+    ///
+    /// Returns at once in two cases: no helper program runs, so no path is reported, or another call began less than
+    /// 0.5 s before. Also returns if the helper program ends, or if it does not answer within 30 s.
     pub async fn caught_up(&self) {
         let question = {
             let (question, when) = &mut *locked(&self.last_question);
@@ -161,8 +164,8 @@ fn pause_after(silent: u32) -> Duration {
     (RESTART_DELAY * 2u32.pow(silent.min(8))).min(MAX_RESTART_DELAY)
 }
 
-/// Moves the wheel along the positions in `lines`, one for each servo cycle, until the lines end. Returns true if at
-/// least one valid line arrived.
+/// Moves the wheel to the positions in `lines`, with one line for each servo cycle, until the lines end. Marks the path
+/// as lost if a line is invalid or a cycle is missing. Returns true if at least one line was valid.
 fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {

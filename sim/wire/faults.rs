@@ -146,8 +146,8 @@ impl FaultPlan {
         Self { rules: Vec::new(), rng: crate::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
     }
 
-    /// Creates a plan in which each request has a fault with the probability `share`. The fault is chosen at random
-    /// from `faults`.
+    /// Creates a plan in which each request has a fault with the probability `share`, from 0 to 1. Each fault is drawn
+    /// at random from `faults`. `seed` initializes the random choices. If `faults` is empty, the plan has no faults.
     pub fn seeded(seed: u64, share: f64, faults: Vec<Fault>) -> Self {
         let mut plan = Self::new(seed);
         plan.rules.push(Rule { when: When::Chance(share), faults, skip: 0, left: u64::MAX });
@@ -164,8 +164,8 @@ impl FaultPlan {
         self.times(1, u64::MAX, when, fault)
     }
 
-    /// Adds a fault for `count` of the requests that `when` selects. The first of them is number `first` of the
-    /// selected requests, counted from 1.
+    /// Adds a fault for consecutive requests among those that `when` selects. The fault begins at the selected request
+    /// number `first`, counted from 1, and happens `count` times.
     pub fn times(mut self, first: u64, count: u64, when: When, fault: Fault) -> Self {
         self.rules.push(Rule { when, faults: vec![fault], skip: first.saturating_sub(1), left: count });
         self
@@ -194,8 +194,8 @@ impl SharedFaultPlan {
         Self::default()
     }
 
-    /// Replaces the plan of faults. The count of requests restarts, and the stored requests that were to be carried out
-    /// again are dropped.
+    /// Replaces the fault plan of the wire by `plan`. The count of requests starts again. The list of the faults that
+    /// have happened, and the requests that were stored for a second execution, are lost.
     pub fn set(&self, plan: FaultPlan) {
         *self.lock() = plan;
     }
@@ -233,13 +233,14 @@ impl SharedFaultPlan {
         met
     }
 
-    /// Stores a request, given as `unit` and `pdu`, that is carried out again before the request number `before`.
+    /// Stores a request that will be carried out a second time. `before` is the number of the later request before
+    /// which this happens. `unit` is the unit id of the stored request, and `pdu` is its protocol data unit.
     pub(crate) fn defer(&self, before: u64, unit: u8, pdu: &[u8]) {
         self.lock().again.push((before, unit, pdu.to_vec()));
     }
 
-    /// Removes and returns the stored requests, each as unit and PDU, that are carried out again before the request
-    /// number `number`.
+    /// Removes and returns the stored requests that must be carried out a second time before the request with the
+    /// number `number`. Each entry is the unit id and the protocol data unit (PDU) of a stored request.
     pub(crate) fn take_due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
         let mut plan = self.lock();
         let (due, later) = plan.again.drain(..).partition(|(before, ..)| *before <= number);

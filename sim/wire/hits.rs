@@ -35,10 +35,10 @@ pub struct ServingHits {
 }
 
 impl ServingHits {
-    /// Creates a printer of hit lines on a new pseudo-terminal.
+    /// Creates a printer of hits (one text line for each touch of the probe) on a new pseudo-terminal.
     ///
     /// # Errors
-    /// No pseudo-terminal is available.
+    /// Returns an error if no pseudo-terminal is available.
     pub fn serial() -> io::Result<Self> {
         let pty = Pty::open()?;
         let path = Some(pty.path().to_owned());
@@ -51,10 +51,11 @@ impl ServingHits {
         Ok(Self { path, local_addr: None, lines, tasks })
     }
 
-    /// Creates a printer of hit lines on a TCP server, for one client after another. Port 0 takes any free port.
+    /// Creates a printer of hits (one text line for each touch of the probe) on a TCP server at the address `addr`.
+    /// Serves one client after another. With port 0, the operating system selects a free port.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// Returns an error if the address cannot be bound.
     pub async fn tcp(addr: impl ToSocketAddrs) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
         let local_addr = Some(listener.local_addr()?);
@@ -81,7 +82,9 @@ impl ServingHits {
         self.local_addr
     }
 
-    /// Sends bytes, and waits until they are on the line. Returns at once if there is no client any more.
+    /// Sends `bytes` to the client, and waits until they are written. On TCP, waits for the next client if none is
+    /// connected. Returns without sending if the pseudo-terminal is already closed. Also returns if the connection
+    /// fails during the write.
     pub async fn send(&self, bytes: &[u8]) {
         let (written, are_written) = oneshot::channel();
         if self.lines.send(LineAction::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
@@ -94,8 +97,9 @@ impl ServingHits {
         let _ = self.lines.send(LineAction::HangUp).await;
     }
 
-    /// Runs a part program that measures each list of targets that appears as `plan.csv` in a folder, and prints its
-    /// touches. `speed` is the number of simulated seconds in a real second.
+    /// Starts the part program `program` in a background task. The program measures the list of targets in the file
+    /// `plan.csv` of `folder`, and prints its touches. It then waits for a new list in the same file. `speed` is the
+    /// number of simulated seconds in one real second.
     pub fn run(&mut self, mut program: PartProgram, folder: &Path, speed: f64) {
         let (list, lines) = (folder.join("plan.csv"), self.lines.clone());
         self.tasks.spawn(async move {
@@ -123,10 +127,11 @@ impl ServingHits {
     }
 }
 
-/// Prints the queued bytes to `stream` until the other side closes it or a hang-up is queued.
+/// Writes the queued bytes of `inbox` to `stream`, and discards all input. Returns when the other side closes the
+/// stream, or when a hang-up is queued.
 ///
 /// # Errors
-/// The stream cannot be read or written any more.
+/// Returns an error if the stream can no longer be read or written.
 async fn print(
     mut stream: impl AsyncRead + AsyncWrite + Unpin,
     inbox: &mut mpsc::Receiver<LineAction>,

@@ -65,7 +65,7 @@ impl From<SimulatedMachine> for SharedMachine {
 }
 
 impl SharedMachine {
-    /// Calls a function with exclusive access to the machine.
+    /// Calls the function `look` with exclusive access to the machine, and returns the result of `look`.
     pub fn with<T>(&self, look: impl FnOnce(&mut SimulatedMachine) -> T) -> T {
         look(&mut self.lock().machine)
     }
@@ -164,7 +164,9 @@ impl Delivery {
     }
 }
 
-/// Carries out a Modbus request with the faults that are due, and returns the answer as the wire delivers it.
+/// Carries out a Modbus request, and returns the answer as the wire delivers it, with its faults. `units` are the
+/// machines on the wire. `faults` is the fault plan. `framing` is the format of the answer (TCP or RTU). `unit` is the
+/// unit id and `pdu` the protocol data unit of the request.
 fn answer(units: &Units, faults: &SharedFaultPlan, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
     let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
     let mut request = describe(machine, unit, pdu);
@@ -262,8 +264,9 @@ fn refusal(function: u8, exception: Exception) -> Vec<u8> {
     vec![function | 0x80, exception as u8]
 }
 
-/// Carries out a Modbus request: function 3 (read), 6 or 16 (write). Returns the protocol data unit of the answer,
-/// which is an exception for any other function.
+/// Carries out the Modbus request `pdu` (protocol data unit) on a machine. The functions 3 (read), 6 and 16 (write) are
+/// known. Returns the protocol data unit of the answer. The answer is an exception if the function is unknown, if the
+/// request is malformed, or if the machine refuses it.
 fn carry_out(machine: &SharedMachine, pdu: &[u8]) -> Vec<u8> {
     let word = |at: usize| u16::from_be_bytes([pdu[at], pdu[at + 1]]);
     let done = match (pdu[0], pdu.len()) {
@@ -330,11 +333,12 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Serves machines over Modbus RTU on a new pseudo-terminal. A client opens its path like the path of a serial
-    /// port.
+    /// Serves machines over Modbus RTU on a new pseudo-terminal. `units` contains each machine with its unit id, `line`
+    /// is the speed of the simulated serial line, and `faults` is the fault plan. [`Self::path`] returns the path of
+    /// the pseudo-terminal; a client opens this path like a serial port.
     ///
     /// # Errors
-    /// No pseudo-terminal is available.
+    /// Returns an error if no pseudo-terminal is available.
     pub fn rtu<M: Into<SharedMachine>>(
         units: Vec<(u8, M)>,
         line: rtu::Line,
@@ -347,11 +351,12 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Creates a symbolic link at the path `at` to the serial port, so that a client's configuration can have a fixed
-    /// path. The link exists while the port is served.
+    /// Creates a symbolic link at the path `at` to the served serial port. The configuration of a client can then
+    /// contain a fixed path. Replaces an existing link at `at`. The link is removed when this value is dropped.
     ///
     /// # Errors
-    /// Something that is not a link exists there, the link cannot be made, or this is not a serial port.
+    /// Returns an error if `at` is an existing file that is not a link, if the link cannot be created, or if the
+    /// machines are served over TCP.
     pub fn link(&mut self, at: impl AsRef<Path>) -> io::Result<()> {
         let at = at.as_ref();
         let port = self.path.clone().ok_or(io::ErrorKind::Unsupported)?;
@@ -407,7 +412,8 @@ impl Serving {
         self.local_addr
     }
 
-    /// Returns the path of the serial port, or `None` for TCP. A client can open it if it is a pseudo-terminal.
+    /// Returns the path of the served serial port, or `None` for TCP. If [`Self::link`] created a link, returns the
+    /// path of the link. A client can open this path only if the port is a pseudo-terminal.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }

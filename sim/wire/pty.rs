@@ -54,7 +54,8 @@ impl Pty {
     }
 }
 
-/// Creates a symbolic link at the path `at` to a pseudo-terminal.
+/// Creates a symbolic link at the path `at`. The link points to the pseudo-terminal at the path `terminal`. Returns an
+/// error if the link cannot be created, for example because `at` exists already.
 pub(super) fn link(terminal: &Path, at: &Path) -> io::Result<()> {
     std::os::unix::fs::symlink(terminal, at)
 }

@@ -34,19 +34,21 @@ impl From<Controller> for SharedController {
 }
 
 impl SharedController {
-    /// Calls a function with exclusive access to the controller.
+    /// Calls `look` with exclusive access to the simulated controller, and returns the result of `look`. Then wakes the
+    /// connections of all clients, because the controller can have new output for them.
     pub fn with<T>(&self, look: impl FnOnce(&mut Controller) -> T) -> T {
         let looked = look(&mut self.locked());
         self.0.changed.send_modify(|times| *times += 1);
         looked
     }
 
-    /// Advances the simulated machine to the present time.
+    /// Advances the simulated machine to the present time, given by [`SharedController::now`]. The machine moves along
+    /// its running program.
     pub fn advance_time(&self) {
         self.locked().advance_time(self.now());
     }
 
-    /// Returns the time since the controller was created.
+    /// Returns the real time since this `SharedController` was created. This is the clock of the simulation.
     pub fn now(&self) -> Duration {
         self.0.began.elapsed()
     }
@@ -55,7 +57,9 @@ impl SharedController {
         self.0.controller.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves a client until either side closes the connection. A running program continues.
+    /// Serves one client that sends text lines (commands of linuxcncrsh) on `stream`. Returns when the client or the
+    /// controller closes the connection, when `stream` fails, or after a line of more than 4096 bytes. A running
+    /// program of the controller continues afterwards.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
         let client = {
             let mut clients = self.0.clients.lock().unwrap_or_else(PoisonError::into_inner);

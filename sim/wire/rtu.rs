@@ -48,10 +48,12 @@ impl Line {
     }
 }
 
-/// Serves machines on a serial line. Runs until its future is dropped or the line fails.
+/// Answers Modbus RTU requests that arrive at the serial port `port`. `units` are the simulated machines with their
+/// unit ids. `line` gives the speed of the line. `faults` are the simulated faults. Requests to unit 0 (broadcast) get
+/// no answer. Runs until its future is dropped or the port fails.
 ///
 /// # Errors
-/// The line cannot be read or written any more.
+/// The port cannot be read or written any more.
 pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: SharedFaultPlan) -> io::Result<()>
 where
     P: AsyncRead + AsyncWrite + Unpin,
@@ -74,8 +76,11 @@ where
     }
 }
 
-/// Returns the next frame with a correct CRC. `heard` holds the bytes that were received and not used yet. After a
-/// wrong CRC, all bytes up to the next silence are dropped.
+/// Returns the next Modbus RTU frame with a correct CRC from `port`. `heard` is a buffer: it holds the bytes that were
+/// received and not used yet. After a wrong CRC, all bytes up to the next silence of 50 ms are dropped. A frame with an
+/// unknown function ends at such a silence.
+///
+/// Returns an error if `port` is closed or cannot be read.
 async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> io::Result<Vec<u8>> {
     let mut broken = false;
     loop {
@@ -113,8 +118,8 @@ async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> 
     }
 }
 
-/// Returns the length in bytes of the frame at the beginning of `heard`. Returns `None` if its function is unknown or
-/// too few bytes have arrived.
+/// Returns the length in bytes of the Modbus RTU request at the beginning of `heard`, with its CRC. Returns `None` if
+/// the Modbus function is unknown, or if too few bytes have arrived to know the length.
 fn length(heard: &[u8]) -> Option<usize> {
     match heard.get(1)? {
         1..=6 | 8 => Some(8),

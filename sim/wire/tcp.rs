@@ -10,10 +10,12 @@ use tokio::task::JoinSet;
 use super::faults::SharedFaultPlan;
 use super::{After, Framing, Units, answer};
 
-/// Serves machines to any number of clients. Runs until its future is dropped, and then closes every connection.
+/// Answers Modbus TCP requests of any number of clients that connect to `listener`. `units` are the simulated machines
+/// with their unit ids. `faults` are the simulated faults. Runs until its future is dropped. All connections are then
+/// closed.
 ///
 /// # Errors
-/// Never; the type is the same as that of the serial line.
+/// Never. The return type is the same as that of `serve_rtu`, the function for a serial line.
 pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) -> io::Result<()> {
     let mut clients = JoinSet::new();
     loop {
@@ -35,10 +37,13 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultP
     }
 }
 
-/// Answers the requests of one client until it disconnects or sends something that is not Modbus.
+/// Answers the Modbus TCP requests of one client on `stream`. `units` are the simulated machines with their unit ids.
+/// `faults` are the simulated faults.
+///
+/// Returns `Ok` after a header that is not Modbus TCP, or after a simulated fault has ended the conversation.
 ///
 /// # Errors
-/// The stream cannot be read or written any more.
+/// The stream cannot be read or written any more, for example because the client has disconnected.
 pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &SharedFaultPlan) -> io::Result<()>
 where
     S: AsyncRead + AsyncWrite + Unpin,

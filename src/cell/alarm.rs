@@ -396,8 +396,8 @@ catalogue! {
 }
 
 impl AlarmId {
-    /// Returns the general alarm of this id, as the catalogue of alarms lists it. Its text names no machine and no
-    /// value of a certain event.
+    /// Returns an alarm of this kind with its general text, for the list of all alarms. The text contains no machine
+    /// and no value, because no event has occurred.
     pub fn generic_alarm(self) -> Alarm {
         Alarm::new(self, "")
     }

@@ -106,7 +106,7 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Returns a cell that waits for `Event::Start`.
+    /// Returns a cell in the state `Idle` that follows `plan`. It waits for `Event::Start`.
     pub fn new(plan: CellPlan) -> Self {
         Self {
             plan: Arc::new(plan),
@@ -140,13 +140,13 @@ impl Cell {
         }
     }
 
-    /// Returns the state.
+    /// Returns the present state of the cell: a PackML state, with the phase of the cycle if the state has one.
     pub fn state(&self) -> State {
         self.state
     }
 
-    /// Returns a description of the state for people. If both machines should be at rest in this state, the description
-    /// names each machine that has not confirmed this.
+    /// Returns a description of the state for people. The description also names each machine that should be at rest in
+    /// this state but has not confirmed it.
     pub fn in_words(&self) -> String {
         match (self.state, &self.unconfirmed()[..]) {
             (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it is at rest", self.state),
@@ -155,7 +155,12 @@ impl Cell {
         }
     }
 
-    /// Returns the machines that should be at rest in this state but have not confirmed it.
+    /// Returns the machines that should be at rest in the present state but have not confirmed it:
+    ///
+    /// - In the state `Aborted`: each machine that was connected in this run and has not confirmed ABORT.
+    /// - In the states `Held` and `Suspended`: the machine whose job has an unknown state.
+    ///
+    /// The list is empty in all other cases.
     pub fn unconfirmed(&self) -> Vec<Device> {
         match self.state {
             State::Aborted => self.unconfirmed_aborts(),
@@ -171,24 +176,29 @@ impl Cell {
             .collect()
     }
 
-    /// Returns the number of the cycle; 0 before the first one.
+    /// Returns the number of the present cycle (one pass with its measurement). Returns 0 before the first cycle.
     pub fn cycle(&self) -> u32 {
         self.cycle
     }
 
-    /// Returns the plan.
+    /// Returns the plan of the run: its first step, tolerance, limits and deadlines.
     pub fn plan(&self) -> &CellPlan {
         &self.plan
     }
 
-    /// Returns the figures of the last measurement that was registered.
+    /// Returns the figures (such as PV and RMS) of the last registered measurement. Returns `None` before the first
+    /// one.
     pub fn figures(&self) -> Option<&Figures> {
         self.figures.as_deref().or(self.previous.as_deref())
     }
 
-    /// Returns true if a command that has waited for its record must still be executed. A command that causes motion is
-    /// executed only if the cell is still in the state that issued the command. While the run ends, only commands that
-    /// belong to the ending are executed.
+    /// Returns true if `command` must still be executed after it was written to the journal. The state of the cell may
+    /// have changed in the meantime. There are three rules:
+    ///
+    /// - START and RESUME cause motion. They are executed only if the cell is still in the state that issued them.
+    /// - While the run is ending or has ended, only commands that belong to the ending, and announcements of a
+    ///   judgement, are executed.
+    /// - Every other command is executed.
     pub fn still_requires(&self, command: &Command) -> bool {
         let at = |device, step| self.state.phase() == Some(Phase::from_job(device, step));
         match (self.state, command) {
@@ -210,12 +220,13 @@ impl Cell {
         }
     }
 
-    /// Returns the active alarms.
+    /// Returns the alarms that were raised and not withdrawn yet, in the order of [`AlarmId`].
     pub fn alarms(&self) -> impl Iterator<Item = &Alarm> + '_ {
         self.active_alarms.values().map(AsRef::as_ref)
     }
 
-    /// Returns the machine for which a person is being asked whether it is clear of the part.
+    /// Returns the machine about which the cell is asking a person: "is this machine clear of the part?". Returns
+    /// `None` if the cell is not asking this.
     pub fn clear_confirmation_device(&self) -> Option<Device> {
         self.state
             .phase()
@@ -223,7 +234,8 @@ impl Cell {
             .and_then(super::transitions::device_awaited_clear)
     }
 
-    /// Returns the time at which `Event::Deadline` is due, as time since the run began.
+    /// Returns the time at which the caller must send `Event::Deadline`, measured from the beginning of the run.
+    /// Returns `None` if the present state has no time limit.
     pub fn next_deadline(&self) -> Option<Duration> {
         self.deadline
     }

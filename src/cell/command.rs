@@ -128,12 +128,14 @@ pub(super) fn format_label((name, device): (&'static str, Option<Device>)) -> St
 }
 
 impl Command {
-    /// Returns the name of the command as it is recorded, with its machine.
+    /// Returns the name of the command as it is recorded. The machine follows the name if the command has one, for
+    /// example "prepare grinder".
     pub fn name(&self) -> String {
         format_label(self.label())
     }
 
-    /// Returns the name of the kind of command, and its machine if it has one. [`Self::name`] formats both.
+    /// Returns the name of the kind of command, such as "prepare", and the machine that the command contains. The
+    /// machine is `None` if the command contains none. [`Self::name`] joins name and machine into one text.
     pub(super) fn label(&self) -> (&'static str, Option<Device>) {
         let (name, device) = match self {
             Self::Connect { device } => ("connect", Some(device)),

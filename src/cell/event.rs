@@ -645,8 +645,11 @@ impl Event {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })
     }
 
-    /// Returns who or what caused the event, for the record: a name and a place. For a person, these are the name and
-    /// the station of the [`Actor`]; for a machine, its name and "wire"; otherwise "cell" and "regrind".
+    /// Returns who or what caused the event, as a pair of texts for the record:
+    ///
+    /// - An event of a person: the name and the station of the [`Actor`].
+    /// - An event of a machine: the name of the machine, and "wire".
+    /// - Any other event: "cell" and "regrind".
     pub fn origin(&self) -> (String, String) {
         match (self.actor(), self.device()) {
             (Some(Actor { name, station }), _) => (name.clone(), station.clone()),

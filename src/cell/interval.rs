@@ -47,7 +47,8 @@ impl RecordedInterval {
         3.090_232_306_167_813_5,
     ];
 
-    /// Returns the interval of a normally distributed figure from its median and its expanded uncertainty (k = 2).
+    /// Returns the interval from `median_mm - expanded_mm` to `median_mm + expanded_mm`, for a normally distributed
+    /// figure. `expanded_mm` is the expanded uncertainty (k = 2) of the figure.
     pub fn from_expanded(median_mm: f64, expanded_mm: f64) -> Self {
         Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm, quantiles_mm: None }
     }
@@ -74,8 +75,9 @@ impl RecordedInterval {
         normal_probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
     }
 
-    /// Returns the quantile of the figure at a probability, clamped to the outermost recorded quantiles. Returns NaN
-    /// for a probability of NaN.
+    /// Returns the quantile of the figure at `probability` (0 to 1), in mm. A probability below 0.001 counts as 0.001,
+    /// and one above 0.999 as 0.999, because no quantiles beyond these are recorded. Returns NaN if `probability` is
+    /// NaN.
     pub fn quantile_mm(&self, probability: f64) -> f64 {
         // `p` and `1 - (1 - p)` differ in their last digits.
         const SAME: f64 = 1e-9;
@@ -92,10 +94,11 @@ impl RecordedInterval {
         quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
     }
 
-    /// Returns the quantiles of the figure in mm, one for each probability that an interval records. If none were
-    /// recorded, returns quantiles of two half normal distributions about the median: below the median, the distance
-    /// from the median to the lower end of the interval counts as 1.96 standard deviations, and above it, the distance
-    /// to the upper end.
+    /// Returns the quantiles of the figure in mm, one for each of [`Self::PROBABILITIES`].
+    ///
+    /// If no quantiles were recorded, they are computed from two half normal distributions that meet at the median.
+    /// Below the median, the standard deviation is `(median_mm - low_mm) / 1.96`. Above the median, it is `(high_mm -
+    /// median_mm) / 1.96`.
     fn quantiles(&self) -> [f64; Self::COUNT] {
         let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
         let of_normal = |k: usize| {
@@ -118,7 +121,8 @@ impl RecordedInterval {
     }
 }
 
-/// Returns the standard normal distribution function at a deviate (Abramowitz and Stegun 26.2.17, accurate to 1e-7).
+/// Returns the probability that a standard normal variable is at most `deviate` (Abramowitz and Stegun 26.2.17,
+/// accurate to 1e-7).
 fn normal_probability(deviate: f64) -> f64 {
     const FACTORS: [f64; 5] = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
     let t = 1.0 / (1.0 + 0.231_641_9 * deviate.abs());
@@ -127,7 +131,8 @@ fn normal_probability(deviate: f64) -> f64 {
     if deviate < 0.0 { above } else { 1.0 - above }
 }
 
-/// Returns the standard normal quantile of a probability from 0.001 to 0.999, by bisection.
+/// Returns the quantile of the standard normal distribution at `probability`, which must be from 0.001 to 0.999. The
+/// quantile is found by bisection of the distribution function.
 fn normal_deviate(probability: f64) -> f64 {
     let (mut low, mut high) = (-4.0, 4.0);
     for _ in 0..60 {

@@ -15,7 +15,9 @@ pub(super) struct ReasonedVerdict {
 }
 
 impl Figures {
-    /// Returns true if all figures are finite and not negative, and all intervals of the form are valid.
+    /// Returns true if the figures can be judged: every checked figure is finite and not negative, and every credible
+    /// interval in `form` is valid. An interval is valid if its values are finite and in ascending order and its median
+    /// is not negative.
     pub(super) fn are_valid(&self) -> bool {
         let all = [
             self.pv_mm,
@@ -35,8 +37,11 @@ impl Figures {
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
-    /// Returns the intervals of the two judged figures: peak to valley (PV) and root mean square (RMS). The flag is
-    /// true if the first interval is of the PV 99.8 %, and false if it is of the PV of all points.
+    /// Returns the credible intervals of the peak to valley (PV) and of the root mean square (RMS), in this order.
+    /// `pv_of` selects the PV: PV 99.8 % or the PV of all points.
+    ///
+    /// The flag is true if the first interval is the PV 99.8 %. It is false if the first interval is the PV of all
+    /// points, which is also used if no PV 99.8 % was computed.
     fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
             Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
@@ -99,8 +104,8 @@ pub struct ComparedFigure {
 }
 
 impl ComparedFigure {
-    /// Returns a text for people with the probability that the figure is within its limit. Returns `None` if the figure
-    /// has no limit.
+    /// Returns a text for people with the probability that the figure is within its limit, for example "P(in tolerance)
+    /// = 84.1 %". Returns `None` if the figure has no limit.
     pub fn probability_in_words(&self) -> Option<String> {
         let [least, most] =
             [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
@@ -118,8 +123,9 @@ fn format_percent(probability: f64) -> String {
 }
 
 impl Tolerance {
-    /// Compares the two judged figures with their limits. The first is the peak to valley that the tolerance selects
-    /// (of all points or PV 99.8 %), the second is the RMS.
+    /// Compares the peak to valley (PV) and the root mean square (RMS) in `figures` with their limits. Returns one
+    /// result for the PV and one for the RMS, in this order. The field `pv_of` of the tolerance selects the PV: PV 99.8
+    /// % or the PV of all points.
     pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
         let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_of);
         let compared = |name, of: RecordedInterval, limit_mm: f64| {
@@ -150,11 +156,12 @@ impl Tolerance {
         pv.max(rms) == Conformity::Within && self.exceeded_with_outliers(figures).is_some()
     }
 
-    /// Returns a text that names the outliers and each exceeded limit, if the part exceeds a limit when the outliers
-    /// are included. Returns `None` if it does not, or if there are no outliers.
+    /// Returns a text for people if the part exceeds a limit when the outliers are included. The text names the
+    /// outliers and each exceeded limit. Returns `None` if there are no outliers, or if no limit is exceeded with them.
     ///
-    /// With the outliers, a judged figure increases as much as the figure of the measured points does: the PV by the
-    /// same difference in mm, the RMS by the same difference of the squares.
+    /// The PV with outliers is estimated as the judged PV plus the increase, in mm, that the outliers cause in the PV
+    /// of the measured points. The RMS is estimated in the same way, with squares: the outliers increase the square of
+    /// the judged RMS by as much as the square of the RMS of the measured points. An increase is never negative.
     fn exceeded_with_outliers(&self, now: &Figures) -> Option<String> {
         let left_out = now.left_out.as_ref()?;
         let [pv, rms] = self.compare(now);
@@ -171,9 +178,20 @@ impl Tolerance {
     }
 }
 
-/// Judges the figures `now` of a cycle after `passes` passes; `before` are those of the last judged cycle. The first
-/// rule that applies gives the verdict: acceptance, removal budget, number of passes, wrong response, divergence,
-/// stall, expected improvement by another pass.
+/// Judges the measurement of a cycle and returns the verdict with its reason. `now` are the figures of this cycle.
+/// `before` are the figures of the last judged cycle, or `None` if there is none. `passes` is the number of passes that
+/// were begun.
+///
+/// The rules are checked in this order, and the first rule that applies gives the verdict:
+///
+/// - The part is in tolerance. If it exceeds a limit with the outliers included, the verdict is `LeftOut`, otherwise
+///   `Accept`.
+/// - The removal budget leaves no room for another pass.
+/// - The maximum number of passes is reached.
+/// - The part responded wrongly to the last map.
+/// - A figure is worse than in the last judged cycle.
+/// - The figures have not improved enough since the last judged cycle.
+/// - Otherwise, the expected improvement by another pass decides.
 pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> ReasonedVerdict {
     let tell = |verdict, reason| ReasonedVerdict { verdict, reason };
     let figures = figures_in_words(plan, now);
@@ -221,8 +239,15 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     judge_next_pass(plan, before, now, conformity)
 }
 
-/// Returns the verdict on another pass: continue if its expected improvement exceeds the stall limits of the plan, or
-/// if it cannot be predicted.
+/// Returns the verdict on another pass, from the RMS that is expected after this pass. `now` are the figures of the
+/// present cycle. `conformity` is the conformity of the part.
+///
+/// The verdict is `Continue` if the expected improvement of the RMS exceeds the stall limits of `plan` (`stall_mm`, and
+/// the share `stall_share` of the RMS). It is also `Continue` if there is no forecast, or if no cycle was judged before
+/// (`before` is `None`). In all other cases the verdict is `Undecided` if the conformity is undecided, or else
+/// `Stalled`.
+///
+/// No improvement is expected if the RMS exceeds its known lower bound by no more than its expanded uncertainty.
 fn judge_next_pass(
     plan: &CellPlan,
     before: Option<&Figures>,
@@ -267,8 +292,9 @@ fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
         && still(rms_before, rms.median_mm, rms.expanded_mm.max(plan.stall_mm))
 }
 
-/// Returns the larger of the two ratios of a judged figure to its limit; a part is better the smaller this number is.
-/// Returns the RMS in mm if neither figure has a limit.
+/// Returns a number that ranks cycles: the smaller it is, the nearer is the part to acceptance. It is the larger of PV
+/// divided by its limit and RMS divided by its limit. A figure without a limit is ignored. Returns the RMS in mm if
+/// neither figure has a limit.
 pub(super) fn distance_to_acceptance(plan: &CellPlan, figures: &Figures) -> f64 {
     let compared = plan.tolerance.compare(figures);
     let shares = compared.iter().filter(|of| of.limit_mm.is_finite() && of.limit_mm > 0.0);
@@ -286,7 +312,8 @@ pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> S
     )
 }
 
-/// Describes a wrong response. Returns `None` if the response is not wrong.
+/// Returns a text for people that describes a wrong response of the part to the map. Returns `None` if the response is
+/// as expected or unclear.
 fn wrong_response(response: PartResponse) -> Option<&'static str> {
     match response {
         PartResponse::Expected | PartResponse::Unclear => None,
@@ -322,7 +349,7 @@ fn figures_in_words(plan: &CellPlan, now: &Figures) -> String {
     format!("{pv}; {rms}; {counts}")
 }
 
-/// Formats a length in micrometres, for people.
+/// Formats the length `mm`, given in millimetres, in µm with two decimals, for example "3.31 µm".
 pub(super) fn format_um(mm: f64) -> String {
     format!("{:.2} µm", 1e3 * mm)
 }

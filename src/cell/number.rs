@@ -49,7 +49,8 @@ pub(super) mod optional {
     }
 }
 
-/// Reads a limit. `null` means an infinite limit, because JSON has no infinity.
+/// Deserializes a limit. The value `null` becomes an infinite limit (no limit), because JSON has no infinity. Returns
+/// an error if the value is not a number in a known form.
 pub(super) fn limit<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Option::<RecordedNumber>::deserialize(from)?.map_or(Ok(f64::INFINITY), RecordedNumber::into_value)
 }

@@ -19,7 +19,7 @@ impl Device {
     /// Both machines, in the order in which they get commands.
     pub const BOTH: [Self; 2] = [Self::Cmm, Self::Grinder];
 
-    /// Returns the name of the machine as it is recorded.
+    /// Returns the name of the machine as it is recorded: "cmm" or "grinder".
     pub fn name(self) -> &'static str {
         match self {
             Self::Cmm => "cmm",
@@ -109,15 +109,16 @@ impl Phase {
         }
     }
 
-    /// Returns the machine that may be moving in this phase.
+    /// Returns the machine that may be moving in this phase. This is the machine of the job at the steps Start, Run and
+    /// Reconcile. Returns `None` in any other phase.
     pub fn moving_device(self) -> Option<Device> {
         self.job()
             .filter(|(_, step)| matches!(step, JobStep::Start | JobStep::Run | JobStep::Reconcile))
             .map(|(device, _)| device)
     }
 
-    /// Returns the position of the phase in the sequence of a cycle: a later phase has a higher number. The step
-    /// Reconcile comes before Run, because the state of its job is unknown.
+    /// Returns a number for the position of the phase in a cycle. A later phase has a higher number. The step Reconcile
+    /// has a lower number than Run, because it is not known whether the job runs.
     pub(super) fn position(self) -> u8 {
         let step = |step: JobStep| match step {
             JobStep::Send => 0,
@@ -223,8 +224,8 @@ impl State {
         }
     }
 
-    /// Returns the machine whose job has an unknown state while the cell is held or suspended: it has not confirmed
-    /// that it is at rest. Returns `None` in all other cases.
+    /// Returns the machine that has not confirmed that it is at rest, while the cell is held or suspended. This is the
+    /// machine whose job has an unknown state (step Reconcile). Returns `None` in all other cases.
     pub fn unconfirmed(self) -> Option<Device> {
         match self {
             Self::Held(phase) | Self::Suspended(phase) => {

@@ -19,10 +19,10 @@ use State::{
 };
 
 impl Cell {
-    /// Handles an event at the time `now` since the run began. Returns the commands to execute, in this order. In an
-    /// end state there are none.
+    /// Handles `event`, which occurred at the time `now` since the run began. Changes the state of the cell and returns
+    /// the commands to execute, in this order. In an end state, returns no command.
     ///
-    /// If the event does not fit, the answer is [`Command::Refuse`], and the state does not change.
+    /// If the present state does not accept the event, the last command is [`Command::Refuse`] with the reason.
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
         if let Err(why) = self.apply_event(now, &event) {
             let (event, state) = (Box::new(event), self.state);
@@ -32,12 +32,12 @@ impl Cell {
         std::mem::take(&mut self.commands)
     }
 
-    /// Handles an event at the time `now` since the run began. Stores the resulting commands in the field `commands` of
-    /// the cell.
+    /// Handles `event`, which occurred at the time `now` since the run began. Appends the resulting commands to the
+    /// field `commands` of the cell. Does nothing in an end state.
     ///
     /// # Errors
-    /// Returns the reason of a refusal, or `None` if the state has no reaction to the event. In the second case the
-    /// state of the cell is unchanged, and the caller writes the text for people.
+    /// The cell refuses the event. `Some` contains the reason for people. `None` means that the present state has no
+    /// reaction to the event. The state of the cell is then unchanged, and the caller writes the reason.
     pub(super) fn apply_event(&mut self, now: Duration, event: &Event) -> Result<(), Option<String>> {
         if self.state.is_end() {
             return Ok(());
@@ -55,11 +55,11 @@ impl Cell {
         answered
     }
 
-    /// Returns the reason for a refusal if the event belongs to another cycle than the current one. Returns `None` if
-    /// it does not.
+    /// Returns the reason to refuse `event` if it belongs to another cycle than the current one. Returns `None` if the
+    /// event belongs to the current cycle or to no cycle.
     ///
-    /// Also returns `None` for [`Event::Ended`] of the machine that is being stopped: STOP can reach the machine while
-    /// it still has the job of the cycle before.
+    /// There is one exception: [`Event::Ended`] of the machine that is being stopped is never refused here. STOP can
+    /// reach the machine while it still has the job of the previous cycle.
     fn foreign_reason(&self, event: &Event) -> Option<String> {
         // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
         // machine then still has the job of the cycle before.
@@ -71,8 +71,13 @@ impl Cell {
         cycle.map(|cycle| format!("it belongs to cycle {cycle}, the current cycle is {}", self.cycle))
     }
 
-    /// Applies the transition table. Abort and fault come first, then orders, then interruptions, then the sequence of
-    /// a run, then time.
+    /// Applies the transition table: selects the reaction to `event` in the present state and carries it out. The first
+    /// matching entry counts. Entries for abort and fault come first. After these come orders of people, interruptions,
+    /// the normal sequence of a run, and deadlines.
+    ///
+    /// # Errors
+    /// The cell refuses the event. `Some` contains the reason. `None` means that the table has no entry for this state
+    /// and event.
     fn transition(&mut self, event: &Event) -> Result<(), Option<String>> {
         match (self.state, event) {
             // The safe sequence.
@@ -343,8 +348,8 @@ impl Cell {
     }
 }
 
-/// Returns true if `event` shows that the machine `of` executes the job that the cell has requested, or has ended this
-/// job.
+/// Returns true if `event` shows that the machine `of` has begun its job: it started, made progress, held, resumed or
+/// ended the job.
 fn shows_job(event: &Event, of: Device) -> bool {
     match event {
         Event::Started { device, .. }

@@ -50,13 +50,15 @@ impl Reaction {
         Self { next, commands: labels.into_iter().map(format_label).collect() }
     }
 
-    /// Returns true if the cell refuses the event in this state.
+    /// Returns true if this reaction refuses the event, that is, if its commands contain "refuse".
     pub fn is_refusal(&self) -> bool {
         self.commands.iter().any(|command| command == REFUSE)
     }
 }
 
-/// Returns the transition table of the cell: one row for each pair of state and event, sorted by both.
+/// Returns the transition table of the cell: one row for each pair of a reachable state and a sample event. The rows
+/// are sorted by state, then by the name of the event. The table is computed by handling every event in every reachable
+/// state.
 pub fn transition_table() -> Vec<TransitionRow> {
     let mut answers: HashMap<State, Vec<Vec<LabelledAnswer>>> = HashMap::new();
     let mut open: VecDeque<Cell> =
@@ -98,8 +100,9 @@ pub fn transition_table() -> Vec<TransitionRow> {
         .collect()
 }
 
-/// Returns a key of the state of a cell, without times and counts. Cells with equal keys react in the same way to the
-/// sample events, so [`transition_table`] continues from only one of them.
+/// Returns a key that contains everything in `cell` on which its reactions to the sample events depend. It contains no
+/// times, and counts only as far as they change a reaction. [`transition_table`] examines only one of several cells
+/// with equal keys.
 fn behaviour_key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.machines.map(|known| (known.ready, known.was_connected && known.abort_confirmed));
     let clear = cell.machines.map(|known| (known.clear, known.clear_confirmed, known.clear_requested));
@@ -171,8 +174,8 @@ fn sample_plan(disposal: HoldOrStop) -> CellPlan {
     }
 }
 
-/// Returns sample events of every kind, all of them for cycle `cycle`. They cover all values on which the decisions of
-/// the cell depend.
+/// Returns sample events of every kind, from which the transition table is computed. If a reaction of the cell depends
+/// on a value in the event, there is a sample for each case. Events that contain a cycle number contain `cycle`.
 pub fn sample_events(cycle: u32) -> Vec<Event> {
     let mut events = order_events();
     for device in Device::BOTH {

@@ -49,8 +49,9 @@ impl Cell {
         }
     }
 
-    /// Updates the furthest position that the cell has reached: the cycle and its phase. If the position advances while
-    /// a machine has a job, resets the [`FailureSeries`] of this machine.
+    /// Updates the record of how far the cell has come in the run: the highest cycle number, and the furthest phase in
+    /// this cycle. If the cell has come further while a machine has a job, resets the [`FailureSeries`] (failures in a
+    /// row) of this machine. Does nothing in a state without a phase.
     pub(super) fn update_furthest_position(&mut self) {
         let Some(phase) = self.state.phase() else { return };
         let place = (self.cycle, phase.position());
@@ -62,8 +63,9 @@ impl Cell {
         }
     }
 
-    /// Resets the [`FailureSeries`] of a machine that has made progress. If people were notified of this series, and of
-    /// no other series that still lasts, withdraws the alarm [`AlarmId::FailsAgain`].
+    /// Resets the [`FailureSeries`] (failures in a row) of the machine `device`, which has made progress. Withdraws the
+    /// alarm [`AlarmId::FailsAgain`] if people were notified of this series and the other machine has no series of
+    /// which people were notified.
     fn reset_failures(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.failure_series[device as usize]).reported;
         if was_told && !self.failure_series.iter().any(|vain| vain.reported) {
@@ -71,9 +73,13 @@ impl Cell {
         }
     }
 
-    /// Adds a failure to the [`FailureSeries`] of a machine, or begins a new series if the last failure is too long
-    /// ago. Returns true if the series is long enough to stop retrying: it has the maximum number of failures, or at
-    /// least [`MIN_RECURRING_FAILURES`] over the time limit of the plan.
+    /// Adds a failure at the present time to the [`FailureSeries`] (failures in a row) of the machine `device`. Begins
+    /// a new series if the last failure was too long ago: more than twice the time limit `vain` of the plan, or more
+    /// than half of `vain` while the cell executes the job of this machine.
+    ///
+    /// Returns true if the cell must stop retrying. This is the case if the series has the maximum number of failures,
+    /// `vain_failures`. It is also the case if the series has at least [`MIN_RECURRING_FAILURES`] failures and lasts at
+    /// least `vain`.
     fn count_failure(&mut self, device: Device) -> bool {
         let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
         let now = self.now;
@@ -98,8 +104,9 @@ impl Cell {
         );
     }
 
-    /// Enters `state` and sets its deadline. If a running job is held or suspended again after a lost link, the
-    /// deadline of the first HOLD stays in force.
+    /// Enters `state` and sets the deadline of this state. If a running job is being held or suspended, the deadline of
+    /// the first HOLD remains valid, even if the cell enters holding or suspending again after a lost link. Withdraws
+    /// the alarm about missing progress reports if it was raised.
     pub(super) fn enter_state(&mut self, state: State) {
         if std::mem::take(&mut self.stall_notified) {
             self.withdraw(AlarmId::ProgressStands);
@@ -119,8 +126,8 @@ impl Cell {
         }
     }
 
-    /// Returns the present state with `phase` as its phase. A state that is neither holding nor suspending becomes
-    /// `Execute`.
+    /// Returns the present state with `phase` in place of its phase. The states holding, held, unholding, suspending,
+    /// suspended and unsuspending keep their kind. Any other state becomes `Execute(phase)`.
     pub(super) fn state_with_phase(&self, phase: Phase) -> State {
         match self.state {
             Holding(_) => Holding(phase),
@@ -157,9 +164,13 @@ impl Cell {
         }
     }
 
-    /// Returns how long a running job may report no progress. Before people are notified, this is the time until the
-    /// notification, if the plan has a notification time below the limit. After the notification, or without one, it is
-    /// the time that remains until the job is held.
+    /// Returns the time without a progress report after which the cell must react, while the machine `device` runs its
+    /// job. There are three cases:
+    ///
+    /// - People were not notified yet, and the notification time is below the time limit of the job: the notification
+    ///   time. It is at least three times the longest interval between two reports.
+    /// - People were notified: the rest of the time limit. The cell then holds the job.
+    /// - There is no notification time below the time limit: the whole time limit. The cell then holds the job.
     fn progress_limit(&self, device: Device) -> Duration {
         let limit = self.plan.deadlines.progress[device as usize];
         let notice =
@@ -203,7 +214,12 @@ impl Cell {
         self.stop(&format!("the {device} is not idle: {message}"), false);
     }
 
-    /// Handles a machine that connects again while the cell is held. The machine may still run the job of this run.
+    /// Handles the connection of the machine `device` while the cell is holding or held at `phase`. `boot_id`
+    /// identifies the last start of the machine's control. `found` describes what the machine is doing.
+    ///
+    /// If `phase` contains no job of this machine and the machine is not idle, raises an alarm. If the cell is held and
+    /// the job of this machine has an unknown state (step Reconcile), the cell becomes holding and asks the machine for
+    /// the state of the job.
     pub(super) fn on_reconnected(&mut self, phase: Phase, device: Device, boot_id: u32, found: &Occupation) {
         let ours = phase.job().is_some_and(|(job, _)| job == device);
         let known = self.machine_mut(device);
@@ -253,8 +269,9 @@ impl Cell {
         });
     }
 
-    /// Enters the phase `next`. If the cell is holding, held, suspending or suspended, it becomes held or suspended
-    /// instead, with `next` as the phase in which it will continue.
+    /// Enters the phase `next`. If the cell is holding or held, it becomes held instead. If the cell is suspending or
+    /// suspended, it becomes suspended instead. In these two cases, the cell continues later from the restart phase of
+    /// `next` (see [`restart_phase`]).
     pub(super) fn advance(&mut self, next: Phase) {
         match self.state {
             Holding(_) | Held(_) => self.enter_state(Held(restart_phase(next))),
@@ -263,9 +280,11 @@ impl Cell {
         }
     }
 
-    /// Enters a phase and issues its command. Does not enter it in two cases. If a machine is in manual mode, the cell
-    /// is held before a job is prepared or started. While a cause of a suspension is active, the cell is suspended
-    /// before any phase that needs a machine.
+    /// Enters `phase` and issues the command of this phase. There are two exceptions:
+    ///
+    /// - If a machine is in manual mode, the cell does not prepare or start a job. It becomes held.
+    /// - If there is a cause of a suspension (a lost link or a missing condition), the cell does not enter a phase that
+    ///   needs a machine. It becomes suspended.
     fn enter_phase(&mut self, phase: Phase) {
         if matches!(phase.job(), Some((_, JobStep::Prepare | JobStep::Start))) && self.has_manual_machine() {
             self.raise_manual_mode();
@@ -312,15 +331,20 @@ impl Cell {
         self.push(Command::VerifyClear { device });
     }
 
-    /// Marks the machine as clear of the part and continues the job that waited for it.
+    /// Handles the report that the machine `device` is clear of the part. `phase` was waiting for this report. If
+    /// `phase` is part of a job, the cell continues with the preparation of this job. If `phase` is `Transfer`, the
+    /// cell continues with the measurement. A cell that is being held becomes held at this point.
     pub(super) fn on_cleared(&mut self, phase: Phase, device: Device) {
         let known = self.machine_mut(device);
         (known.clear, known.clear_requested) = (true, false);
         self.advance(phase.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::from_job(job, JobStep::Prepare)));
     }
 
-    /// Handles a machine that cannot report whether it is clear of the part. An earlier confirmation of a person counts
-    /// if the machine was not started since then. Without such a confirmation, the cell asks a person.
+    /// Handles the report that the machine `device` has no signal that shows whether it is clear of the part. `phase`
+    /// is waiting for this information.
+    ///
+    /// If a person has confirmed that the machine is clear, and it was not started since then, it counts as clear.
+    /// Otherwise the cell asks a person. A cell that is not in the state `Execute` becomes held instead.
     pub(super) fn on_clear_unknown(&mut self, phase: Phase, device: Device) {
         if self.machine(device).clear_confirmed {
             return self.on_cleared(phase, device);
@@ -345,13 +369,15 @@ impl Cell {
         }
     }
 
-    /// Returns true if a person is being asked whether the machine that this phase waits for is clear of the part.
+    /// Returns true if `phase` waits until a machine is clear of the part, and the cell is asking a person whether this
+    /// is so.
     pub(super) fn is_asking_whether_clear(&self, phase: Phase) -> bool {
         device_awaited_clear(phase).is_some_and(|device| self.machine(device).clear_requested)
     }
 
-    /// Starts a machine if the interlock allows it: since this job began, the other machine has been reported clear,
-    /// and no later event contradicts this.
+    /// Sends START to the machine `device` if the other machine is known to be clear of the part. The other machine was
+    /// checked at the step Clear of this job. If it is no longer known to be clear, does not send START, raises an
+    /// alarm and holds the cell.
     fn start_machine(&mut self, device: Device) {
         let other = device.other();
         if !self.machine(other).clear {
@@ -406,9 +432,10 @@ impl Cell {
         }
     }
 
-    /// Handles the declaration of a person that a job is over, if the machine cannot report this. The machine may still
-    /// have the job with its result, and would then refuse the next job. So the cell asks the machine to discard the
-    /// result: at once if the machine is connected, otherwise later.
+    /// Handles the declaration of a person that the job of the machine `device` is over. A person declares this if the
+    /// machine cannot report the end of the job. The machine may still have the result of the job and would then refuse
+    /// the next job. So the cell asks the machine to discard the result. If the machine is not connected, the cell
+    /// becomes held and asks later.
     pub(super) fn on_declared_over(&mut self, device: Device) {
         let discard = Phase::from_job(device, JobStep::Discard);
         self.acknowledge_refused[device as usize] = false;
@@ -421,7 +448,8 @@ impl Cell {
     }
 
     /// Handles the declaration of a person that a machine need not discard the result of its job. The cell no longer
-    /// requests this, and becomes held before its next phase.
+    /// asks the machine to do this. `phase` is the phase in which the cell asked. The cell becomes held before the next
+    /// phase. If an unusable measurement was to be discarded, the next phase is its repetition.
     pub(super) fn on_result_given_up(&mut self, phase: Phase) {
         self.withdraw(AlarmId::MachineRefused);
         self.acknowledge_refused = [false; 2];
@@ -482,7 +510,8 @@ impl Cell {
         self.advance(Measure(JobStep::Discard));
     }
 
-    /// Raises an alarm for an unusable measurement and repeats the measurement.
+    /// Rejects a measurement that cannot be used. Raises the alarm `id`, in which `case` describes the fault, and
+    /// prepares a repetition of the measurement. The cell is then held until a person resumes it.
     pub(super) fn reject_measurement(&mut self, id: AlarmId, case: &str) {
         self.raise(id, case);
         self.repeat_measurement();
@@ -632,7 +661,10 @@ impl Cell {
         self.enter_state(if unseen { Holding(phase) } else { Held(phase) });
     }
 
-    /// Handles a machine that moves while the cell is held or suspended: orders it to hold and raises an alarm.
+    /// Handles the report that the machine `device` moves while the cell is held or suspended at `phase`. Orders the
+    /// machine to hold and raises an alarm. If the machine has an unfinished job in `phase`, the cell becomes holding.
+    ///
+    /// Does nothing if the machine has no such job and this motion was reported before.
     pub(super) fn on_motion_while_held(&mut self, phase: Phase, device: Device) {
         let astray = self.machine(device).moves_unordered;
         if phase.moving_device() == Some(device) {
@@ -647,9 +679,9 @@ impl Cell {
         self.push(Command::HoldMachine { device });
     }
 
-    /// Handles a machine that moves without an order of the cell. Raises an alarm and orders the machine to hold. Also
-    /// holds the cell, and with it the machine whose job is running. If this motion was reported before, does nothing
-    /// more.
+    /// Handles the report that the machine `device` moves without an order of the cell. `phase` is the phase of the
+    /// cell. Raises an alarm and orders the machine to hold. Also holds the cell and, with it, the job of the other
+    /// machine if one runs. If this motion was reported before, does not repeat these steps.
     pub(super) fn on_unordered_motion(&mut self, phase: Phase, device: Device) {
         let known = self.machine_mut(device);
         known.clear = false;
@@ -677,8 +709,11 @@ impl Cell {
         self.raise(AlarmId::NotAutomatic, &format!("{} in manual mode", names.join(" and ")));
     }
 
-    /// Handles a machine that left automatic mode. If a job is in progress, raises an alarm and holds the cell. A
-    /// suspended cell becomes held, so that it waits for a person instead of resuming by itself.
+    /// Handles the report that the machine `device` has left automatic mode. `message` describes this for the alarm. If
+    /// a machine may be moving in the present phase and the cell is not held, raises an alarm and holds the cell. This
+    /// includes a suspended cell: it would otherwise resume without a person.
+    ///
+    /// In other cases, only stores that the machine is in manual mode.
     pub(super) fn on_manual_mode(&mut self, device: Device, message: &str) {
         self.machine_mut(device).manual = true;
         let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving_device()?))) else {
@@ -714,9 +749,13 @@ impl Cell {
         self.enter_state(self.state);
     }
 
-    /// Handles a command that was not sent because it could not be recorded. No answer will come, so the cell becomes
-    /// held at `phase`. It does not become held while the job of a machine runs, or after a START, which is reported as
-    /// refused. A machine that was ordered to hold gets HOLD again.
+    /// Handles a command that was not sent, because it could not be written to the journal. No machine will answer this
+    /// command, so the cell becomes held at `phase`. There are three exceptions:
+    ///
+    /// - A machine runs its job, and the cell is executing, holding or suspending: nothing is done. HOLD is sent even
+    ///   if it is not recorded.
+    /// - The step Start: nothing is done. A START that was not sent is reported as refused.
+    /// - A machine was ordered to hold and has not confirmed it: the cell sends HOLD again.
     pub(super) fn on_not_recorded(&mut self, phase: Phase) {
         let runs = matches!(phase.job(), Some((_, JobStep::Run)));
         match self.state {
@@ -734,8 +773,8 @@ impl Cell {
         }
     }
 
-    /// Handles a machine that no longer reports the job that it had reported before. The cell asks the machine for the
-    /// state of the job, and concludes nothing before the answer.
+    /// Handles the event that the machine `device` no longer reports its running job. `why` is the reason. Raises an
+    /// alarm and asks the machine for the state of the job. The cell draws no conclusion before the answer.
     pub(super) fn on_job_vanished(&mut self, device: Device, why: &str) {
         self.raise(AlarmId::JobVanished, &format!("{device}, {why}"));
         let asked = Phase::from_job(device, JobStep::Reconcile);
@@ -799,7 +838,8 @@ impl Cell {
         }
     }
 
-    /// Suspends because a condition is missing while a machine moves.
+    /// Suspends the cell at `phase`, because a condition (supplies or a required signal) is missing while a machine may
+    /// move. The cell becomes suspending. If a machine runs its job, the cell orders it to hold.
     pub(super) fn suspend(&mut self, phase: Phase) {
         self.enter_state(Suspending(phase));
         if let Some((device, JobStep::Run)) = phase.job() {
@@ -845,9 +885,14 @@ impl Cell {
         }
     }
 
-    /// Handles a lost link. If the phase needs the link, the cell enters the state that `wait` returns, at a step from
-    /// which it can restart. A job of the other machine continues. A machine that was ordered to hold counts as held
-    /// only after it has confirmed that it is at rest. `why` is the reason of the loss.
+    /// Handles the loss of the link to the machine `device`. `why` is the reason. `phase` is the present phase of the
+    /// cell.
+    ///
+    /// If `phase` needs this machine, the cell enters the state `wait` (held or suspended), with the phase from which
+    /// it can restart. If the link fails too often, the cell is held in any case. While the cell is being held and this
+    /// machine may move, the cell stays holding until the machine confirms that it is at rest.
+    ///
+    /// If `phase` does not need this machine, the cell continues.
     pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.set_link_lost(device, true);
         let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
@@ -879,8 +924,12 @@ impl Cell {
         }
     }
 
-    /// Handles the failure of a station, the task of this program that communicates with a machine. The station does
-    /// not recover by itself, so a phase that needs it is held for a person.
+    /// Handles the failure of a station: the task of this program that communicates with the machine `device`. `why` is
+    /// the reason. A station does not recover by itself, so the cell raises an alarm and waits for a person.
+    ///
+    /// If the cell is starting, the run is stopped. If the present phase needs this machine, the cell becomes held at
+    /// once. Otherwise an executing cell is held after the present phase. If the other machine runs its job, the cell
+    /// orders it to hold.
     pub(super) fn on_station_failed(&mut self, device: Device, why: &str) {
         self.set_link_lost(device, true);
         let case = format!("{device}, {why}");
@@ -1003,8 +1052,9 @@ impl Cell {
         Ok(())
     }
 
-    /// Enters `Execute` with the phase `run`, in which a machine runs its job. If a machine is in manual mode, holds
-    /// the job again. If a condition is missing, suspends the job.
+    /// Enters `Execute` with the phase `run`, after a report that a machine runs its job. If a machine is in manual
+    /// mode, raises an alarm and orders the job to hold. Otherwise, if a condition (supplies or a required signal) is
+    /// missing, suspends the job.
     pub(super) fn enter_running(&mut self, run: Phase) {
         self.enter_state(Execute(run));
         // The time during which the machine was held is no measure of its pace.
@@ -1071,9 +1121,11 @@ impl Cell {
         self.push(Command::Reconcile { device, cycle: self.cycle });
     }
 
-    /// Handles a restart of this program by `actor`. Forgets the states of the machines, holds the cell, raises an
-    /// alarm and connects both machines. The machines may still run the job of this run, so a job that may be moving is
-    /// reconciled first.
+    /// Handles a restart of this program by `actor`. Forgets the reported states of the machines, raises an alarm,
+    /// holds the cell and connects both machines. The machines may still run the job of this run. If a machine may be
+    /// moving, the cell therefore continues at the step Reconcile, which asks for the state of the job.
+    ///
+    /// If the part was accepted already, raises an alarm and ends the run instead.
     pub(super) fn on_restarted(&mut self, actor: &str) {
         if self.state == Completing {
             self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear");
@@ -1096,9 +1148,14 @@ impl Cell {
 
 // The ends, and time.
 impl Cell {
-    /// Ends the run in order. Stops a machine that may have a job, or acknowledges the result of a finished job.
-    /// Without either, the run ends at once. `reason` is written to the ending. `judged_out` is true if the run ends
-    /// because the part is not accepted.
+    /// Ends the run in order. There are three cases:
+    ///
+    /// - A machine may have an unfinished job: the cell sends STOP and waits for the end of the job.
+    /// - A machine has a result: the cell asks the machine to discard the result.
+    /// - Neither: the run ends at once.
+    ///
+    /// `reason` is the reason that is recorded with the end of the run. `judged_out` is true if the run ends because
+    /// the part is not accepted.
     pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
         reason.clone_into(&mut self.ending_reason);
         self.not_accepted = judged_out;
@@ -1126,9 +1183,9 @@ impl Cell {
         self.push(Command::Finish(ending));
     }
 
-    /// Begins the safe sequence: sends ABORT to every machine that was connected in this run. After they confirm, the
-    /// cell checks that each machine is clear of the part. Ends the run at once if no machine was connected. `reason`
-    /// is written to the ending.
+    /// Begins the safe sequence: sends ABORT to every machine that was connected in this run. When a machine confirms,
+    /// the cell checks whether this machine is clear of the part. If no machine was connected, the run ends at once.
+    /// `reason` is the reason that is recorded with the end of the run.
     pub(super) fn abort(&mut self, reason: &str) {
         reason.clone_into(&mut self.ending_reason);
         self.abort_repeated = false;
@@ -1165,8 +1222,9 @@ impl Cell {
         self.verify_clear(device);
     }
 
-    /// Handles the last clearance check of a machine at the end of a run. Raises an alarm if the machine is not clear
-    /// of the part.
+    /// Handles the last check at the end of a run: is the machine `device` clear of the part? `clear` is the result,
+    /// and `message` is the text for the alarm. Raises an alarm if the machine is not clear. In both cases the check of
+    /// this machine is over. The run ends when the checks of all connected machines are over.
     pub(super) fn on_final_clearance(&mut self, device: Device, clear: bool, message: &str) {
         if !clear {
             self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
@@ -1193,7 +1251,9 @@ impl Cell {
         self.push(Command::Finish(Ending::Accepted { cycle, reason }));
     }
 
-    /// Handles a deadline. Does nothing if the deadline is not reached yet.
+    /// Handles the end of a time limit. If the deadline of the present state is reached, raises an alarm or notifies
+    /// people, and then does the next safe step: for example holds, stops or aborts the run. Does nothing if the
+    /// deadline is not reached yet or if there is none.
     pub(super) fn on_deadline(&mut self) {
         if !self.is_deadline_reached() {
             return;
@@ -1254,8 +1314,8 @@ impl Cell {
         }
     }
 
-    /// Returns true if people must be notified when this job makes no progress: the plan has a notification time below
-    /// the time limit of the job, and nobody was notified yet.
+    /// Returns true if the next step after missing progress reports of the machine `device` is to notify people. This
+    /// requires that nobody was notified yet and that the plan has a notification time below the time limit of the job.
     fn needs_stall_notice(&self, device: Device) -> bool {
         !self.stall_notified && self.progress_limit(device) < self.plan.deadlines.progress[device as usize]
     }
@@ -1288,7 +1348,8 @@ impl Cell {
     }
 }
 
-/// Returns the phase from which to restart an interrupted phase. A job that does not run yet restarts at the step Send.
+/// Returns the phase from which to restart `phase` after an interruption. At the steps Clear, Prepare and Start of a
+/// job, this is the step Send of the same job. In all other cases, it is `phase` itself.
 pub(super) fn restart_phase(phase: Phase) -> Phase {
     match phase.job() {
         Some((device, JobStep::Clear | JobStep::Prepare | JobStep::Start)) => Phase::from_job(device, JobStep::Send),
@@ -1305,8 +1366,8 @@ fn phase_after_link_loss(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the machine that must be clear of the part before this phase can end; `None` if the phase waits for no
-/// machine.
+/// Returns the machine that must be clear of the part before `phase` can end. At the step Clear of a job, this is the
+/// machine without the job. In the phase Transfer, it is the grinder. Returns `None` for any other phase.
 pub(super) fn device_awaited_clear(phase: Phase) -> Option<Device> {
     match phase.job() {
         Some((device, JobStep::Clear)) => Some(device.other()),
@@ -1320,7 +1381,8 @@ pub(super) fn device_awaiting_acknowledge(phase: Phase) -> Option<Device> {
     phase.job().filter(|(_, step)| matches!(step, JobStep::Acknowledge | JobStep::Discard)).map(|(device, _)| device)
 }
 
-/// Returns true if `phase` waits for the answer of a machine to the request `what`.
+/// Returns true if `phase` waits for the answer of the machine `device` to the request `what`. Returns false if `phase`
+/// is not a job of this machine.
 pub(super) fn awaits_answer(phase: Phase, device: Device, what: MachineRequest) -> bool {
     let steps: &[JobStep] = match what {
         MachineRequest::Load => &[JobStep::Send],
@@ -1342,8 +1404,8 @@ pub(super) fn running_device(state: State) -> Option<Device> {
     state.phase().and_then(Phase::moving_device)
 }
 
-/// Returns the machine whose job is being reconciled in `state`, that is, whose job has an unknown state. Returns
-/// `None` if there is no such machine.
+/// Returns the machine that the cell is asking for the unknown state of its job (step Reconcile). Returns `None` in any
+/// other phase, and also while the cell is held or suspended.
 pub(super) fn reconciling_device(state: State) -> Option<Device> {
     match state {
         Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {

@@ -215,8 +215,14 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     }
 }
 
-/// Returns true if a verified record is complete, and false if its run is still active. Returns an error that names
-/// what is missing if the record is incomplete.
+/// Returns true if a verified journal is complete. Returns false if its run is still active, so that the end is missing
+/// for good reason. `keys` are the public keys that the user trusts. The slice can be empty.
+///
+/// Returns an error, with a text that names the fault, in three cases:
+///
+/// - The end of the run is not signed, although the run has a key.
+/// - The anchor file is missing, so that a cut of the end cannot be detected.
+/// - The run was interrupted and has no end.
 pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
     match verified {
         // With a key, an end that this key has not signed is not trusted, even if a process holds the lock.
@@ -239,8 +245,9 @@ fn is_folder_of_runs(folder: &Path) -> bool {
     !has_record(folder) && folders(folder).any(|run| has_record(&run))
 }
 
-/// Returns lines about files in a run folder that the record does not list. Also reports a `report.html` that differs
-/// from the report that this record gives. Returns an empty text if there is nothing to report.
+/// Returns lines of text about files in the run folder `folder` that the journal does not list. `unrecorded` contains
+/// the names of these files. The file `report.html` is reported only if it differs from a report made from the journal
+/// now. Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
@@ -269,9 +276,11 @@ fn mark(begin: &Value) -> &'static str {
     if begin["simulation"] == true { "SIMULATION  " } else { "" }
 }
 
-/// Returns the text about the signature of a record: up to which record it reaches, and the keys that signed.
-/// `as_given` is true if the user gave the key with `--key`; otherwise the text warns that the key may not be that of
-/// the cell.
+/// Returns the text about the signatures of a verified journal: the number of the last signed record, or that all
+/// records are signed, and the keys that signed. If the run had no key, the text says so.
+///
+/// `as_given` is true if the user gave the key with `--key`. If it is false, the text warns that only `--key` proves
+/// that the key belongs to the cell.
 fn signed(verified: &Verified, as_given: bool) -> String {
     let Verified { keys, signed, records, .. } = verified;
     let [first, others @ ..] = keys.as_slice() else {
@@ -344,8 +353,11 @@ fn row(record: &Record) -> String {
     format!("{:>6}  {utc:<19}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
 }
 
-/// Prints `head`, and then the text that `line` returns for each record of the run in `folder` for which `wanted`
-/// returns true. Prints while it reads. Stops without an error if the program that reads the output has ended.
+/// Prints text about the run in `folder` to standard output. Prints `head` first, if there is one. Then prints one line
+/// for each record for which `wanted` returns true: the text that `line` returns. Each line is written while the
+/// journal is still being read. Ends without an error if the program that reads the output has ended.
+///
+/// Returns an error if the journal cannot be read or the output cannot be written.
 fn print_lines(
     folder: PathBuf,
     head: Option<String>,

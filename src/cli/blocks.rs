@@ -15,8 +15,9 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    /// Paints an error map. `most` is the maximum width and height in characters; a character shows two pixels, one
-    /// above the other.
+    /// Draws an error map in coloured blocks: blue below zero, red above zero. `nodes` are the nodes of the map. `most`
+    /// is the maximum width and height of the drawing, in characters. A character shows two pixels, one above the
+    /// other.
     ///
     /// Returns `None` if the nodes have no extent in x or in y, or if `most` contains 0.
     pub(super) fn paint_error(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
@@ -24,16 +25,21 @@ impl Blocks {
         Self::painted(&nodes, most, |share| ColourMap::Diverging.at(0.5 + 0.5 * share))
     }
 
-    /// Paints the standard deviation of the error, from dark (0) to bright (maximum). The parameters and `None` are
-    /// those of [`Blocks::paint_error`].
+    /// Draws the standard uncertainty of an error map in coloured blocks, from dark (0) to bright (maximum). `nodes`
+    /// are the nodes of the map. `most` is the maximum width and height of the drawing, in characters.
+    ///
+    /// Returns `None` if the nodes have no extent in x or in y, or if `most` contains 0.
     pub(super) fn paint_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::sigma).collect();
         Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
     }
 
-    /// Paints the nodes `[x, y, value]` on a grid of pixels; a pixel gets the mean value of the nodes in it. `most` is
-    /// the maximum width and height in characters. `colour` returns the RGB colour for a pixel: its argument is the
-    /// mean divided by the largest absolute mean, from -1 to 1.
+    /// Draws `nodes` on a grid of pixels. A node is `[x, y, value]`, in mm. A pixel has the mean value of the nodes in
+    /// its area, and is empty if there is no node. `most` is the maximum width and height of the drawing, in
+    /// characters. A character shows two pixels.
+    ///
+    /// `colour` returns the RGB colour of a pixel. The argument of `colour` is the mean value of the pixel divided by
+    /// the largest absolute mean value, from -1 to 1.
     ///
     /// Returns `None` if the nodes have no extent in x or in y, or if `most` contains 0.
     fn painted(nodes: &[[f64; 3]], most: [usize; 2], colour: impl Fn(f64) -> [u8; 3]) -> Option<Self> {
@@ -83,7 +89,9 @@ impl Blocks {
     }
 }
 
-/// Draws a series of values as bars, one character per value, on a logarithmic scale. The maximum has the highest bar.
+/// Returns `values` as a line of bars, with one character for each value. The height of a bar is on a logarithmic scale
+/// from the minimum (lowest bar) to the maximum (highest bar). A value below 1e-9 counts as 1e-9. If all values are
+/// equal, all bars have the full height.
 pub(super) fn sparkline(values: impl Iterator<Item = f64> + Clone) -> String {
     const STEPS: [char; 8] =
         ['\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}', '\u{2588}'];

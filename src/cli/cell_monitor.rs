@@ -45,7 +45,9 @@ impl CellMonitor {
         }
     }
 
-    /// Returns the current status of the cell, or the last known status if the current one cannot be read.
+    /// Reads the status of the cell again and returns it. Asks the active run, or reads the records if no run is
+    /// active. Returns the last known status if the records cannot be read, or if the run has not answered for less
+    /// than 5 s. After this time, the status is `Unresponsive`.
     pub(super) fn poll(&mut self) -> &CellStatus {
         let live = control::live_runs(&self.runs).next();
         match live {
@@ -61,8 +63,9 @@ impl CellMonitor {
         &self.status
     }
 
-    /// Calls [`CellMonitor::poll`] on a separate thread, and returns the monitor afterwards. The calling task is not
-    /// blocked by a long record or by a run that does not answer.
+    /// Calls [`CellMonitor::poll`] on a separate thread, and returns the monitor with the new status. The calling task
+    /// can continue meanwhile, even if a journal is long or a run does not answer. If the thread panics, returns a new
+    /// monitor without a status.
     pub(super) async fn poll_in_background(mut self) -> Self {
         let runs = self.runs.clone();
         let looked = tokio::task::spawn_blocking(move || {
@@ -72,12 +75,12 @@ impl CellMonitor {
         looked.await.unwrap_or_else(|_| Self::new(&runs))
     }
 
-    /// Returns the last status found.
+    /// Returns the status of the cell that was last read or set. Does not read it again.
     pub(super) fn status(&self) -> &CellStatus {
         &self.status
     }
 
-    /// Sets a status that the caller has received from the active run.
+    /// Stores `now` as the status of the run. The caller has received this status from the active run.
     pub(super) fn set_run_status(&mut self, now: RunStatus) {
         (self.status.run_status, self.silent) = (now, None);
     }
@@ -142,8 +145,8 @@ impl CellMonitor {
         (self.settled, self.silent) = (Some((run.clone(), at)), None);
     }
 
-    /// Returns the time of the last record of a run. `None` for a folder that is not a run of a part or that cannot be
-    /// read.
+    /// Returns the time of the last record of the run in the folder `run`. Returns `None` if the folder cannot be read,
+    /// has no record, or contains the record of a recovery, which is not a run of a part.
     fn last_recorded(&mut self, run: &Path) -> Option<Timestamp> {
         let at = stamp(run);
         if let Some((_, last)) = self.known.get(run).filter(|(then, _)| *then == at) {

@@ -101,8 +101,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Checks one file. Returns the kind of file ("dialect", "cell file" or "recipe"), and either its hash with notes or
-/// its problems.
+/// Checks the file at `path`. Returns the kind of the file ("dialect", "cell file" or "recipe") and the result. The
+/// result is the SHA-256 hash of the file with notes for people, or all problems of the file.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
         let good = |(_, sha256): (_, [u8; 32])| Good { sha256: hex(&sha256), notes: Vec::new() };
@@ -120,8 +120,9 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     ("recipe", checked)
 }
 
-/// Returns true if a line of the file begins with one of the table headers in `heads`. The headers identify the kind of
-/// a file even if its other content is invalid. Only the first MiB is read.
+/// Returns true if a line of the file at `path` begins with one of the table headers in `heads`. The headers show the
+/// kind of a file, even if the rest of the file is invalid. Only the first MiB is read. Returns false if the file
+/// cannot be read.
 fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
@@ -164,7 +165,8 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     problems.map_or(Ok(()), Err)
 }
 
-/// Checks the table `[simulation]` of a recipe, the true shape of the simulated part, in the same way as the simulator.
+/// Checks the table `[simulation]` of `recipe`, which describes the simulated part and machines, with the same limits
+/// as the simulator. Returns the first problem as an error. Returns `Ok` if there is no such table.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     let Some(table) = recipe.simulation.clone() else { return Ok(()) };
     let remedy = "correct it, or remove the key: every key has a default";
@@ -186,7 +188,8 @@ pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     })
 }
 
-/// Prints problems to standard error: on a terminal with the lines of text that they are in, otherwise one line each.
+/// Prints `problems` to standard error. If standard error is a terminal, each problem is shown with the line of the
+/// file in which it is. Otherwise each problem is one line of text. Returns an error if the text cannot be written.
 fn show(problems: &Problems) -> Result<(), Failure> {
     let text = if io::stderr().is_terminal() {
         let columns = Term::stderr().size_checked().map_or(100, |(_, columns)| usize::from(columns));

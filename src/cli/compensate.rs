@@ -128,7 +128,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns a summary of the corrected program, as lines.
+/// Returns a text for people about the corrected program `amended`: numbers of moves and arcs, largest displacement in
+/// µm, length outside the map, and an assumed unit. The last two lines appear only if they apply.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
         "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} µm\n",
@@ -155,8 +156,10 @@ fn summary(amended: &Amended) -> String {
 /// Distance outside the grid, in nodes, within which the values of a map level off.
 const LEVEL_OFF_NODES: f64 = 5.0;
 
-/// Reads the nominal surface in `file` and returns it as the target surface of a pass without a correction. `table` is
-/// the format of the file if it is a table of points.
+/// Reads the nominal surface in `file` and returns it as a target surface without a correction. `table` is the format
+/// of the file if the file is a table of points.
+///
+/// Returns an error if the file cannot be read, or if the surface is not a height over x and y.
 fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
     let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };

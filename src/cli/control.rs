@@ -16,7 +16,8 @@ use super::failure::Failure;
 use super::show::{how_far, limits, preview_text, pv_name};
 use super::words::time_left;
 
-/// Returns the text that follows the help of an order, with an example command.
+/// Returns the text that the help of an order (a command to a running cell) shows at its end. The text explains the
+/// default run, lists the exit codes, and contains `example`, an example command line.
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
@@ -96,8 +97,10 @@ enum ConfirmedState {
     Over,
 }
 
-/// Sends an order to the cell that the command line names. `order` builds the [`Request`] from the reason of the
-/// person.
+/// Sends an order to the cell of the run that `arguments` name, and prints the reply. `order` is a function that builds
+/// the [`Request`] from the reason in `arguments`.
+///
+/// Returns an error if no run is found, or if the cell does not answer or refuses the order.
 pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Result<Outcome, Failure> {
     give(arguments.run.as_deref(), &order(arguments.reason.clone()), arguments.json)
 }
@@ -149,8 +152,11 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
-/// Sends a request to the cell of a run folder and returns the reply. If no program listens in the folder, uses the
-/// second control socket of this run, which is next to the lock file of its machines.
+/// Sends `request` to the cell that executes the run in `folder`, and returns the reply. First uses the control socket
+/// in `folder`. If no program listens at that socket, uses the second control socket of the run, next to the lock file
+/// of the machines.
+///
+/// Returns an error if no program listens at either socket, or if the cell does not answer.
 fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     match send_request(folder, request) {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
@@ -160,8 +166,8 @@ fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     }
 }
 
-/// Returns true if a program drives the run of a folder: it listens at the control socket in the folder, or at the one
-/// next to the lock file of its machines.
+/// Returns true if a program executes the run in `folder`. Such a program listens at the control socket in `folder`, or
+/// at the second control socket next to the lock file of the machines.
 pub(super) fn is_driven(folder: &Path) -> bool {
     is_live(folder) || socket_beside_lock(folder).is_some()
 }
@@ -171,8 +177,8 @@ fn socket_beside_lock(folder: &Path) -> Option<PathBuf> {
     runs_holding_machines().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
 }
 
-/// Returns the runs that have locked machines on this computer and whose cells listen: the run folder, and the control
-/// socket next to the lock file.
+/// Returns the runs on this computer whose cells have locked machines and listen for requests. Each entry contains the
+/// run folder and the path of the control socket next to the lock file of a machine.
 fn runs_holding_machines() -> impl Iterator<Item = (PathBuf, PathBuf)> {
     MachineLock::control_sockets().into_iter().filter(|(_, door)| is_live_at(door))
 }
@@ -192,7 +198,8 @@ fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(
     super::print(&status_text(&reply.status, folder))
 }
 
-/// Returns the status of a cell as text, the most urgent information first.
+/// Returns the status of a cell as lines of text for a person: the state, the progress, the alarms with their remedies,
+/// the next step, the part, and the figures of each cycle. `folder` is the run folder, which the text names.
 fn status_text(status: &Snapshot, folder: &Path) -> String {
     let mut text = String::new();
     let marked = if status.simulation { "SIMULATION  " } else { "" };
@@ -230,18 +237,21 @@ fn status_text(status: &Snapshot, folder: &Path) -> String {
     text
 }
 
-/// Returns the folder of the named run, or of the newest run.
+/// Returns `run` if the person named a run folder. Otherwise returns the folder of the newest run in `runs`, a
+/// subfolder of the working folder. Returns an error if no run is named and `runs` contains no run.
 pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
     run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
 }
 
-/// Returns the folder of the active run, or of the newest run if none is active.
+/// Returns the folder of the active run in the folder `runs`. A run is active if its cell listens for orders. If no run
+/// is active, returns the folder of the newest run. Returns an error if several runs are active, or if `runs` contains
+/// no run.
 pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     live_or(runs, newest)
 }
 
-/// Returns the folder of the only active run in `runs`. If no run is active, returns the result of `otherwise`, which
-/// gets the folder `runs`.
+/// Returns the folder of the only active run in the folder `runs`. A run is active if its cell listens for orders. If
+/// no run is active, calls `otherwise` with `runs` and returns the folder that `otherwise` selects.
 ///
 /// # Errors
 /// Several runs are active, or no run is active and `otherwise` returns `None`.
@@ -264,7 +274,8 @@ pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> R
     }
 }
 
-/// Returns the folders of the active runs.
+/// Returns the folders of the active runs in the folder `runs`. A run is active if a cell listens for orders at the
+/// control socket in the run folder.
 #[cfg(feature = "plant")]
 pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
     folders(runs).filter(|folder| is_live(folder))
@@ -277,7 +288,9 @@ pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     entries.filter(move |entry| !is_hidden(entry)).map(|entry| entry.path()).filter(|path| path.is_dir())
 }
 
-/// Returns the newest run without a recorded end, or the newest run if all have ended.
+/// Returns the folder of the newest run in `runs` whose record has no end. Skips records of `regrind recover` and
+/// records that cannot be read. If no run is left, returns the folder of the newest run. Returns `None` if `runs`
+/// contains no run.
 pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
     let is_open = |folder: &PathBuf| {
         let Ok(reader) = Reader::open(folder) else { return false };
@@ -290,13 +303,16 @@ pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
     all.into_iter().rev().find(is_open).or_else(|| newest(runs))
 }
 
-/// Returns the folder of the run that began last.
+/// Returns the folder of the run in `runs` that began last. Returns `None` if `runs` contains no run.
 fn newest(runs: &Path) -> Option<PathBuf> {
     folders(runs).max_by_key(|folder| began(folder))
 }
 
-/// Returns the time at which a run began, from its first record or else from its name, as text that sorts by time.
-/// Changes to a folder do not make a run newer.
+/// Returns the start time of the run in `folder` as text that sorts by time. The text consists of the digits and
+/// letters of the UTC time, such as `20260704T120000`. Uses the time of the first record. If there is no readable
+/// record, uses the time in the folder name. Returns `None` if the folder name contains no time.
+///
+/// The modification time of the folder is not used. Therefore a changed file does not make a run newer.
 fn began(folder: &Path) -> Option<String> {
     let by_record = || {
         let reader = Reader::open(folder).ok()?;

@@ -131,8 +131,9 @@ fn folder(runs: &Path) -> Finding {
     }
 }
 
-/// Reports runs whose folders every user of this computer can read, because a process that reads a record can block its
-/// writer. Earlier versions created such folders. Returns `None` if there are none.
+/// Returns a notice with the number of run folders in `runs` that every user of this computer can read or enter. Such
+/// folders are a risk: a user who reads a record can block the program that writes this record. Earlier versions of
+/// this program created such folders. Returns `None` if no run folder is open to every user.
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
@@ -143,8 +144,9 @@ fn open_runs(runs: &Path) -> Option<Finding> {
     (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
 }
 
-/// Checks the clock of this computer. It must not show a time before the end of the last recorded run, or before the
-/// release of this program.
+/// Checks the clock of this computer. Returns a notice if the clock shows a time before the last run in `runs` ended
+/// (or began, if the run has no recorded end). Also returns a notice if the time is before 2026-01-01, the date of this
+/// code. Otherwise returns a good finding with the time in UTC.
 fn clock(runs: &Path) -> Finding {
     /// Date of this code. A correct clock shows no earlier time.
     const MIN: &str = "2026-01-01T00:00:00Z";
@@ -180,8 +182,9 @@ fn signing() -> Finding {
     }
 }
 
-/// Checks whether the cell can run a recipe: the reference sphere is clear of the part, and all values are within the
-/// limits of the machines.
+/// Checks whether the cell `cell` can run the recipe in the file `recipe`. All values must be within the limits of the
+/// machines. The reference sphere, if the task has one, must be clear of the part. Returns a text that confirms this.
+/// Returns an error with the reason if the cell cannot run the recipe.
 fn fits(recipe: &Path, cell: &CellConfig) -> Result<String, Failure> {
     let recipe = check::or_show(Recipe::read(recipe))?;
     let (task, _) = setup::prepare(&recipe, cell).map_err(Failure::Setup)?;
@@ -212,8 +215,10 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     ]
 }
 
-/// Checks the connection to a machine that is a server: locks it, opens a session, requests identity and status, and
-/// ends the session. Runs no job. `made` is its driver, or the reason why there is none.
+/// Checks the connection to a machine that is a server, and returns the result. Locks the machine against other runs,
+/// opens a session, requests the identity and the status, and closes the session. Starts no job on the machine. `kind`
+/// and `link` are the kind of the machine and the settings of its connection. `made` is the driver of the machine, or
+/// the error if the driver could not be created.
 async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M, DriverError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,
@@ -242,9 +247,10 @@ async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M
 /// Time for which the line of a machine that prints its hits is read.
 const LISTENS: Duration = Duration::from_secs(5);
 
-/// Checks the connection to a measuring machine that only prints its hits. Listens for at most [`LISTENS`]. Reports
-/// which formats fit the line that the machine prints, or that no line arrived. `made` is its driver, or the reason why
-/// there is none.
+/// Checks the connection to a measuring machine that only prints its hits (one line of text for each touch), and
+/// returns the result. Waits at most [`LISTENS`] for a line. The result states which formats fit this line, or that no
+/// line arrived. `link` contains the settings of the connection. `made` is the driver of the machine, or the error if
+/// the driver could not be created.
 async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Finding {
     let what = Device::Cmm.to_string();
     let _taken = match lock_machine(link, MachineKind::Cmm, Path::new("regrind doctor")) {

@@ -233,8 +233,12 @@ impl From<PlantError> for Failure {
 }
 
 impl Failure {
-    /// Returns the failure for a cell of the run in `folder` that did not answer a request. The kind of `source`
-    /// decides: no permission (a cell may or may not run there), a timeout, or no program that listens.
+    /// Returns the failure to report if the cell of the run in `folder` did not answer a request. `source` is the error
+    /// of the connection, and its kind selects the failure:
+    ///
+    /// - Permission denied: it is unknown whether a cell runs in `folder`.
+    /// - Timeout: a cell listens, but does not answer.
+    /// - Other errors: no cell runs in `folder`.
     pub(super) fn unreached(folder: &std::path::Path, source: io::Error) -> Self {
         let path = folder.to_owned();
         match source.kind() {

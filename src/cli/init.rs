@@ -51,7 +51,7 @@ enum Machines {
 }
 
 impl Machines {
-    /// Returns the text of the shipped cell file for these machines.
+    /// Returns the text of the cell file for this connection to the machines. The file is contained in the program.
     fn cell(self) -> &'static str {
         match self {
             Self::Simulated => include_str!("../../config/sim.toml"),
@@ -62,7 +62,8 @@ impl Machines {
         }
     }
 
-    /// Returns the text of the shipped recipe for these machines, and the name of the part in it.
+    /// Returns the recipe for this connection to the machines, as contained in the program: first the text of the
+    /// recipe file, then the name of the part in this text.
     fn recipe(self) -> (&'static str, &'static str) {
         match self {
             // Machines that exchange files have no pattern from Regrind.
@@ -71,7 +72,8 @@ impl Machines {
         }
     }
 
-    /// Returns the commands to make a part, each with its purpose.
+    /// Returns the command lines with which a person makes a part with this connection to the machines, in the order of
+    /// their use. Each entry contains a command line and its purpose.
     fn commands(self) -> Vec<(&'static str, &'static str)> {
         let run = "regrind run recipe.toml --cell cell.toml --part SN-0001 --operator \"Your Name\"";
         let before = match self {
@@ -112,8 +114,9 @@ struct InitSettings {
     part: Option<String>,
 }
 
-/// Returns the settings for the new folder from the arguments. If the folder is missing there, asks a person at the
-/// terminal for each missing setting. Returns an error if the folder is missing and there is no terminal.
+/// Returns the settings for the new folder. If `arguments` name this folder, uses only `arguments` and the defaults.
+/// Otherwise asks a person at the terminal for each missing setting. Returns an error if `arguments` name no folder and
+/// there is no terminal.
 fn read_settings(arguments: &Arguments) -> Result<InitSettings, Failure> {
     let Arguments { folder, machines, part } = arguments.clone();
     if let Some(folder) = folder {
@@ -150,8 +153,9 @@ fn ask_for_machines() -> Result<Machines, Failure> {
     })
 }
 
-/// Prints `question` and reads answers until `read` accepts one. An empty answer stands for the default `usual`.
-/// Returns an error if the input ends.
+/// Prints `question` with the default answer `usual`, and reads an answer from standard input. `read` converts the
+/// answer to a value, or returns the reason for a rejection. After a rejection, prints this reason and repeats the
+/// question. An empty answer means `usual`. Returns the first accepted value. Returns an error if the input ends.
 fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, Failure> {
     loop {
         super::print(&format!("{question} [{usual}]: "))?;
@@ -188,8 +192,8 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
     Ok(Outcome::Accepted)
 }
 
-/// Returns the text of the shipped recipe `shipped` for a new folder: replaces the part name `shipped_name` by `name`,
-/// and the paths by those in the new folder.
+/// Returns the recipe text `shipped` with changes for a new folder. Replaces the part name `shipped_name` by `name`.
+/// Replaces the file paths, which are valid only in the source tree, by the paths of the same files in the new folder.
 fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
     let named = toml::Value::String(name.to_owned()).to_string();
     shipped
@@ -200,7 +204,8 @@ fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
         .replace("config/file-exchange.toml", "cell.toml")
 }
 
-/// Returns the text of the shipped cell file `shipped` for a new folder: replaces its paths by those in the new folder.
+/// Returns the text of the cell file `shipped` with changes for a new folder. Replaces the file paths, which are valid
+/// only in the source tree, by the paths of the same files in the new folder.
 fn cell_of(shipped: &str) -> String {
     let text = shipped
         .replace("../docs/cell.schema.json", "cell.schema.json")

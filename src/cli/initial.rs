@@ -20,10 +20,13 @@ struct Earlier {
     cmm_from_model: Rows,
 }
 
-/// Reads a pose `cmm_from_model`, in mm.
+/// Reads the pose `cmm_from_model` from the file `path`. The pose transforms model coordinates to coordinates of the
+/// measuring machine, in mm. The file contains sixteen numbers (a 4 x 4 matrix, row by row) as text or JSON, or is the
+/// `registration.json` of an earlier registration.
 ///
 /// # Errors
-/// Returns an error if the file cannot be read, is neither JSON nor sixteen numbers, or does not hold a rigid pose.
+/// Returns an error if the file cannot be read, is larger than 64 MiB, is neither JSON nor sixteen numbers, or does not
+/// contain a rigid pose.
 pub(super) fn read_pose(path: &Path) -> Result<Pose, Failure> {
     let failed = |reason: String| Failure::Initial { path: path.to_owned(), reason };
     let mut bytes = Vec::new();

@@ -115,8 +115,9 @@ pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
     AuditKey::read(&path).map(Some).map_err(Failure::Journal)
 }
 
-/// Parses a public key of the command line: its 64 hexadecimal digits, or the path of a file with the output of
-/// `regrind audit key`.
+/// Parses a public key from the command-line argument `word`. The argument is the key as 64 lower-case hexadecimal
+/// digits, or the path of a file with the output of `regrind audit key`. Returns the reason if `word` is neither of
+/// them.
 pub(super) fn public(word: &str) -> Result<PublicKey, String> {
     if let Ok(key) = word.parse() {
         return Ok(key);

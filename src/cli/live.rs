@@ -50,8 +50,9 @@ pub(super) struct PreparedRun {
 }
 
 impl RunContext<'_> {
-    /// Locks both machines and opens the connections to them. Sends nothing to a machine. `now` is the current time in
-    /// seconds, as returned by [`super::run::epoch`].
+    /// Locks the measuring machine and the grinder against other runs on this computer, and opens the connections to
+    /// both. Sends nothing to a machine. `now` is the current time in seconds, as returned by [`super::run::epoch`].
+    /// Returns an error if another run has locked a machine, or if a connection cannot be opened.
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
         let taken = [
@@ -100,8 +101,9 @@ impl RunContext<'_> {
     }
 }
 
-/// Runs the cell with its machines until the run ends. Meanwhile, passes on orders from the control sockets, from the
-/// terminal and from signals.
+/// Executes the run on `machines` until the run ends, and returns the ending. Meanwhile, accepts orders from the
+/// control sockets, from the terminal (Enter, Ctrl-C) and from signals of the system. `actor` is the person at the
+/// terminal. Returns an error if the control socket or the signals are not available.
 async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let Machines { cmm, grinder, taken } = machines;
@@ -127,9 +129,12 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
     Ok(ending)
 }
 
-/// Turns Ctrl-C into orders. The first Ctrl-C holds the cell at the next safe place, the second aborts it. If a person
-/// has resumed the cell in between, the next Ctrl-C holds it again, except within the time [`IN_ONE_GO`] after the
-/// first.
+/// Sends an order to the cell for each Ctrl-C. `actor` is the person at the terminal.
+///
+/// - The first Ctrl-C holds the cell at the next safe place.
+/// - A further Ctrl-C aborts the run if the cell is not executing, or if the last hold by Ctrl-C was less than
+///   [`IN_ONE_GO`] ago.
+/// - Otherwise a person has resumed the cell, and Ctrl-C holds the cell again.
 async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
@@ -144,8 +149,9 @@ async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     }
 }
 
-/// Confirms the loaded part when a person presses Enter at this terminal while the cell waits for this confirmation.
-/// Keys pressed earlier are discarded.
+/// Waits until the cell asks for the confirmation that the part is loaded. Then waits for Enter at this terminal, and
+/// sends the confirmation in the name of `actor`. Discards keys that were pressed before the cell asked. Sends nothing
+/// if no person can answer at this terminal, or if the cell no longer waits for the confirmation.
 async fn heed_enter(orders: OrderSender, actor: Actor) {
     let mut status = orders.status();
     if status.wait_for(|seen| seen.next_step == NextStep::Load).await.is_err() || !reads_keys() {
@@ -174,9 +180,10 @@ async fn heed_enter(orders: OrderSender, actor: Actor) {
 /// Time between two checks whether the cell still waits for the confirmation of the loaded part.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// Turns events that end this program, such as a closing terminal, into orders. The first event stops the run in order,
-/// the next one aborts it. A closing terminal can send its event twice, so a second one within [`IN_ONE_GO`] is
-/// ignored.
+/// Sends an order to the cell for each event in `endings`, such as a closed terminal or SIGTERM. The first event stops
+/// the run in an orderly way. The next event aborts the run. A closed terminal can send its event twice. Therefore a
+/// second event of a closed terminal is ignored within [`IN_ONE_GO`] after the first event. `actor` is the person named
+/// in the orders.
 async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     let mut first: Option<Instant> = None;
     while let Some(outside::Ending { by, hung_up }) = endings.next().await {
@@ -190,9 +197,10 @@ async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
     }
 }
 
-/// Locks a machine, identified by its address, against all other runs on this computer. `run` is the folder of the run
-/// that takes the lock. Returns `None` if the machine has no address, for example because it exchanges files. Returns
-/// an error if another run has the lock.
+/// Locks a machine against all other runs on this computer. The lock belongs to the address of the machine in `link`
+/// (host and port, or serial line). `kind` is the kind of the machine, and `run` the folder of the run that takes the
+/// lock. Returns `None` if the machine has no address, for example because it exchanges files. Returns an error if
+/// another run has the lock.
 pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.modbus_line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
@@ -210,8 +218,9 @@ pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> 
     Ok(taken)
 }
 
-/// Returns the number by which the machines recognise this run as their client. It is computed from the station of
-/// `actor` and the run folder only. So it is the same if another person resumes the run at this station.
+/// Returns the client number of this run: the number, above 0, by which the machines recognise the run. The number is
+/// the CRC-32 of the station (computer name) of `actor` and the absolute path of the run folder `run`. The name of the
+/// person has no influence. Therefore another person who resumes the run at this station gets the same number.
 pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");

@@ -209,9 +209,9 @@ fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
     print(&text)
 }
 
-/// Checks that a text can be the name of a person, a part or a place, and returns it without spaces at its ends.
-/// Returns the reason if it is empty, longer than 300 characters, or has characters that are invisible or change the
-/// order of the letters.
+/// Checks that `text` can be the name of a person, a part or a place. Returns the name without spaces at both ends.
+/// Returns the reason as text if the name is empty or longer than 300 characters. Also returns the reason if the name
+/// has characters that are invisible or that change the order of the letters.
 fn name(text: &str) -> Result<String, String> {
     const LONGEST: usize = 300;
     match (misleading(text), text.trim()) {
@@ -225,8 +225,8 @@ fn name(text: &str) -> Result<String, String> {
     }
 }
 
-/// Checks the remark of a person, which can be empty, and returns it. Returns the reason if it has invisible characters
-/// or is too long.
+/// Checks that `text` can be the remark of a person. Returns the remark without spaces at both ends; the remark can be
+/// empty. Returns the reason as text if the remark has invisible characters or is longer than 300 characters.
 fn remark(text: &str) -> Result<String, String> {
     if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
 }

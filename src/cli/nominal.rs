@@ -30,11 +30,13 @@ impl NominalTable {
     }
 }
 
-/// Reads a nominal file. `table` gives the columns and the unit of a table of points whose header does not state them.
+/// Reads the nominal file `path` (point cloud, mesh or definition of a surface). `projection` selects the projection of
+/// a point cloud to two coordinates. `table` gives the columns and the units of a table of points whose header does not
+/// state them.
 ///
 /// # Errors
-/// Returns an error if the file cannot be read, if columns are missing, or if a projection is given for anything but a
-/// point cloud.
+/// Returns an error if the file cannot be read or columns are missing. Also returns an error if `projection` is not
+/// [`PlaneProjection::Auto`] and the file is not a point cloud.
 pub(super) fn read(path: &Path, projection: PlaneProjection, table: &Table) -> Result<NominalFile, Failure> {
     let file = read_nominal_as(path, table)?;
     let what = match file {
@@ -48,10 +50,12 @@ pub(super) fn read(path: &Path, projection: PlaneProjection, table: &Table) -> R
     Ok(file)
 }
 
-/// Reads a nominal file and builds its surface.
+/// Reads the nominal file `path` and builds the nominal surface. `projection` selects the projection of a point cloud
+/// to two coordinates. `table` gives the columns and the units of a table of points whose header does not state them.
 ///
 /// # Errors
-/// Returns the errors of [`read`], and an error with the file name if the content does not make a surface.
+/// Returns the errors of [`read`]. Also returns an error with the file name if no surface can be built from the
+/// content.
 pub(super) fn surface(path: &Path, projection: PlaneProjection, table: &Table) -> Result<Nominal, Failure> {
     setup::nominal_from_file(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
 }

@@ -207,8 +207,9 @@ impl ScallopsDocument {
         Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
     }
 
-    /// Returns a text for each tolerance of which the scallops use more than the share [`MAX_SCALLOP_SHARE`], such as
-    /// "40 % of acceptance.pv_um". A scallop is the ridge between two tracks of the wheel.
+    /// Returns a text for each tolerance (PV or RMS) of which the scallops use more than the share
+    /// [`MAX_SCALLOP_SHARE`]. A scallop is the ridge between two tracks of the wheel. An example of a text is "40 % of
+    /// acceptance.pv_um".
     fn beyond(&self) -> Vec<String> {
         let taken = [
             ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),
@@ -313,8 +314,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the summary of the arcs in the program of the first pass. Returns `None` if the cell uses no arcs or there
-/// is no program, and an error if the dialect cannot express the program.
+/// Returns the summary of the circular arcs in the grinding program of the first pass. `program` is the path of this
+/// pass with its summary. Returns `None` if `program` is `None`, if there is no program for the task, or if the cell
+/// uses no arcs. Returns an error if the dialect of the controller cannot express the program.
 fn arcs_of(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> Result<Option<ArcsDocument>, Failure> {
     let (Some((path, summary)), Ok(programs)) = (program, &task.programs) else { return Ok(None) };
     let arcs = programs.arc_summary(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
@@ -330,7 +332,9 @@ fn min_measuring_minutes(task: &Task) -> Option<f64> {
     (!task.targets.is_empty()).then_some(seconds / 60.0)
 }
 
-/// Returns warnings about a pass or a measurement that takes longer than a shift.
+/// Returns a warning for a grinding pass, and one for a measurement, if it takes longer than a shift ([`MAX_MINUTES`]).
+/// `path_mm` is the length of the grinding path, and `grinding_minutes` the duration of one pass. `measuring_minutes`
+/// is the minimum duration of one measurement; `None` means unknown and gives no warning.
 fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes: Option<f64>) -> Vec<String> {
     let n = three_digits;
     let mut warnings = Vec::new();
@@ -359,7 +363,8 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
 }
 
 /// Returns a warning if the scallops (the ridges between the tracks of the wheel) use more than the share
-/// [`MAX_SCALLOP_SHARE`] of a tolerance. Returns `None` if they do not.
+/// [`MAX_SCALLOP_SHARE`] of the PV or RMS tolerance in `recipe`. Otherwise returns `None`, also if the scallops are
+/// unknown.
 fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let scallops = task.scallops?;
     let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
@@ -374,8 +379,9 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     })
 }
 
-/// Returns the estimated duration of a run in words: the grinding time of all passes, and the minimum time of all
-/// measurements.
+/// Returns the estimated duration of the planned run as text for a person. The text states the grinding time of each
+/// pass in minutes, the minimum time of each measurement in minutes, and the sum in hours. The sum assumes that all
+/// allowed passes are needed.
 fn time_in_words(d: &Document) -> String {
     let n = three_digits;
     let measurements = counted(d.most_measurements as usize, "measurement");
@@ -391,8 +397,9 @@ fn time_in_words(d: &Document) -> String {
     )
 }
 
-/// Returns the text about one pass: the volume in mm3 that is removed from the part, and the volume that the wheel
-/// loses, or that this loss is unknown.
+/// Returns the removed volumes as text for a person, in mm3: the volume that one pass removes from the part, and the
+/// volume that the wheel loses in one pass and in all allowed passes. If the loss of the wheel is unknown, the text
+/// says so.
 fn removal_in_words(d: &Document) -> String {
     let n = three_digits;
     let most = f64::from(d.most_passes);
@@ -405,8 +412,9 @@ fn removal_in_words(d: &Document) -> String {
     format!("about {} mm3 a pass; {wheel}", n(d.removed_mm3_a_pass))
 }
 
-/// Plans the path of the first pass and checks it against the limits of the grinder. Returns `None` if this program
-/// cannot plan a path for the part, and the controller of the grinder has to.
+/// Plans the path of the first pass, and checks this path against the limits of the grinder. Returns the path with its
+/// summary. Returns `None` if this program cannot plan a path for the part; the controller of the grinder must then
+/// plan the path. Returns an error if the wheel cannot grind the surface, or if the path exceeds a limit.
 pub(super) fn first_path(
     task: &Task,
     recipe: &Recipe,

@@ -79,8 +79,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the name of the cell, as the plant file states it for the publishers. If the plant file states no name or no
-/// receiver of live values, prints this problem and returns a failure.
+/// Returns the name of the cell from the plant file, under which the live values are published. If the plant file has
+/// no table `[sparkplug]` or `[opcua]`, or no name of the cell, prints this problem and returns a failure.
 fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
     match &config.cell {
@@ -92,7 +92,9 @@ fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     }
 }
 
-/// Takes the publisher lock of the cell and returns it. Waits as long as another program holds the lock.
+/// Waits for the publisher lock of the cell, and returns this lock. The lock ensures that only one program at a time
+/// publishes the cell. If another program has the lock, prints a message once (not with `--while-stdin`), and tries
+/// again until that program ends. Returns an error if the lock file cannot be used.
 async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<PublisherLock, Failure> {
     let folder = config.path().with_extension("live");
     let mut waits = false;
@@ -107,8 +109,9 @@ async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<Pu
     }
 }
 
-/// Publishes the state of the cell until the future `ended` completes. `cell` is the published name, and `turn` the
-/// lock against other publishers.
+/// Publishes the state of the cell to all receivers that the plant file `config` names, until the future `ended`
+/// completes or a publisher ends. `cell` is the name under which the cell is published. `turn` is the lock that keeps
+/// other programs from publishing the same cell. Returns an error if a publisher cannot start or fails.
 async fn publish(
     config: &PlantConfig,
     cell: &str,
@@ -147,8 +150,10 @@ async fn publish(
     }
 }
 
-/// Starts a task for each publisher that the plant file names (Sparkplug, OPC UA). The tasks publish each status that
-/// arrives in `told`, and report connections and refused requests through `notes`.
+/// Starts one task for each publisher that the plant file names (Sparkplug, OPC UA), and returns these tasks. Each task
+/// publishes every status that arrives in `told`. Each task sends its events (connected, not connected, request
+/// refused) to `notes`. `cell` is the published name, and `turn` the lock that keeps other programs from publishing the
+/// same cell. Returns an error if a publisher cannot be created.
 fn begin(
     config: &PlantConfig,
     cell: &str,
@@ -170,8 +175,9 @@ fn begin(
 
 enum Never {}
 
-/// Sends the status of the cell to the publishers through `to`. Follows each active run in the folder `runs`, one after
-/// the other. Never returns.
+/// Sends every new status of the cell to the publishers through the channel `to`. If a run in the folder `runs` is
+/// active, sends each status of this run until the run no longer answers. Between runs, reads the status of the cell
+/// with the monitor `look`, every [`ROUND`]. Never returns.
 async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatus>) -> Never {
     loop {
         if let Some(folder) = control::live_runs(runs).next() {
@@ -183,7 +189,8 @@ async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatu
     }
 }
 
-/// Sends each status of the run in `folder` to the publishers through `to`. Returns when the run no longer answers.
+/// Sends each status of the active run in `folder` to the publishers through the channel `to`, if the status has
+/// changed. Also stores the status in the monitor `look`. Returns when the run ends or no longer answers.
 async fn watch_run(folder: &Path, look: &mut CellMonitor, to: &watch::Sender<CellStatus>) {
     let Ok(mut watch) = regrind_control::watch(folder).await else { return };
     while let Ok(Some(snapshot)) = watch.next().await {
@@ -203,8 +210,10 @@ fn publish_status(now: &CellStatus, to: &watch::Sender<CellStatus>) {
 
 // ---- returned events ----------------------------------------------------------------------------------------------
 
-/// Prints the events of the publishers. Also records each refused request in the active run, within a [`Quota`] per
-/// minute. Returns when all publishers have ended.
+/// Prints the events of the publishers that arrive in `news`: connected, not connected, and request refused. With
+/// `json`, also prints each event as a line of JSON. Records refused requests in the active run in the folder `runs`,
+/// but only as many in a minute as [`Quota`] allows. Prints and records the number of further refused requests
+/// together. Returns when all publishers have ended.
 async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, json: bool) {
     let mut some = Vec::new();
     let mut quota = Quota::new(Instant::now());
@@ -261,17 +270,18 @@ impl Quota {
         }
     }
 
-    /// Counts a refused request. Returns true if the request is reported individually: it is one of the first
-    /// [`ONE_BY_ONE`] in its minute.
+    /// Counts a refused request that arrives at the time `now`. Returns true if the request is one of the first
+    /// [`ONE_BY_ONE`] in the current minute. The caller then reports this request individually. Otherwise returns
+    /// false.
     fn takes(&mut self, now: Instant) -> bool {
         self.turn(now);
         self.reported += 1;
         self.reported <= ONE_BY_ONE
     }
 
-    /// Returns the number of refused requests that were not reported individually, if this number is due for a report:
-    /// once a minute, or at the end. `over` is true at the end, when no further events can arrive. Returns `None` if no
-    /// report is due.
+    /// Returns the number of refused requests that were not reported individually, and resets this number to 0. `now`
+    /// is the current time. `over` is true if no further events can arrive. Returns `None` if there are no such
+    /// requests. Also returns `None` if this number was already reported in the current minute and `over` is false.
     fn summed_up(&mut self, now: Instant, over: bool) -> Option<u64> {
         self.turn(now);
         let is_due = self.unreported > 0 && (over || !self.has_summed_up);
@@ -282,8 +292,9 @@ impl Quota {
     }
 }
 
-/// Prints a refused request, and records it as a remark in the active run. `by` is the client that sent the request,
-/// `what` describes the request.
+/// Prints that a request was refused, and records this as a remark in the active run in the folder `runs`, if there is
+/// one. `by` is the client that sent the request. `what` describes the request. With `json`, also prints the refusal as
+/// a line of JSON. If the run does not record the remark, prints a message.
 async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     say(
         json,

@@ -77,8 +77,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Prints the failure to bring a machine to idle and returns false, so that the caller continues with the other
-/// machine. Returns an error only if the terminal cannot be used.
+/// Evaluates the result `home` of the attempt to bring one machine to idle. If `home` is an error, prints this error
+/// and returns false, so that the caller continues with the other machine. Otherwise returns the value in `home`.
+/// Returns an error only if the terminal cannot be used.
 fn print_failure(home: Result<bool, Failure>) -> Result<bool, Failure> {
     match home {
         Err(failure @ Failure::Terminal(_)) => Err(failure),
@@ -100,12 +101,14 @@ struct Recovery {
 }
 
 impl Recovery {
-    /// Brings a machine to idle. Shows its state, and asks a person before each step. Returns true if the machine is
-    /// idle. Returns false if the person declines a step, if a step changes nothing, or if no step is possible over the
-    /// wire of this machine.
+    /// Brings a machine to idle in several steps. Before each step, shows the state of the machine and asks a person
+    /// for permission. `device` is the machine, and `link` its connection. `settings` are the Modbus settings, or
+    /// `None` if the machine has no Modbus connection. `machine` creates the driver from these settings. Returns true
+    /// if the machine is idle. Returns false if the person declines a step, if a step does not change the state, or if
+    /// `settings` is `None`.
     ///
     /// # Errors
-    /// The machine cannot be reached, or a step fails.
+    /// The machine cannot be reached, a step fails, or the terminal cannot be used.
     async fn bring_home<M: Machine>(
         &mut self,
         device: Device,
@@ -157,8 +160,9 @@ impl Recovery {
         }
     }
 
-    /// Returns the folder of an interrupted run on this computer whose job number is `job`. Returns `None` if no run
-    /// without a recorded end has this number.
+    /// Returns the path of the folder of the interrupted run with the job number `job`, from the runs in the same
+    /// folder as this recovery. The job number identifies a run at the machines. An interrupted run has a record
+    /// without an end. Returns `None` if no such run is found.
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;

@@ -167,7 +167,9 @@ fn options(arguments: &Arguments) -> Result<RegistrationOptions, Failure> {
     })
 }
 
-/// Reads both files in parallel: the nominal surface is built while the measured points are still read.
+/// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface, and
+/// the measured points with the notes about them. Returns an error if a file is invalid. Also returns an error if the
+/// measured file is a map of heights (X3P, SDF or MetroPro) and the method of the registration is not `Contact`.
 fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
@@ -184,7 +186,9 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
     })
 }
 
-/// Returns the summary for an operator, as lines.
+/// Returns the result of the registration as lines of text for an operator: the files, the numbers of points, the
+/// deviation in µm, the pose, the warnings and the alternative poses. `kind` is the kind of the nominal surface.
+/// `folder` is the folder with the result files.
 fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let mut text = String::new();
@@ -228,8 +232,9 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
     text
 }
 
-/// Returns the results of the error model as lines for people: figures of the form with their 95 % intervals, and the
-/// estimated parameters.
+/// Returns the estimated form error as lines of text for a person. The lines state RMS, PV and PV 99.8 % of the form in
+/// µm with 95 % intervals, the parameters of the Gaussian-process model, and the standard uncertainty of the frame in
+/// µm. They contain a warning if there are too few points to separate the form from the noise.
 fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =
@@ -265,8 +270,9 @@ fn form_in_words(form: &Form) -> String {
     )
 }
 
-/// Returns lines for people about slopes and the figures of ISO 10110-5, with their 95 % intervals. Returns an empty
-/// text if there are too few points for them.
+/// Returns lines of text for a person: the slopes of the form in µrad, and the figures of ISO 10110-5 (power,
+/// irregularity, symmetric part) in nm, each with a 95 % interval. Omits the slopes or the figures if they could not be
+/// computed, for example from too few points. The text is empty if both are missing.
 fn area_in_words(form: &Form) -> String {
     let mut text = String::new();
     if let Some(SlopeFigures { rms, largest, integration_mm, .. }) = form.slope {

@@ -100,8 +100,10 @@ impl Replication<'_> {
         Ok(if self.shipper.skipped().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
     }
 
-    /// Replicates in rounds until it is told to end. Retries with growing intervals while the plant cannot be reached.
-    /// With `--while-stdin`, ends after standard input is closed, when all data has been sent or after a time limit.
+    /// Replicates records to the plant, one round after the other. If the plant cannot be reached, waits before the
+    /// next round; this time doubles up to [`LONGEST_WAIT`]. Without `--while-stdin`, continues until the caller stops
+    /// the replication. With `--while-stdin`, continues until standard input is closed. Then returns after a round
+    /// without new data, or after the time [`LINGERS`]. Returns an error for any fault that cannot end by itself.
     async fn go_on(&mut self) -> Result<(), Failure> {
         let mut over = self.arguments.while_stdin.then(end_of_input);
         let mut last = None;
@@ -135,7 +137,9 @@ impl Replication<'_> {
         }
     }
 
-    /// Connects to the plant if necessary. Sends it all new records and the status of the cell.
+    /// Executes one round of the replication: connects to the plant if there is no connection, then sends the plant all
+    /// new records and the status of the cell. Returns the numbers of the sent records and files. After an error,
+    /// closes the connection and returns the error.
     async fn round(&mut self) -> Result<ReplicationResult, Failure> {
         if self.link.as_ref().is_none_or(DatabaseLink::is_closed) {
             self.link = Some(plant::open(&self.config).await?);
@@ -184,7 +188,8 @@ impl Replication<'_> {
         super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
     }
 
-    /// Prints that the plant cannot be reached and why. Prints this only once until the plant has answered again.
+    /// Prints `error`, which states why the plant cannot be reached. Prints nothing if such an error was printed since
+    /// the last successful round.
     fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
             eprintln!("ship: {error}; the cell continues, and its records wait here until the plant can be reached");
@@ -193,8 +198,9 @@ impl Replication<'_> {
     }
 }
 
-/// Sends the status of the cell to the plant. Does not send an unknown status, so that the plant shows the cell as
-/// silent.
+/// Sends the status `told` of the cell to the plant: the status of the active run, or that no run is active. Sends
+/// nothing if the run does not respond or its program has ended, because the status is then unknown. The plant then
+/// shows the cell as silent.
 async fn send_status(link: &DatabaseLink, told: &CellStatus) -> Result<(), PlantError> {
     match &told.run_status {
         RunStatus::Active { run, snapshot } => {

@@ -74,9 +74,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))
 }
 
-/// Continues the interrupted run in `folder`. First verifies the record, rebuilds task and plan from the stored recipe
-/// and cell file, and replays the recorded decisions. Returns an error if one of them has changed. Opens the machines
-/// only after these checks.
+/// Continues the interrupted run in `folder`. First verifies the record, and rebuilds the task and the plan from the
+/// stored recipe and the stored cell file. Then replays the recorded decisions. Opens the machines only after these
+/// checks. Returns an error if the record is not valid, if the task or the plan has changed, or if the replay gives
+/// other decisions. Also returns an error if the machines were simulated inside the program that was interrupted.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
     // From here on, another program that resumes or verifies the run finds it driven.
@@ -152,11 +153,12 @@ struct RunStart {
 }
 
 impl RunStart {
-    /// Verifies the record of an interrupted run and reads the inputs with which the run began.
+    /// Verifies the record of the interrupted run in the folder `run`, and reads the inputs with which the run began.
     ///
     /// # Errors
-    /// The record is invalid, has no first entry, or has an end. Records at the end may be lost, and `despite_loss` is
-    /// false; if it is true, the loss is only reported.
+    /// Returns an error if the record is invalid, contains no event, or already has an end. Also returns an error if
+    /// the run is from another version of the program. If records at the end may be lost, returns an error unless
+    /// `despite_loss` is true; the reason is then only stored in the result.
     fn read(run: &Path, despite_loss: bool) -> Result<Self, Failure> {
         let reader = Reader::open(run).map_err(Failure::Journal)?;
         let lost = || may_be_lost(run).map_err(Failure::Journal);
@@ -228,8 +230,9 @@ impl RunStart {
         })
     }
 
-    /// Builds the task and the plan from the recipe and the cell file with which the run began. Returns an error if
-    /// they differ from the recorded ones, for example because a file that the recipe names has changed.
+    /// Builds the task and the plan of the run in the folder `run` from `recipe` and `cell`, the stored recipe and the
+    /// stored cell file of this run. Returns an error if the nominal surface, the settings or the plan differ from
+    /// those in the record. This happens, for example, if a file that the recipe names has changed.
     fn prepared(&self, run: &Path, recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), Failure> {
         let (mut task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
         if let Some(seed) = self.seed {

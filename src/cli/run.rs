@@ -132,8 +132,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Opens the machines, creates the journal and executes the run until its end. `earlier` is the knowledge from earlier
-/// runs, and `key` signs the record.
+/// Locks and connects the machines, creates the run folder and the journal, and executes the run until its end. Returns
+/// how the run has ended. `earlier` is the knowledge from earlier runs, or `None` if the recipe does not use any. `key`
+/// signs the record; without a key the record is not signed. Returns an error if the disk has too little space, a
+/// machine is not available, or a file cannot be written.
 async fn carry_out(
     arguments: &Arguments,
     recipe: &Recipe,
@@ -189,8 +191,8 @@ async fn carry_out(
     live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await
 }
 
-/// Returns `now` as whole seconds since 1970, modulo 2^31 and at least 1. Machines compare these numbers: a program
-/// that starts later has a higher one.
+/// Returns the time `now` in whole seconds since 1970, modulo 2^31, and at least 1. A machine compares this number with
+/// the number of an earlier program: the program with the higher number began later.
 pub(super) fn epoch(now: SystemTime) -> u32 {
     let seconds = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     u32::try_from(seconds & 0x7fff_ffff).unwrap_or(1).max(1)
@@ -208,8 +210,10 @@ struct EarlierKnowledge {
 }
 
 impl EarlierKnowledge {
-    /// Initialises a task with what the newest earlier run with the same settings has learned. If there is none, uses
-    /// the results of other cells of the plant, if the arguments name a plant file. Returns this knowledge.
+    /// Changes `task` so that the run begins with the knowledge (correction and error statistics) of the newest
+    /// finished run with the same settings. If there is no such run and `arguments` name a plant file, uses the results
+    /// that other cells of the plant have learned. Returns the knowledge that was found. Leaves `task` unchanged if
+    /// nothing was found.
     ///
     /// # Errors
     /// The correction from the earlier run exceeds the limits of this task, or the plant file is invalid.
@@ -226,8 +230,10 @@ impl EarlierKnowledge {
         Ok(earlier)
     }
 
-    /// Initialises a task with results that other cells of the plant have learned. Results that the task cannot use are
-    /// reported in the messages of the returned value.
+    /// Changes `task` so that the run begins with the results that other cells of the plant have learned. `plant` is
+    /// the path of the plant file. Returns `self` with these results, and with messages for the operator. If the
+    /// results are not usable or the plant does not answer, `task` is unchanged and a message states the reason.
+    /// Returns an error if the plant file is invalid.
     #[cfg(feature = "plant")]
     fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::query_knowledge(plant, task)?;
@@ -277,7 +283,9 @@ impl EarlierKnowledge {
     }
 }
 
-/// Returns a line for people about the knowledge from other cells with which the first part of this kind begins.
+/// Returns one line of text for a person about the knowledge `others` from other cells with which the run begins. The
+/// line names the source runs. It states the assumed difference of the machines in per cent, or why the run begins
+/// without a correction.
 fn others_in_words(others: &KnowledgeOrigin) -> String {
     let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
     let runs = runs.join(" and ");
@@ -301,7 +309,7 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
 }
 
 /// Returns true if a machine of the cell is simulated inside this process. This is the case if the cell is simulated
-/// and the cell file leaves the address of a machine open, for example as port 0.
+/// and the cell file leaves the address of a machine undefined, for example with port 0. Otherwise returns false.
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &LinkConfig| {
         matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
@@ -311,8 +319,9 @@ pub(super) fn within(cell: &CellConfig) -> bool {
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 
-/// Returns the first entry of the record of a run. It contains everything that a program needs to resume the run.
-/// `earlier` is the knowledge with which the run begins.
+/// Returns the first entry of the record of a run. The entry contains the data that a program needs to resume the run,
+/// such as the paths and hashes of the recipe and the cell file, and the plan. `live` is the context of the run.
+/// `earlier` is the knowledge from earlier runs with which the run begins; `None` if there is none.
 fn header(
     arguments: &Arguments,
     live: &RunContext,
@@ -363,8 +372,9 @@ fn begin(
     Ok(journal)
 }
 
-/// Writes the correction of the first pass and its program to the folder `cycle-0` of the run, and adds the files to
-/// the journal.
+/// Writes the correction of the first pass, and the grinding program of this pass, to the subfolder `cycle-0` of the
+/// run folder. Adds these files to `journal`. Returns an error if the program cannot be computed or a file cannot be
+/// written.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
     let folder = journal.folder().join("cycle-0");
     for name in task.save_first_pass(&folder).map_err(Failure::Programs)? {
@@ -377,8 +387,9 @@ fn recipe_name(recipe: &Recipe) -> String {
     recipe.path().file_stem().map_or("run".into(), |stem| stem.to_string_lossy().into_owned())
 }
 
-/// Returns the path of a folder that does not exist yet, for a run that begins at `began`. Its name consists of `name`
-/// (of the recipe), the time, and a number if this name is taken. A simulated run also gets the mark SIMULATION.
+/// Returns the path of a new run folder in `runs`. Does not create the folder. The folder name consists of `name`, the
+/// time `began` in UTC, and the mark `SIMULATION` if `simulated` is true. If this folder already exists, the name also
+/// contains a number.
 pub(super) fn free_folder(runs: &Path, name: &str, began: SystemTime, simulated: bool) -> PathBuf {
     // The mark is in the path of every file of the run.
     let mark = if simulated { "-SIMULATION" } else { "" };

@@ -83,7 +83,10 @@ pub(super) struct ConfirmedPart {
 }
 
 impl ConfirmedPart {
-    /// Assigns the leased part to a run. Returns after the plant has confirmed this; the run must not begin earlier.
+    /// Tells the plant that the leased part (the part reserved for this cell) is made by the run in the folder `run`.
+    /// Returns after the plant has confirmed this assignment. The run must not begin earlier. If the answer of the
+    /// plant is lost, repeats the request once. Returns an error if the plant refuses the assignment or cannot be
+    /// reached.
     pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
         let name = run.file_name().unwrap_or_default().to_string_lossy();
         let link = plant::open(&self.config).await?;
@@ -148,8 +151,13 @@ enum Next {
     None,
 }
 
-/// Leases the next part of the queue from the plant, verifies and stores its recipe, and asks a person to confirm the
-/// part. If the recipe is invalid or not approved, returns the part to the queue, and then an error.
+/// Leases (reserves) the next part of the queue for this cell. Fetches the recipe of the part from the plant, verifies
+/// its signatures, stores it, and asks a person to confirm the part. Returns the confirmed part with the path of the
+/// recipe. If nobody confirms the part, returns the part to the queue. Returns [`Next::None`] if no part waits for this
+/// cell.
+///
+/// If the recipe is invalid or not approved, returns the part to the queue and returns an error. Also returns an error
+/// if a part that this cell has started still has an open run.
 async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
     let link = plant::open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
@@ -184,8 +192,11 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     }
 }
 
-/// Returns true if the run of the leased part may begin: the argument `--part` or a person at the terminal gives its
-/// serial number, or the recipe does not require a confirmation. Renews the lease while it waits for the person.
+/// Returns true if the run of the leased part may begin. If `arguments` give a serial number (`--part`), this number
+/// must be that of the part. Otherwise the recipe requires no confirmation, or a person at the terminal enters the
+/// serial number of the part. Returns false if the given serial number is wrong. Renews the lease (the reservation of
+/// the part) while the person has not answered. Returns an error if the lease cannot be renewed, except for a temporary
+/// fault.
 async fn confirmed(
     link: &DatabaseLink,
     lease: &Lease,
@@ -238,8 +249,12 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
     Ok(())
 }
 
-/// Removes the part `serial` from this cell. With a reason in `up`, gives the part up. Without a reason, returns the
-/// part to the queue; this is refused if its run has commanded a machine.
+/// Ends the assignment of the part `serial` to this cell. If `up` contains a reason, gives the part up: the part is
+/// made again only if a planner queues it again. If `up` is `None`, returns the part to the queue. Returns
+/// `NotInTolerance` if this cell has not started the part.
+///
+/// Returns an error if the run of the part is active. Without a reason, also returns an error if the run has sent a
+/// command to a machine or has ended.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
@@ -280,8 +295,8 @@ enum RunProgress {
     Over,
 }
 
-/// Returns how far a run has come, from its record. A record that cannot be read counts as that of a run that has
-/// commanded a machine.
+/// Returns the progress of the run in `folder` as stated in its record: no record, begun, command sent to a machine, or
+/// ended. If the record cannot be read, assumes that the run has sent a command to a machine.
 fn run_progress(folder: &Path) -> RunProgress {
     // To look makes no journal where there is none.
     let Ok(reader) = Reader::open(folder) else {
@@ -299,8 +314,9 @@ fn run_progress(folder: &Path) -> RunProgress {
     far
 }
 
-/// Writes a recipe of the plant, with its files, to a subfolder of `runs` that is named by its hash `sha256`. Returns
-/// the path of the recipe. Returns an error if a file name leads out of this folder.
+/// Writes a recipe of the plant, with the files that it needs, to a subfolder of `runs`. The name of the subfolder is
+/// `sha256`, the hash of the recipe. Returns the path of the recipe file. Returns an error if a file name leads out of
+/// the subfolder, or if a file cannot be written.
 fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Failure> {
     let folder = runs.join(RECIPES).join(sha256);
     let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };

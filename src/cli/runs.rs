@@ -59,8 +59,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Formats a run as two lines: its folder, and its state or result with the part, the number of cycles and the last
-/// figures.
+/// Returns two lines of text about a run. The first line is the run folder. The second line contains the state or the
+/// result, the part, the number of cycles, and the newest measured PV and RMS in µm.
 fn in_words(run: &Listed) -> String {
     let Listed { folder, is_live, summary } = run;
     let figures = summary.cycles.iter().rev().find_map(|of| of.figures);

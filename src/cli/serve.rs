@@ -66,8 +66,9 @@ pub(super) struct PageAccess {
 }
 
 impl PageAccess {
-    /// Opens a listener at the address `listen`. Returns an error if the address is taken, or if other computers can
-    /// reach it and the certificate or the list of users is missing.
+    /// Opens a TCP listener for the page at the address `listen`. Returns the listener and the settings for the access
+    /// to the page. Returns an error if the address is in use, or if a file for the access is invalid. Also returns an
+    /// error if other computers can reach the address, and the certificate or the list of users is missing.
     pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
         let Self { certificate, key, users } = self;
         let tls =
@@ -124,8 +125,9 @@ pub(super) struct PageProcess {
 }
 
 impl PageProcess {
-    /// Starts the page for the runs in a folder as a separate process. The page can therefore neither slow down the run
-    /// of this process nor stop it.
+    /// Starts the web page for the runs in the folder `runs` as a separate process. `listen` is the address of the
+    /// page. With `json`, the process prints nothing to standard output. A separate process can neither slow down nor
+    /// stop the run in this process. Returns an error if the process cannot be started.
     pub(super) fn start(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };
@@ -157,8 +159,9 @@ impl PlannedPointsCache {
     }
 }
 
-/// Recomputes the planned points (x, y) of a run in mm from its stored recipe and cell file; `None` if one of them is
-/// missing or invalid.
+/// Returns the planned measuring points (x, y) of the run in the folder `run`, in mm in the model frame. Computes the
+/// points again from the recipe and the cell file in this folder. Returns `None` if the recipe, the cell file or the
+/// first record is missing or invalid.
 fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
     let first = Reader::open(run).ok()?.records(0).next()?.ok()?.value();
     let content = &first["content"];

@@ -56,7 +56,8 @@ pub(super) fn pages(arguments: &Pages) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the manual page of each visible command, with its file name.
+/// Returns the manual page of each command that is not hidden. Each entry contains the file name, such as
+/// `regrind-run.1`, and the content.
 fn manual() -> Vec<(String, Vec<u8>)> {
     let mut program = super::Arguments::command().disable_help_subcommand(true);
     program.build();

@@ -61,7 +61,8 @@ impl Show {
         }
     }
 
-    /// Shows notices until the run is over.
+    /// Shows each notice of the run that arrives in `notices`, as text or as a line of JSON. Returns when the run has
+    /// ended and no further notice can arrive. Returns an error if standard output cannot be written.
     pub(super) async fn follow(mut self, mut notices: mpsc::UnboundedReceiver<Notice>) -> Result<(), Failure> {
         if !self.json {
             let marked = if self.simulated { "SIMULATION  " } else { "" };
@@ -158,7 +159,8 @@ impl Show {
         }
     }
 
-    /// Prints the order that the cell has accepted, and its effect. `event` is the name of the order, such as `hold`.
+    /// Prints a line about an order that the cell has accepted, and the effect of this order. `event` is the name of
+    /// the order: `hold`, `resume`, `stop` or `abort`. Prints nothing for any other event.
     fn order(&mut self, event: &str) -> Result<(), Failure> {
         match event {
             "hold" => self.line(&format!(
@@ -210,8 +212,9 @@ impl Show {
         self.picture(cycle)
     }
 
-    /// Prints the error map of a cycle in colour, and the series of RMS values of the cycles so far. Prints nothing
-    /// without a terminal that shows colours.
+    /// Prints the error map of the cycle `cycle` in colour, and a small chart of the RMS values of all cycles so far.
+    /// If the measurement selects its touches during the cycle, also prints the map of the standard deviation. Prints
+    /// nothing if the output is JSON, if the terminal shows no colours, or if there is no error map.
     fn picture(&self, cycle: u32) -> Result<(), Failure> {
         let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
         let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
@@ -277,8 +280,9 @@ impl Show {
         self.striking(text, "", "")
     }
 
-    /// Prints text. If `word` is not empty, a terminal shows its first occurrence in colour (`colour` is an ANSI code)
-    /// and rings its bell.
+    /// Prints `text`. If there is a terminal and `word` is not empty, also rings the bell, and shows the first
+    /// occurrence of `word` in colour if the terminal supports colours. `colour` is the ANSI code of the colour, such
+    /// as `31` for red. Without a terminal, prints only the text.
     fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
         // Parts of the text come from a machine or a file.
         let text = &visible(text);
@@ -293,8 +297,9 @@ impl Show {
     }
 }
 
-/// Returns the path of the newest error map of a cycle; `None` if there is none. A repeated measurement has a folder of
-/// its own.
+/// Returns the path of the newest error map of the cycle `cycle` in the run folder `run`. Looks first in the folders of
+/// repeated measurements (`attempt-2` and higher), then in the cycle folder, and then in the folders of the batches of
+/// touches. Returns `None` if there is no error map.
 fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     let cycle = run.join(format!("cycle-{cycle}"));
     let of = |what: &str, first: u32| {
@@ -307,8 +312,8 @@ fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     maps.rev().find(|map| map.is_file())
 }
 
-/// Returns true if a person at this terminal can answer: standard input and standard error are terminals, and this
-/// program has the terminal at the moment.
+/// Returns true if a person at this terminal can answer a question. This requires that standard input and standard
+/// error are terminals, and that this program is in the foreground of its terminal. Otherwise returns false.
 pub(super) fn reads_keys() -> bool {
     is_in_front() && io::stdin().is_terminal() && io::stderr().is_terminal()
 }
@@ -333,7 +338,8 @@ fn doing(device: Device) -> &'static str {
     }
 }
 
-/// Returns the progress of a job as text, from `done` steps of `total`.
+/// Returns the progress of a job as text for a person. For the measuring machine, the text states `done` of `total`
+/// points. For the grinder, the text states `done` / `total` in per cent of the path.
 pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     match device {
         Device::Cmm => format!("measuring, {done} of {total} points"),
@@ -343,15 +349,16 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     }
 }
 
-/// Returns a line about a measurement that is still running: the number of touches on the part, and the statistics of
-/// their deviations from the targets.
+/// Returns a line of text about a measurement that is not yet complete. The line states the number of touches on the
+/// part, and the RMS, minimum and maximum of the deviations from the planned positions in µm.
 pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_um }: &PreviewStatistics) -> String {
     format!(
         "preliminary, relative to the planned position: {touched} touched, RMS {rms_um:.2} µm, {least_um:+.2} to {most_um:+.2} µm"
     )
 }
 
-/// Returns the name of the peak-to-valley figure that has the limit: of all points, or of 99.8 % of them.
+/// Returns the name of the PV (peak-to-valley) figure to which the PV limit applies: `PV` for all points, or `PV 99.8
+/// %` if the highest and the lowest 0.1 % are omitted.
 pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     match tolerance.pv_of {
         PvPoints::All => "PV",
@@ -359,15 +366,16 @@ pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     }
 }
 
-/// Returns the acceptance limits as text.
+/// Returns the acceptance limits of PV and RMS in µm as text. Omits a limit that is not finite.
 pub(super) fn limits(tolerance: &Tolerance) -> String {
     let limits =
         [(pv_name(tolerance), tolerance.pv_mm), ("RMS", tolerance.rms_mm)].into_iter().filter(|(_, mm)| mm.is_finite());
     limits.map(|(name, mm)| format!("{name} {} µm", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the gains (the second number of each pair) as text: one value, or the range from the smallest to the
-/// largest.
+/// Returns the gains as text with two decimals. A gain is the share of the newest error that the next correction
+/// compensates. Each pair in `gains` belongs to a band of wavelengths, and its second number is the gain. If the gains
+/// differ by less than 0.005, the text is one value; otherwise it is the range from the minimum to the maximum.
 fn gains(gains: &[[f64; 2]]) -> String {
     let least = gains.iter().map(|gain| gain[1]).fold(f64::INFINITY, f64::min);
     let most = gains.iter().map(|gain| gain[1]).fold(0.0, f64::max);

@@ -66,8 +66,8 @@ async fn until_stopped() -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the address of a simulated machine. If the cell file leaves the port open (0), the address has the port that
-/// the system has assigned.
+/// Returns the address of a simulated machine as a JSON object: host and port, or serial device. `link` contains the
+/// assigned port if the cell file left the port open (0). Returns null if the machine has no address.
 fn wire(link: &LinkConfig) -> Value {
     match link.wire.modbus_line() {
         Some((LineAddress::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),

@@ -67,8 +67,8 @@ impl Drop for SimulatedCell {
     }
 }
 
-/// Reads the true shape of the simulated part from the table `[simulation]` of a recipe. `seed` replaces the seed in
-/// the table.
+/// Reads the properties of the simulated part and machines, such as the true shape of the part, from the table
+/// `[simulation]` of `recipe`. If `seed` is given, it replaces the seed of the random numbers in this table.
 ///
 /// # Errors
 /// Returns an error if the recipe has no table `[simulation]`, or an invalid one.
@@ -88,11 +88,13 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     Ok(spec)
 }
 
-/// Serves the simulated machines of a cell at their addresses. If a port in the cell is 0, replaces it by the assigned
-/// one. The probe of a simulated I++ DME server and the wheel of a simulated LinuxCNC have the radii of the recipe.
+/// Starts servers for the simulated machines of the cell `cell`, at the addresses in the cell file. `spec` defines the
+/// simulated part and machines. If a port is 0, the system assigns a free port, which is then stored in `cell`. The
+/// simulated probe with I++ DME or hit lines, and the simulated wheel of LinuxCNC, have the radii in `recipe`. The
+/// servers end when the returned value is dropped.
 ///
 /// # Errors
-/// Returns an error if a wire is not available.
+/// Returns an error if an address is not available, or if this machine or recipe cannot be simulated.
 pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recipe) -> Result<SimulatedCell, Failure> {
     let probe_radius_mm = recipe.measure.probe_radius_mm;
     let path = cell.path().to_owned();
@@ -157,9 +159,10 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     Ok(simulated)
 }
 
-/// Starts the external controller `command`, and returns the path of the wheel that the controller executes. The
-/// simulated wheel has the radius of the recipe. Returns the reason if the recipe needs another wheel, pattern or tilt,
-/// or if the program cannot be started.
+/// Starts the external controller with `command`, and returns the path on which the controller moves the simulated
+/// wheel. The wheel grinds the part in `world`, and has the radius in `recipe`. Returns the reason as text if `recipe`
+/// requires a tilted wheel, a wheel that is not a sphere, or a pattern other than parallel tracks along x. Also returns
+/// the reason if `command` cannot be started.
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
@@ -178,9 +181,9 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
     })
 }
 
-/// Returns the folder of grinding programs that the simulated controller reads, with the dialect of the cell file.
-/// Returns `None` if the cell file names no program folder, and the reason if no simulated controller reads the
-/// dialect.
+/// Returns the settings with which the simulated grinder reads grinding programs: the program folder, the control for
+/// the dialect in the cell file, and the rotary axis of the wheel. Returns `None` if the cell file names no program
+/// folder. Returns the reason as text if no simulated control reads the dialect.
 fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let program = &cell.grinder.program;
     let Some(folder) = program.folder.clone() else { return Ok(None) };
@@ -200,8 +203,9 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
 }
 
 impl SimulatedCell {
-    /// Writes the true PV and RMS of the simulated part to the file `path`, in µm. They are computed from the
-    /// deviations at the targets, after a best fit of the pose.
+    /// Writes the true PV and RMS of the simulated part, in µm, to the JSON file `path`. Takes the true deviations at
+    /// the targets (the planned measuring points), fits the pose to them, and computes PV and RMS from the residuals.
+    /// Returns an error if the fit fails or the file cannot be written.
     #[cfg(feature = "plant")]
     pub(super) fn tell_truth(&self, recipe: &Recipe, cell: &CellConfig, path: &Path) -> Result<(), Failure> {
         let (task, _) = regrind::setup::prepare(recipe, cell).map_err(Failure::Setup)?;
@@ -218,10 +222,11 @@ impl SimulatedCell {
         Ok(regrind::formats::write_json_atomic(path, &truth)?)
     }
 
-    /// Writes all further events of the machines to a file, one line of JSON per event, as they happen.
+    /// Writes each future event of the simulated Modbus machines to the file `path`, when the event occurs. Each event
+    /// is a line of JSON.
     ///
     /// # Errors
-    /// Returns an error if the file cannot be written.
+    /// Returns an error if the file cannot be opened.
     pub(super) fn log_to(&self, path: &Path) -> Result<(), FormatError> {
         let lines = JsonlAppender::open(path)?;
         let machines = self.servings.iter().flat_map(|serving| serving.machines());
@@ -238,8 +243,10 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a simulated measuring machine with I++ DME. Writes the assigned port into `wire`. `radius_mm` is the
-    /// radius of the probe, `speed` the factor by which the simulation is faster than reality.
+    /// Starts the server of a simulated measuring machine with the protocol I++ DME, at the address in `wire`. Writes
+    /// the assigned port into `wire`. `probe` touches the simulated part, and `radius_mm` is the radius of the probe.
+    /// `speed` is the factor by which the simulation is faster than reality. `grinder` is the path of the simulated
+    /// wheel if LinuxCNC grinds; otherwise `None`. Returns the reason as text if the address is not available.
     async fn serve_dme(
         &mut self,
         wire: &mut IppdmeWire,
@@ -261,8 +268,11 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a simulated measuring machine that prints a line for each hit. It measures each list of points that
-    /// Regrind writes to the folder of `wire`.
+    /// Starts a simulated measuring machine that prints a line of text for each hit (touch), at the address in `wire`.
+    /// The machine measures each list of points that Regrind writes to the plan folder of `wire`. A relative plan
+    /// folder starts at `cell_folder`. If `wire` names no plan folder, creates a temporary one. Stores the plan folder
+    /// and the assigned address in `wire`. `probe` touches the simulated part. The last parameter contains the speed
+    /// factor of the simulation and the probe radius in mm. Returns the reason as text if the address is not available.
     async fn serve_hits(
         &mut self,
         wire: &mut HitLinesWire,
@@ -311,8 +321,9 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Creates a symbolic link at the path `device` to the simulated serial line `terminal`, and stores it for its
-    /// removal. Returns the reason if the link cannot be created.
+    /// Creates a symbolic link at the path `device` to `terminal`, the pseudo-terminal that simulates the serial line.
+    /// Stores the path of the link, so that the link is removed when `self` is dropped. Returns the reason as text if
+    /// the link cannot be created.
     fn link(&mut self, terminal: &Path, device: &str) -> Result<(), String> {
         place_link(terminal, Path::new(device)).map_err(|e| {
             format!(
@@ -349,7 +360,8 @@ impl SimulatedCell {
     }
 }
 
-/// Creates a temporary folder for the list of points that the part program reads, for a cell file that names no folder.
+/// Creates a temporary folder for the lists of points that the simulated measuring machine reads. It is used if the
+/// cell file names no folder. The folder is removed when the returned value is dropped.
 fn list_folder() -> Result<ScratchFolder, FormatError> {
     let path = std::env::temp_dir().join(format!("regrind-list-{:016x}", rand::random::<u64>()));
     let folder = ScratchFolder::at(path)?;
@@ -357,7 +369,8 @@ fn list_folder() -> Result<ScratchFolder, FormatError> {
     Ok(folder)
 }
 
-/// Returns the format in which the simulated machine prints its hits, so that the parser of the cell file accepts it.
+/// Returns the format in which the simulated measuring machine prints its hits. The format has the separator, the unit,
+/// the axes and the decimals that the cell file in `wire` prescribes, so that this program can read the hits.
 fn style(wire: &HitLinesWire) -> hits::print::Style {
     use regrind::device::hit_lines::Separator;
     let reading = wire.parser();
@@ -378,7 +391,8 @@ fn style(wire: &HitLinesWire) -> hits::print::Style {
     }
 }
 
-/// Returns a random number above 0. A real machine has a new number at each start, too.
+/// Returns a random number above 0 that identifies this start of a simulated machine. A real machine also has a new
+/// number after each start.
 fn boot_id() -> u32 {
     rand::random::<u32>().max(1)
 }

@@ -59,8 +59,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns true if the event of a row is accepted, and changes the state or issues a command. `answer` is one of the
-/// reactions of this row.
+/// Returns true if an event has an effect: the cell accepts the event, and changes the state or issues a command. `row`
+/// contains a state and an event of the transition table. `answer` is one possible reaction of the cell to this event.
 fn acts(row: &TransitionRow, answer: &Reaction) -> bool {
     !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
 }

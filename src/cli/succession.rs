@@ -55,8 +55,10 @@ impl Drop for SuccessionLock {
 }
 
 impl RunPlace {
-    /// Returns the number of the next run in the folder `runs`, with its previous run, and the lock of the folder. The
-    /// caller must keep the lock until the run has its first record.
+    /// Returns the place of the next run in the folder `runs`: its number (from 1), and the state of the previous run
+    /// (name, number of records and last hash), if there is one. Creates `runs` if the folder is missing. Also returns
+    /// a lock of the folder, which keeps other runs from receiving the same number. The caller must keep this lock
+    /// until the new run has written its first record. Returns an error if the folder cannot be created.
     pub(super) fn next(runs: &Path) -> Result<(Self, SuccessionLock), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
         // Any user can hold this lock. It does not prevent a run, but without it the run can receive the number of
@@ -77,8 +79,9 @@ impl RunPlace {
         content["before"] = json!(self.before);
     }
 
-    /// Reads the number and the previous run from the first record of a run. Returns `None` for a run from before runs
-    /// had numbers.
+    /// Reads the place of the run in `folder` from its first record: the number of the run, and the state of its
+    /// previous run. Returns `None` if the record cannot be read or has no number, as in runs of early versions of the
+    /// program.
     fn read(folder: &Path) -> Option<Self> {
         let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
         serde_json::from_value(first.value()["content"].clone()).ok()
@@ -108,9 +111,12 @@ fn is_ours_in_time(folder: &File) -> bool {
     }
 }
 
-/// Returns the newest runs of a folder, each with its number. Omits runs without a number. Selects runs both by the
-/// time in the folder name and by the modification time of the folder, because a copy changes all modification times,
-/// and a name need not contain a time.
+/// Returns the newest runs in the folder `runs`, each with its number. Omits runs without a number. The result is not
+/// sorted by time.
+///
+/// Takes the [`NEWEST`] runs with the latest modification time of their folder, and the [`NEWEST`] runs with the latest
+/// time in their folder name. Both criteria are needed: copying a folder changes its modification time, and a folder
+/// name need not contain a time.
 fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let changed = |folder: &PathBuf| fs::metadata(folder).and_then(|found| found.modified()).ok();
     let mut all: Vec<PathBuf> = folders(runs).collect();
@@ -146,8 +152,12 @@ struct Proof {
     are_under_way: bool,
 }
 
-/// Verifies every run of a folder. Also checks that no run is missing, renamed, or different from the one that its
-/// successor names.
+/// Verifies the records of all runs in the folder `runs` with `keys`, and prints the result, as JSON if `json` is true.
+/// Also checks the sequence of the runs: no run is missing or renamed, and each run agrees with the hash that the next
+/// run has stored.
+///
+/// Returns `Accepted` if there is no fault, and `UnderWay` if a run has not ended. Returns an error with the number of
+/// faults and the first fault if there is any.
 pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
     let mut proof = Proof::default();
     let mut all: Vec<(Option<RunPlace>, PathBuf)> =
@@ -176,8 +186,9 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
 }
 
 impl Proof {
-    /// Verifies the record of a single run, and adds its result to the list and its faults to the flaws. `place` is the
-    /// number of the run with its previous run, if the record states them.
+    /// Verifies the record of the run in `folder` with `keys`. Adds the result to the list of runs in `self`, and each
+    /// fault to the list of flaws. `place` is the number of the run and the state of its previous run; `None` if the
+    /// record does not contain them. Does nothing if the folder contains no record.
     fn verify_run(&mut self, place: Option<&RunPlace>, folder: &Path, keys: &[PublicKey]) {
         let name = name_of(folder);
         let number = place.map_or("-".to_owned(), |place| place.number.to_string());
@@ -210,8 +221,10 @@ impl Proof {
             .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
     }
 
-    /// Checks that a run continues the series: its number is one higher than that of the run `last`, and `last` still
-    /// contains the records that this run has noted in `before`. Adds each fault to the flaws.
+    /// Checks that a run follows the run `last` in the sequence, and adds each fault to the list of flaws. The number
+    /// of the run must be one higher than the number of `last`, or 1 if `last` is `None`. `before` is the state of the
+    /// previous run, as stored in the checked run: its name, number of records and last hash. If `before` is given, the
+    /// name of `last` must be the same, and the record of `last` with this number must still have this hash.
     fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));

@@ -102,8 +102,10 @@ fn print_users(users: &Users, as_json: bool) -> Result<(), Failure> {
     users.people().try_for_each(|of| super::print(&format!("{:9}  {}\n", of.role, of.name)))
 }
 
-/// Reads a password for the user `name`. At a terminal, asks for it twice without showing it, and returns an error if
-/// the two differ. From a pipe, reads the first line.
+/// Reads a password for the user `name` from the standard input and returns it. At a terminal, asks for the password
+/// twice without showing it. From a pipe, reads the first line.
+///
+/// Returns an error if the two passwords differ, or if the input cannot be read.
 fn password(name: &str) -> Result<String, Failure> {
     if !io::stdin().is_terminal() {
         let mut line = String::new();

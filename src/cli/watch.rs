@@ -69,7 +69,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Prints one line per new state, for a file or a pipe.
+/// Follows a running cell without a full-screen view, for output to a file or a pipe. Prints one line (cycle and
+/// message) for `first` and for each later status from `watch`. Omits a line that equals the line before it.
+///
+/// When the cell sends no more status, prints the recorded result from the run folder `folder` and returns. Returns an
+/// error if the record contains no end of the run, or if printing fails.
 async fn in_lines(
     first: Snapshot,
     watch: &mut regrind_control::StatusStream,
@@ -89,8 +93,10 @@ async fn in_lines(
     Ok(Outcome::Accepted)
 }
 
-/// Returns the recorded result of a run after its program has stopped answering. Returns an error if the record has no
-/// end. `told` is the last answer of the program.
+/// Returns the recorded verdict of the run in `folder`, after its cell has stopped sending its status. `told` is the
+/// last result of waiting for the status; it gives the reason in the error.
+///
+/// Returns an error if the record does not contain the end of the run.
 fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Failure> {
     let summary = run_summary(folder).unwrap_or_default();
     if summary.ended.is_some() {
@@ -154,8 +160,10 @@ impl View {
         };
     }
 
-    /// Reads the newest recorded error map, if the status of the cell has changed and the last attempt is long enough
-    /// ago. Keeps the earlier map if there is no newer one.
+    /// Reads the newest error map in the record of the run and stores it for display. Does nothing if the status of the
+    /// cell has not changed since the last check, or if this check is less than [`BETWEEN_LOOKS`] ago.
+    ///
+    /// Keeps the displayed map if the record has no newer one, or if the newer map cannot be read.
     fn read_map(&mut self) {
         let number = self.snapshot.number;
         if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
@@ -272,7 +280,8 @@ impl View {
     }
 }
 
-/// Starts a thread that waits for pressed keys, and returns their receiver. Ctrl-C is received as Esc.
+/// Starts a thread that reads pressed keys, and returns the channel on which the keys arrive. Ctrl-C arrives as Esc.
+/// The thread ends when the channel is dropped.
 fn keys() -> mpsc::Receiver<KeyCode> {
     let (pressed, keys) = mpsc::channel(16);
     std::thread::spawn(move || {

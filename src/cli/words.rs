@@ -20,7 +20,8 @@ pub(super) fn counted(n: usize, noun: &str) -> String {
     format!("{} {noun}{}", count(n), if n == 1 { "" } else { "s" })
 }
 
-/// Returns three significant digits, without an exponent between 0.001 and a million.
+/// Formats `value` with three significant digits. Uses an exponent if the absolute value is below 0.001 or at least a
+/// million: "2.00e-5". Returns "0" for 0. Digits before the decimal point are never removed: "1234".
 pub(super) fn three_digits(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 {
@@ -33,8 +34,8 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.*}", (3 - before_point).max(0) as usize)
 }
 
-/// Returns a judged figure as text: its name, its value in µm, its limit if there is one, and the probability that it
-/// is within the limit.
+/// Formats a judged figure for people: its name, its value in µm, its limit in µm, and the probability that the value
+/// is within the limit. Omits limit and probability if the figure has no limit.
 pub(super) fn judged(compared: &ComparedFigure) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let ComparedFigure { name, median_mm: found_mm, limit_mm, .. } = compared;
@@ -43,8 +44,11 @@ pub(super) fn judged(compared: &ComparedFigure) -> String {
     format!("{name}: {} µm{of}{within}", um(*found_mm))
 }
 
-/// Returns the remaining time as text, from the minimum and the maximum in seconds: "3 to 5 min", or one number if both
-/// are equal.
+/// Formats the remaining time of a job as a range: "3 to 5 min". The argument holds the minimum and the maximum in
+/// seconds.
+///
+/// The maximum selects the unit: s below 90 s, min below 90 min, otherwise h with one decimal. If minimum and maximum
+/// are equal after rounding, returns one number: "50 s".
 pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     let (unit, name) = match most_s {
         s if s < 90.0 => (1.0, "s"),
@@ -56,8 +60,11 @@ pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
 }
 
-/// Wraps each line of `text` between words, at `columns` characters. If a line is a label, at least two spaces and a
-/// text, its continuation lines are indented to the text. A word that is longer than a line is not divided.
+/// Wraps each line of `text` between words, so that no line has more than `columns` characters. A word that is longer
+/// than a line is not divided.
+///
+/// Continuation lines have the indentation of the wrapped line. If the line consists of a label, at least two spaces
+/// and a text, they are indented to the start of this text.
 pub(super) fn wrapped(text: &str, columns: usize) -> String {
     let mut out = String::new();
     for line in text.lines() {
@@ -82,8 +89,12 @@ pub(super) fn wrapped(text: &str, columns: usize) -> String {
     out
 }
 
-/// Returns the indentation for the continuation of a line: the column after its label and two or more spaces. If this
-/// column is not in the left half of the line, or if there is no label, returns the indentation of the line itself.
+/// Returns the number of spaces before each continuation line of the wrapped line `line`. `columns` is the maximum
+/// width of a line.
+///
+/// If `line` has a label, then at least two spaces and a text, returns the position of the text. If this position is
+/// not in the left half of `columns`, or if there is no label, returns the indentation of `line`, but at most half of
+/// `columns`.
 fn text_begins(line: &str, columns: usize) -> usize {
     let begin = line.len() - line.trim_start().len();
     let label = line[begin..].find("  ").map(|at| begin + at);

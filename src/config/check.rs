@@ -27,8 +27,10 @@ pub(super) struct CheckedCell {
 }
 
 impl CheckedCell {
-    /// Builds the cell from the checked values. Returns `None` if a required value is missing or invalid. `renamed` are
-    /// the notes on keys with a new name.
+    /// Builds the configuration of the cell from the checked values. `path` is the path of the cell file and `text` its
+    /// content. `renamed` contains one note for each key that the file has under its old name.
+    ///
+    /// Returns `None` if a required value is missing or invalid.
     pub(super) fn into_cell(self, path: &Path, text: &str, renamed: Vec<String>) -> Option<CellConfig> {
         Some(CellConfig {
             name: self.name?,
@@ -55,8 +57,11 @@ struct MachineTables<'w> {
     signals: &'w [SignalTable],
 }
 
-/// Checks the tables of a cell file and converts their values. Reports each error to `document`. A value with an error
-/// is `None` in the result.
+/// Checks the tables of the cell file `written` and converts their values into the units of [`CellConfig`]. `path` is
+/// the path of the cell file; relative paths in the file are resolved against its folder. Adds each error to
+/// `document`.
+///
+/// In the result, a required value with an error is `None`.
 pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> CheckedCell {
     let (cmm, grinder) = (&written.cmm, &written.grinder);
     let machines = [
@@ -176,8 +181,9 @@ impl MachineTables<'_> {
     }
 }
 
-/// Returns the pose of the part in the fixture. The table states rotations about the fixed axes x, then y, then z, and
-/// then a translation.
+/// Returns the pose of the part in the fixture: the transformation from model coordinates to CMM coordinates, in
+/// millimetres. The table gives rotations in degrees about the fixed axes x, then y, then z of the CMM, and after them
+/// a translation in millimetres.
 fn fixture(written: &FixtureTable) -> Pose {
     let turn = |axis: usize| {
         let mut twist = Twist::zeros();

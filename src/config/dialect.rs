@@ -16,7 +16,7 @@ const BUILT_IN_DIALECTS: [(&str, &str); 4] = [
     ("heidenhain", include_str!("../../config/dialects/heidenhain.toml")),
 ];
 
-/// Returns the JSON schema of a dialect.
+/// Returns the JSON schema of a dialect file. A dialect is the format of the programs of one kind of machine control.
 pub fn dialect_schema() -> &'static serde_json::Value {
     &SCHEMA
 }
@@ -26,17 +26,19 @@ pub fn dialects() -> impl Iterator<Item = &'static str> {
     BUILT_IN_DIALECTS.iter().map(|(name, _)| *name)
 }
 
-/// Returns the path of the dialect file `dialect`, relative to the folder of the cell file `cell`. Returns `None` if
-/// `dialect` is the name of a built-in dialect.
+/// Returns the path of a dialect file. `dialect` is the path as written in the cell file; it is resolved against the
+/// folder of the cell file `cell`. Returns `None` if `dialect` is the name of a built-in dialect.
 pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
     let is_built_in = dialects().any(|name| name == dialect);
     (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))
 }
 
-/// Reads a built-in dialect or a dialect file.
+/// Returns the dialect (format of the programs of a machine control) that a cell file names. `dialect` is the name of a
+/// built-in dialect, or else the path of a dialect file. A relative path is resolved against the folder of the cell
+/// file `cell`.
 ///
 /// # Errors
-/// Returns an error if the file cannot be read, and all errors of its text.
+/// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
 pub(super) fn read_named_dialect(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
     match BUILT_IN_DIALECTS.iter().find(|(name, _)| *name == dialect) {
         Some((name, text)) => parse_dialect(Path::new(name), text).map(|(dialect, _)| dialect),

@@ -217,10 +217,11 @@ impl CellConfig {
         Self::parse(path, &text)
     }
 
-    /// Parses a cell file from its text. `path` is used in messages; relative folders are relative to its folder.
+    /// Parses a cell file from its content `text`. `path` is the path of the file: it appears in error messages, and
+    /// relative paths in the text are resolved against its folder.
     ///
     /// # Errors
-    /// Returns all errors of the text.
+    /// Returns all errors found in the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         let renamed = document.rename_keys(RENAMED);
@@ -233,21 +234,25 @@ impl CellConfig {
         })
     }
 
-    /// Returns a problem with the value of `key` that another module has found, with the position of the key in the
-    /// file. `found` describes the value, `allowed` the permitted values, and `remedy` what to do.
+    /// Builds an error report about one key of this cell file, for an error that another module has found. The report
+    /// shows the position of `key` in the file. `found` describes the present value, `allowed` the permitted values,
+    /// and `remedy` the action that corrects the error.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
 
-    /// Returns notes for people: on keys that have a new name, and on wires, such as a serial port that does not exist
-    /// on this computer. A note is not an error, because the file can be checked on a computer other than the cell's.
+    /// Returns notes for people about this cell file. A note is about a key under its old name, or about the connection
+    /// to a machine, for example a serial port that this computer does not have.
+    ///
+    /// A note is not an error, because the file can be checked on a computer other than that of the cell.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = [self.renamed.clone(), self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
         notes.dedup();
         notes
     }
 
-    /// Returns a note for each key that has a new name, with its line. The old names of earlier files are read.
+    /// Returns one note for each key that the cell file has under its old name. The note states the line and the new
+    /// name. The value under an old name is still used.
     pub fn renamed_keys(&self) -> &[String] {
         &self.renamed
     }
@@ -257,7 +262,7 @@ impl CellConfig {
         self.simulated || self.rehearsal
     }
 
-    /// Returns true if people serve both machines.
+    /// Returns true if persons operate both machines by hand: neither machine has an automatic connection.
     pub fn is_manual(&self) -> bool {
         [&self.cmm.link, &self.grinder.link].iter().all(|link| link.wire.is_by_person())
     }

@@ -83,10 +83,11 @@ impl PlantConfig {
         Self::parse(path, &read_text(path)?)
     }
 
-    /// Parses a plant file from its text. `path` is used in messages; relative files are relative to its folder.
+    /// Parses a plant file from its content `text`. `path` is the path of the file: it appears in error messages, and
+    /// relative paths in the text are resolved against its folder.
     ///
     /// # Errors
-    /// Returns all errors of the text.
+    /// Returns all errors found in the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.check_schema(&SCHEMA);
@@ -118,8 +119,9 @@ impl PlantConfig {
         })
     }
 
-    /// Returns a problem with the value of `key` that another module has found, with the position of the key in the
-    /// file. `found` describes the value, `allowed` the permitted values, and `remedy` what to do.
+    /// Builds an error report about one key of this plant file, for an error that another module has found. The report
+    /// shows the position of `key` in the file. `found` describes the present value, `allowed` the permitted values,
+    /// and `remedy` the action that corrects the error.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, &[], key, [found, allowed, remedy])
     }
@@ -135,7 +137,8 @@ impl PlantConfig {
     }
 }
 
-/// Returns a file path resolved relative to the folder of the plant file.
+/// Returns the path `file` resolved against the folder `at` of the plant file; an absolute path is unchanged. Returns
+/// `None` if `file` is `None`.
 fn resolve_path(at: &Path, file: Option<PathBuf>) -> Option<PathBuf> {
     file.map(|file| at.join(file))
 }

@@ -208,8 +208,8 @@ pub struct CycleRow {
 }
 
 impl CycleRow {
-    /// Returns the judged PV and RMS of a cycle in µm. For a figure without a judged value, returns that of all points
-    /// used in the registration.
+    /// Returns `[PV, RMS]` of a cycle in µm, as they are judged against the limits. If no judged value exists for one
+    /// of them, returns the value of all points that the registration used instead.
     pub fn judged_um(&self) -> [f64; 2] {
         [self.judged_pv_um.unwrap_or(self.pv_um), self.judged_rms_um.unwrap_or(self.rms_um)]
     }

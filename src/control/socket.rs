@@ -79,13 +79,16 @@ pub struct Control {
 }
 
 impl Control {
-    /// Opens the control endpoint of a run folder. Requests of clients are sent to `orders`, and watching clients
-    /// receive each new value of `status`. If `watched` is true, an endpoint that is removed or replaced is created
-    /// again and reported by [`Self::changed`].
+    /// Opens the control endpoint (a Unix socket, or a pipe on Windows) of the run folder `folder` and serves its
+    /// clients in the background. Sends the orders of clients to `orders`. Sends each new value of `status` to the
+    /// clients that watch the cell.
+    ///
+    /// If `watched` is true, checks periodically that the socket file exists. A socket file that was removed or
+    /// replaced is created again, and [`Self::changed`] reports this.
     ///
     /// # Errors
-    /// The folder cannot hold a socket, for example because its path is too long for the operating system; or another
-    /// program has the pipe.
+    /// Returns an error if the endpoint cannot be created. For example, the path of the folder is too long for a
+    /// socket, or another program already has the pipe.
     pub fn listen(
         folder: &Path,
         orders: mpsc::Sender<ReceivedOrder>,
@@ -105,10 +108,11 @@ impl Control {
         Ok(Self { folder: folder.to_owned(), second_place: None, service: desk, changes, tasks })
     }
 
-    /// Listens also at a second path, for the user of this program and root only. Does nothing on Windows.
+    /// Opens a second control endpoint at the path `place`, in addition to the endpoint in the run folder. Only the
+    /// user of this program and root can connect to it. Does nothing on Windows.
     ///
     /// # Errors
-    /// No socket can be created at that path.
+    /// Returns an error if no socket can be created at that path.
     pub fn listen_also_at(&mut self, place: &Path) -> io::Result<()> {
         let Some(door) = Endpoint::open_for_user(place)? else { return Ok(()) };
         self.second_place = Some(place.to_owned());
@@ -117,8 +121,9 @@ impl Control {
         Ok(())
     }
 
-    /// Waits until the endpoint in the run folder is lost or created again, and returns which of the two has happened.
-    /// Never returns if the endpoint is not watched.
+    /// Waits for a change of the endpoint in the run folder and returns it: the endpoint was lost, or it was created
+    /// again. If the endpoint is not watched (see [`Self::listen`]), waits without end. This is always the case on
+    /// Windows.
     pub async fn changed(&mut self) -> EndpointChange {
         match self.changes.recv().await {
             Some(change) => change,
@@ -138,8 +143,9 @@ impl Drop for Control {
     }
 }
 
-/// Accepts the clients of the endpoint `door`, and serves each in a task. After a replacement arrives in `made_again`,
-/// accepts the clients of that endpoint instead.
+/// Accepts clients without end and serves each of them in a separate task with the channels in `desk`. `door` is the
+/// endpoint on which clients connect. If a new endpoint arrives in `made_again`, this endpoint replaces `door`. After
+/// an error, waits [`ACCEPT_RETRY_INTERVAL`] and continues.
 async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpoint>, desk: ControlService) {
     loop {
         let caller = tokio::select! {
@@ -161,8 +167,14 @@ async fn accept_clients(mut door: Endpoint, mut made_again: mpsc::Receiver<Endpo
     }
 }
 
-/// Checks periodically that the endpoint `mark` still exists. If it does not, creates it again, sends the new one to
-/// `hand_over` and the change to `tell`. Uses a separate thread for disk access, so that a slow disk delays no order.
+/// Checks every [`CHECK_INTERVAL`] that the socket file of the endpoint still exists. `mark` is the identity of this
+/// file.
+///
+/// If the file was removed or replaced, creates a new endpoint and sends it to `hand_over`. Reports the loss and the
+/// recovery to `tell`. If the endpoint cannot be created, the report of the loss contains the reason, and the next
+/// check tries again.
+///
+/// The disk is accessed in a separate thread, so that a slow disk does not delay orders.
 async fn restore_if_removed(
     mut mark: endpoint::EndpointIdentity,
     tell: mpsc::UnboundedSender<EndpointChange>,
@@ -198,7 +210,12 @@ async fn restore_if_removed(
     }
 }
 
-/// Reads the request of a client, and answers it.
+/// Reads one request line from the client `caller`, executes it with the channels in `desk`, and sends the reply. A
+/// client that asks to watch the cell then receives its status until the connection ends.
+///
+/// Replies with a refusal if the request is invalid or contains misleading characters. Also refuses another watching
+/// client if [`MAX_WATCHERS`] clients already watch. Executes nothing if the client has already closed the connection.
+/// Returns an error if reading or writing fails or takes longer than [`IO_TIMEOUT`].
 async fn serve_client(caller: Client, desk: ControlService) -> io::Result<()> {
     let ControlService { orders, mut status, watcher_permits: places } = desk;
     let peer = caller.actor()?;
@@ -228,7 +245,11 @@ async fn serve_client(caller: Client, desk: ControlService) -> io::Result<()> {
     send_reply(&mut write, &reply).await
 }
 
-/// Passes an order to the cell, and waits for its reply.
+/// Sends `request` to the cell through `orders`, waits for the answer and returns it. `actor` is the person to record
+/// for the request. A request for the status is answered at once from `status`.
+///
+/// Returns a refusal if the run is over, or if the cell does not answer within [`ANSWER_TIMEOUT`]. In the second case
+/// it is unknown whether the cell accepts the order.
 async fn forward_request(
     request: Request,
     actor: Actor,
@@ -258,8 +279,11 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
     Reply { taken: false, message, status: status.borrow().clone() }
 }
 
-/// Sends the state of the cell after every change, and repeats it after [`MAX_LINE_INTERVAL`] without a change, so
-/// that silence means that the cell is gone.
+/// Sends the present `status` of the cell to a client through `write`, and sends it again after each change, but at
+/// most once per [`MIN_LINE_INTERVAL`]. Without a change, repeats the status after [`MAX_LINE_INTERVAL`]. So the client
+/// can conclude from a longer silence that the cell is gone.
+///
+/// Returns when the run ends. Returns an error if the client cannot be reached.
 async fn stream_status(write: &mut ClientWriter, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
@@ -278,8 +302,10 @@ async fn send_reply(write: &mut ClientWriter, reply: &Reply) -> io::Result<()> {
     tokio::time::timeout(IO_TIMEOUT, write.write_all(&text)).await?
 }
 
-/// Returns the person to record for a request. `peer` is the user of the program that sent it; `by` is the person for
-/// whom the program says that it acts. The result names both, because the program could state any name in `by`.
+/// Returns the person to record for a request. `peer` is the user of the program that sent the request, as identified
+/// by the operating system. `by` is the person whom this program names as the origin of the request.
+///
+/// The result contains both names, because the program can state any name in `by`. Without `by`, the result is `peer`.
 fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
     let Some(by) = by else { return peer };
     let name = by.name.map_or(peer.name.clone(), |name| format!("{name}, by a program of {}", peer.name));
@@ -291,32 +317,37 @@ pub fn is_live(folder: &Path) -> bool {
     endpoint::is_listening(folder)
 }
 
-/// Returns true if a cell listens on an endpoint outside a run folder.
+/// Returns true if a cell listens for orders on the second endpoint at the path `place`, outside the run folder.
+/// Returns false if the endpoint belongs to another user (except root). Always returns false on Windows.
 pub fn is_live_at(place: &Path) -> bool {
     endpoint::is_listening_at(place)
 }
 
-/// Sends a request to a running cell, and blocks until its reply.
+/// Sends `request` to the cell that runs in the run folder `folder`, blocks until the reply arrives, and returns the
+/// reply.
 ///
 /// # Errors
-/// No cell runs in that folder, or it does not answer.
+/// Returns an error if no cell runs in the folder, or if the cell does not answer in time.
 pub fn send_request(folder: &Path, request: &Request) -> io::Result<Reply> {
     send_request_on_behalf(folder, request, None)
 }
 
-/// Sends a request to a running cell on behalf of another person, and blocks until its reply.
+/// Sends `request` to the cell that runs in the run folder `folder`, blocks until the reply arrives, and returns the
+/// reply. `by` is the person for whom this program sends the request; `None` means the user of this program.
 ///
 /// # Errors
-/// Those of [`send_request`].
+/// Returns the same errors as [`send_request`].
 pub fn send_request_on_behalf(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
     let text = endpoint::exchange_line(folder, &encode_line(request, by)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)
 }
 
-/// Sends a request to the cell of an endpoint outside a run folder, and blocks until its reply.
+/// Sends `request` to the cell that listens on the second endpoint at the path `place`, outside the run folder. Blocks
+/// until the reply arrives, and returns the reply.
 ///
 /// # Errors
-/// No cell listens at that path, the endpoint belongs to another user, or the cell does not answer.
+/// Returns an error if no cell listens at that path, if the endpoint belongs to another user, or if the cell does not
+/// answer in time.
 pub fn send_request_at(place: &Path, request: &Request) -> io::Result<Reply> {
     let text = endpoint::exchange_line_at(place, &encode_line(request, None)?, IO_TIMEOUT)?;
     Ok(serde_json::from_str(&text)?)
@@ -335,10 +366,11 @@ pub struct StatusStream {
     _write: CellWriter,
 }
 
-/// Starts to watch a running cell.
+/// Connects to the cell that runs in the run folder `folder` and asks for its status. Returns a stream that yields the
+/// present status and then each new status, see [`StatusStream::next`].
 ///
 /// # Errors
-/// No cell runs in that folder.
+/// Returns an error if no cell runs in the folder.
 pub async fn watch(folder: &Path) -> io::Result<StatusStream> {
     let (read, mut write) = endpoint::open_connection(folder).await?;
     write.write_all(&encode_line(&Request::Watch, None)?).await?;
@@ -346,10 +378,12 @@ pub async fn watch(folder: &Path) -> io::Result<StatusStream> {
 }
 
 impl StatusStream {
-    /// Waits for the next state of the cell, and returns it; `None` if the cell has closed the connection.
+    /// Waits for the next status of the cell and returns it. The cell repeats an unchanged status about once per
+    /// second. Returns `None` if the cell has closed the connection.
     ///
     /// # Errors
-    /// The cell is silent for too long, its line cannot be parsed, or too many clients watch already.
+    /// Returns an error if the cell sends nothing for 2.5 s, if a line cannot be parsed, or if the cell refuses because
+    /// too many clients already watch.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE_TIMEOUT, self.lines.next_line()).await?? else { return Ok(None) };
         let Reply { taken, message, status } = serde_json::from_str(&text)?;

@@ -40,12 +40,13 @@ pub(crate) struct SelectedInverse<'a> {
 }
 
 impl SparsityPattern {
-    /// Prepares the factorization of all symmetric matrices with one sparsity pattern: computes a fill-reducing order
-    /// and the symbolic Cholesky factorization.
+    /// Prepares the Cholesky factorization of all symmetric matrices with the same sparsity pattern. Computes a
+    /// fill-reducing order of the rows, and the symbolic factorization.
     ///
-    /// The pattern is the lower triangle by columns: `begins` has the index of the first entry of each column and the
-    /// number of entries as its end, `rows` the row of each entry, ascending within a column. Returns `None` if there
-    /// is not enough memory. Panics if the pattern is not valid.
+    /// The arguments describe the lower triangle column by column. `rows` contains the row of each entry, in ascending
+    /// order within a column. `begins[c]` is the index in `rows` of the first entry of column c. One more element at
+    /// the end of `begins` contains the number of entries. Returns `None` if there is not enough memory. Panics if the
+    /// pattern is not valid.
     pub fn new(columns: usize, begins: Vec<usize>, rows: Vec<usize>) -> Option<Self> {
         let matrix = SymbolicSparseColMat::new_checked(columns, columns, begins, None, rows);
         let params = CholeskySymbolicParams {
@@ -71,8 +72,9 @@ impl SparsityPattern {
         }
     }
 
-    /// Computes the Cholesky factor of a matrix with this pattern. `values` holds its entries in the order of the
-    /// pattern. Returns `None` if the matrix is not positive definite or there is not enough memory.
+    /// Computes the Cholesky factor of a matrix with this sparsity pattern. `values` contains the entries of the lower
+    /// triangle, in the order of the pattern. Returns `None` if the matrix is not positive definite or if there is not
+    /// enough memory.
     pub fn factor(&self, values: &[f64]) -> Option<CholeskyFactor<'_>> {
         let matrix = SparseColMatRef::new(self.matrix.as_ref(), values);
         let mut factor = vec![0.0; self.symbolic.len_val()];
@@ -88,7 +90,8 @@ impl SparsityPattern {
 }
 
 impl<'a> CholeskyFactor<'a> {
-    /// Solves the system of equations for the right-hand side `right`. Returns `None` if there is not enough memory.
+    /// Solves A x = b for x, where A is the factored matrix and `right` is b. Returns `None` if there is not enough
+    /// memory.
     pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
         let symbolic = &self.pattern.symbolic;
         let mut solution = right.to_vec();
@@ -102,8 +105,8 @@ impl<'a> CholeskyFactor<'a> {
         Some(solution)
     }
 
-    /// Computes the entries of the inverse matrix at all places where the Cholesky factor has entries (selected
-    /// inverse). Returns `None` if the factor has no supernodes.
+    /// Computes the selected inverse: the entries of the inverse matrix at the positions where the Cholesky factor has
+    /// entries. Returns `None` if the factor is not stored in supernodes (blocks of columns with the same pattern).
     pub fn selected_inverse(&self) -> Option<SelectedInverse<'a>> {
         let symbolic = self.pattern.blocks()?;
         let factor = SupernodalLltRef::new(symbolic, &self.values);
@@ -151,8 +154,9 @@ impl SelectedInverse<'_> {
         place.map_or(f64::NAN, |place| self.blocks[s][(place, column - begin)])
     }
 
-    /// Returns the dense block of the inverse for some `rows` (ascending) of the factor. The supernodes that contain
-    /// these rows must already be computed. `local` is working memory with one element for each row of the matrix.
+    /// Returns the symmetric dense block of the inverse whose rows and columns are `rows` of the Cholesky factor.
+    /// `rows` must be in ascending order. The inverse must already be computed for all supernodes (blocks of columns)
+    /// that contain these rows. `local` is working memory with one element for each row of the matrix.
     fn on_rows(&self, rows: &[usize], local: &mut [usize]) -> Mat<f64> {
         let mut dense = Mat::zeros(rows.len(), rows.len());
         let Some(symbolic) = self.pattern.blocks() else { return dense };

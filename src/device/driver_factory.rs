@@ -84,59 +84,70 @@ pub trait DriverFactory {
     /// run.
     const READS_RUN_FOLDER: bool = false;
 
-    /// Reports to the document the errors in the table of the wire that the schema does not detect.
+    /// Checks the table `wire` of a machine, which describes the connection to this machine. Adds each error that the
+    /// schema of the cell file does not detect to the cell file `_document`. `_place` states whether the table belongs
+    /// to the CMM or to the grinder. The default reports no error.
     fn check(&self, _place: &MachineTable<'_>, _document: &mut Document) {}
 
-    /// Reports to the document the conflicts between this wire, which is that of the CMM, and the wire of the grinder.
+    /// Compares this table `wire`, which belongs to the CMM, with the table `_grinder` of the grinder. Adds each
+    /// conflict, for example a folder that both machines use, to the cell file `_document`. The default reports no
+    /// conflict.
     fn check_against_grinder(&self, _grinder: &Self, _document: &mut Document) {}
 
-    /// Returns notes for a person about this wire on this computer, for example that a serial port does not exist. They
-    /// are no errors of the cell file.
+    /// Returns notes for a person about this connection on this computer, for example that a serial port does not
+    /// exist. These notes are not errors of the cell file. The default returns an empty list.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Returns whether the coordinates of a measurement are probe centres or contact points. Returns `None` if each
-    /// result states this itself.
+    /// Returns whether the points of a measurement through this connection are probe centres or contact points. Returns
+    /// `None` if the connection does not determine this; each result must then state it. The default is probe centres.
     fn coordinates(&self) -> Option<Coordinates> {
         Some(Coordinates::Centres)
     }
 
-    /// Creates the driver of a measuring machine. Sends nothing to the machine yet.
+    /// Creates the driver of a measuring machine from this table `wire` and the other data in `making`. Sends nothing
+    /// to the machine yet.
     ///
     /// # Errors
-    /// The wire cannot be opened, a folder does not exist, or a file cannot be read.
+    /// Returns an error if this kind of connection has no driver for a measuring machine, if the connection cannot be
+    /// opened, if a folder does not exist, if a file cannot be read, or if the cell file lacks a required value.
     fn create_cmm(&self, making: &DriverContext<'_>) -> Result<Self::Cmm, DriverError>;
 
-    /// Creates the driver of a grinder. Sends nothing to the machine yet.
+    /// Creates the driver of a grinder from this table `wire` and the other data in `making`. Sends nothing to the
+    /// machine yet.
     ///
     /// # Errors
-    /// The errors of [`DriverFactory::create_cmm`].
+    /// Returns an error if this kind of connection has no driver for a grinder. Otherwise the errors are those of
+    /// [`DriverFactory::create_cmm`].
     fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError>;
 
-    /// Returns the Modbus line that the driver uses and that the driver of another machine may share. Returns `None`
-    /// for other wires.
+    /// Returns the Modbus line that the driver `_cmm` uses. The driver of the other machine may share this line.
+    /// Returns `None` if the connection is not Modbus.
     fn link(_cmm: &Self::Cmm) -> Option<&Link> {
         None
     }
 
-    /// Returns host and port of the I++ DME server, or `None` if this is another wire.
+    /// Returns the host and the TCP port of the I++ DME server of the machine. Returns `None` if the connection does
+    /// not use I++ DME.
     fn ippdme_address(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// Returns where the hit lines come from, or `None` if this wire has no hit lines.
+    /// Returns the source of the hit lines: a serial port or a terminal server. A hit line is the line of text that a
+    /// measuring machine prints for each touch. Returns `None` if the connection does not use hit lines.
     fn hit_source(&self) -> Option<HitSource> {
         None
     }
 
-    /// Returns host and port of the server linuxcncrsh, or `None` if this is another wire.
+    /// Returns the host and the TCP port of linuxcncrsh, the server of a LinuxCNC control. Returns `None` if the
+    /// connection does not use this server.
     fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// Returns the Modbus line and the unit number on it, or `None` if this is not a Modbus wire. A simulated machine
-    /// is served there.
+    /// Returns the address of the Modbus line and the number of the machine's unit on this line. A simulated machine
+    /// listens at the same address. Returns `None` if the connection is not Modbus.
     fn modbus_line(&self) -> Option<(LineAddress, u8)> {
         None
     }

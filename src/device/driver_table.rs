@@ -44,13 +44,16 @@ macro_rules! drivers {
         }
 
         impl Wire {
-            /// Reports to the document the errors of this wire that the schema does not detect.
+            /// Checks this wire (the connection to one machine, from its table in the cell file). Adds each error that
+            /// the schema of the cell file does not detect to the cell file `document`. `place` states whether the wire
+            /// belongs to the CMM or to the grinder.
             pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
                 match self { $(Self::$wire(wire) => DriverFactory::check(wire, place, document)),+ }
             }
 
-            /// Reports to the document the conflicts between this wire, which is that of the CMM, and the wire of the
-            /// grinder.
+            /// Compares this wire (the connection to the CMM) with the wire `grinder`. Adds each conflict, for example
+            /// a folder that both machines use, to the cell file `document`. Reports nothing if the two wires are of
+            /// different kinds.
             pub fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
                 match (self, grinder) {
                     $((Self::$wire(cmm), Self::$wire(grinder)) => DriverFactory::check_against_grinder(cmm, grinder, document),)+
@@ -58,8 +61,8 @@ macro_rules! drivers {
                 }
             }
 
-            /// Returns notes for a person about this wire on this computer, for example that a serial port does not
-            /// exist.
+            /// Returns notes for a person about this wire (the connection to one machine) on this computer, for example
+            /// that a serial port does not exist. Returns an empty list if there is nothing to report.
             pub fn notes(&self) -> Vec<String> {
                 match self { $(Self::$wire(wire) => wire.notes()),+ }
             }
@@ -74,62 +77,72 @@ macro_rules! drivers {
                 match self { $(Self::$wire(_) => <$table>::REPORTS_TEMPERATURE),+ }
             }
 
-            /// Returns true if the tables `registers` and `signals` of a cell file apply to this wire.
+            /// Returns true if the tables `registers` and `signals` of a cell file apply to this wire (the connection
+            /// to one machine). This is so for Modbus.
             pub fn has_registers(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }
             }
 
-            /// Returns true if a grinder on this wire takes its program and its map from the folder of the run.
+            /// Returns true if a grinder on this wire (the connection to one machine) reads its program and its
+            /// correction map from the folder of the run.
             pub fn reads_run_folder(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::READS_RUN_FOLDER),+ }
             }
 
-            /// Returns whether the coordinates of a measurement are probe centres or contact points. Returns `None` if
-            /// each result states this itself.
+            /// Returns whether the points of a measurement through this wire (the connection to one machine) are probe
+            /// centres or contact points. Returns `None` if the wire does not determine this; each result must then
+            /// state it.
             pub fn coordinates(&self) -> Option<Coordinates> {
                 match self { $(Self::$wire(wire) => wire.coordinates()),+ }
             }
 
-            /// Returns the Modbus line and the unit number on it, or `None` if this is not a Modbus wire.
+            /// Returns the address of the Modbus line and the number of the machine's unit on this line. Returns `None`
+            /// if this wire is not Modbus.
             pub fn modbus_line(&self) -> Option<(LineAddress, u8)> {
                 match self { $(Self::$wire(wire) => DriverFactory::modbus_line(wire)),+ }
             }
 
-            /// Returns host and port of the I++ DME server, or `None` if this is another wire.
+            /// Returns the host and the TCP port of the I++ DME server of the machine. Returns `None` if this wire does
+            /// not use I++ DME.
             pub fn ippdme_address(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => DriverFactory::ippdme_address(wire)),+ }
             }
 
-            /// Returns where the hit lines come from, or `None` if this wire has no hit lines.
+            /// Returns the source of the hit lines: a serial port or a terminal server. A hit line is the line of text
+            /// that a measuring machine prints for each touch. Returns `None` if this wire does not use hit lines.
             pub fn hit_source(&self) -> Option<HitSource> {
                 match self { $(Self::$wire(wire) => DriverFactory::hit_source(wire)),+ }
             }
 
-            /// Returns host and port of the server linuxcncrsh, or `None` if this is another wire.
+            /// Returns the host and the TCP port of linuxcncrsh, the server of a LinuxCNC control. Returns `None` if
+            /// this wire does not use this server.
             pub fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => DriverFactory::linuxcncrsh_address(wire)),+ }
             }
 
-            /// Creates the driver of a measuring machine. Sends nothing to the machine yet.
+            /// Creates the driver of a measuring machine on this wire. `making` contains the other data of the cell
+            /// that the driver needs. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// The errors of [`DriverFactory::create_cmm`].
+            /// The errors of [`DriverFactory::create_cmm`], for example a serial port or a folder that does not exist.
             pub fn create_cmm(&self, making: &DriverContext<'_>) -> Result<AnyCmm, DriverError> {
                 Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.create_cmm(making)?)),+ })
             }
 
-            /// Creates the driver of a grinder. Sends nothing to the machine yet.
+            /// Creates the driver of a grinder on this wire. `making` contains the other data of the cell that the
+            /// driver needs. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// The errors of [`DriverFactory::create_grinder`].
+            /// The errors of [`DriverFactory::create_grinder`], for example a serial port or a folder that does not
+            /// exist.
             pub fn create_grinder(&self, making: &DriverContext<'_>) -> Result<AnyGrinder, DriverError> {
                 Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.create_grinder(making)?)),+ })
             }
         }
 
         impl AnyCmm {
-            /// Returns the Modbus line that the driver uses and that the driver of another machine may share. Returns
-            /// `None` for other wires.
+            /// Returns the Modbus line that this driver uses. The driver of the other machine may share this line.
+            /// Returns `None` if the machine is not connected by Modbus.
             pub fn link(&self) -> Option<&Link> {
                 match self { $(Self::$wire(cmm) => <$table>::link(cmm)),+ }
             }

@@ -283,8 +283,10 @@ pub enum DeviceError {
 const BUSY: [u8; 6] = [4, 5, 6, 8, 10, 11];
 
 impl DeviceError {
-    /// Returns true if the communication failed or the access to the machine was lost, so that the machine itself may
-    /// be unaffected. Any other error is a clear refusal of the machine.
+    /// Returns true if the error concerns only the access to the machine, so that the machine itself may be unaffected.
+    /// Examples are a timeout, a lost connection, a folder that cannot be read, another client that took control, or a
+    /// Modbus exception that says that the machine is busy. Returns false for every other error, for example if the
+    /// machine refuses a command.
     pub fn is_link(&self) -> bool {
         self.is_busy()
             || matches!(
@@ -303,8 +305,8 @@ impl DeviceError {
             )
     }
 
-    /// Returns true for a Modbus exception with which the machine, or a gateway before it, answers that it cannot carry
-    /// out the request now. A retry may succeed.
+    /// Returns true if the error is a Modbus exception that says that the request cannot be carried out now. The
+    /// machine, or a gateway between this computer and the machine, sends such an exception. A retry may succeed.
     pub(super) fn is_busy(&self) -> bool {
         matches!(self, Self::Exception { code, .. } if BUSY.contains(code))
     }

@@ -47,7 +47,8 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identity of a machine that a person operates. It has no limit for the silence of its client.
+    /// Returns the identity of a machine that a person operates. `name` is the name of the machine. The identity has no
+    /// boot id and no silence limit: such a machine does not stop when this program is silent.
     pub(super) fn for_manual_machine(kind: MachineKind, name: &str) -> Self {
         Self { kind, name: name.to_owned(), boot_id: 0, simulation: false, silence_limit_s: None }
     }
@@ -65,7 +66,8 @@ pub struct Job {
 }
 
 impl Job {
-    /// Returns the cycle and the batch of touches to which this job belongs.
+    /// Returns the cycle of this job and the number of its batch. A measurement may be divided into several batches of
+    /// touches; the first batch has the number 0.
     pub fn batch_id(&self) -> BatchId {
         BatchId::decode(self.cycle)
     }
@@ -93,14 +95,16 @@ impl BatchId {
     /// Number of batches that the encoding can distinguish; a measurement has fewer.
     pub const MAX_BATCHES: u32 = 64;
 
-    /// Decodes cycle and batch from `seen`, the cycle number that a machine is given.
+    /// Decodes the cycle and the batch from `seen`, the single number of 16 bits that a machine receives as its cycle.
+    /// This is the inverse of [`BatchId::encode`].
     pub fn decode(seen: u16) -> Self {
         let seen = u32::from(seen);
         Self { cycle: seen % Self::MAX_CYCLES, batch: seen / Self::MAX_CYCLES }
     }
 
-    /// Encodes cycle and batch as the one cycle number that a machine is given. Different batches of a run have
-    /// different numbers if cycle and batch are below their limits.
+    /// Encodes the cycle and the batch as the single number of 16 bits that a machine receives as its cycle: cycle +
+    /// 1024 · batch. The number is unique within a run if the cycle is less than 1024 and the batch less than 64.
+    /// Larger values wrap around.
     pub fn encode(self) -> u16 {
         (self.cycle % Self::MAX_CYCLES + Self::MAX_CYCLES * (self.batch % Self::MAX_BATCHES)) as u16
     }
@@ -115,8 +119,8 @@ impl fmt::Display for BatchId {
     }
 }
 
-/// Returns the digest of the payloads of a job: the CRC-32 over their identities. For a CMM this is the plan; for a
-/// grinder the map, then the pass.
+/// Returns the digest of a job: the CRC-32 of the identities (SHA-256) of its payloads, in the given order. The payload
+/// of a CMM job is the plan. The payloads of a grinder job are the correction map and then the pass.
 pub fn digest(identities: &[[u8; 32]]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     for identity in identities {

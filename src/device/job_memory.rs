@@ -22,15 +22,17 @@ impl<Load> JobMemory<Load> {
         Self { loaded: None, unresolved: None, last_start_sequence: 0, reported_points: 0 }
     }
 
-    /// Restores the start `intended` that an interrupted run had sent. The job is not begun again, and its outcome is
-    /// unresolved.
+    /// Stores the job and the start number of `intended`, the start that an interrupted run had sent. Does not start
+    /// the job again. The job becomes unresolved, which means that its outcome is not known. The next start gets a
+    /// number above the start number of `intended`.
     pub(crate) fn restore(&mut self, intended: &Armed) {
         self.unresolved = Some((intended.job, intended.start_sequence));
         self.last_start_sequence = self.last_start_sequence.max(intended.start_sequence);
     }
 
-    /// Returns the payload that was loaded for a job, or `None` if another payload or none is loaded. Also forgets the
-    /// unresolved job, because the cell prepares another job only after it has resolved that one.
+    /// Returns the loaded payload if its digest equals the digest in `job`. Returns `None` if no payload is loaded or
+    /// if the digest differs. Also deletes the unresolved job, because the cell prepares a new job only after the
+    /// outcome of the old job is known.
     pub(crate) fn payload_for(&mut self, job: Job) -> Option<Arc<Load>> {
         self.unresolved = None;
         self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest).map(|(load, _)| Arc::clone(load))

@@ -16,70 +16,91 @@ pub trait Machine: Send {
     /// Returns the name of this machine in messages, for example `cmm at 10.0.0.5:502, unit 1`.
     fn name(&self) -> &str;
 
-    /// Returns notes for a person in addition to the status: which files are awaited, which files were ignored and why.
-    /// Empty for a machine that reports everything in its status.
+    /// Returns lines of text for the operator that the status does not contain. Examples: which files the driver waits
+    /// for, and which files it ignored and why. Returns an empty list if the status of the machine contains everything.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Opens the connection to the machine. Proves that the machine at its other end is the intended one, before
-    /// anything is written to it.
+    /// Opens the connection to the machine and returns the identity that the machine reports. Checks the identity
+    /// before any command or payload is written.
+    ///
+    /// # Errors
+    /// The machine cannot be reached, or it is not the intended machine.
     fn connect(&mut self) -> impl Future<Output = Result<Identity, DeviceError>> + Send;
 
     /// Returns the present status of the machine. The request also shows the machine that its client is alive, so call
     /// it twice a second or more.
     fn status(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Restores a start that an interrupted run had prepared and possibly sent. Implemented for machines without a
-    /// memory of jobs: such a machine counts as possibly moving until a person confirms the outcome.
+    /// Restores the start `_intended` of an interrupted run, after a restart of this program. It is not known if the
+    /// machine has begun this job. After the call, the machine counts as possibly moving until a person confirms the
+    /// outcome.
+    ///
+    /// Does nothing by default. Only drivers of machines without a memory of jobs implement it.
     fn restore(&mut self, _intended: &Armed) {}
 
-    /// Makes this client the owner of the machine.
+    /// Makes this client the owner of the machine. Returns the status with which the machine acknowledges this.
     fn claim(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Lets the machine check its payloads and interlocks for a job. Nothing moves. Journal the returned `Armed` before
-    /// you pass it to [`Machine::start`].
+    /// Asks the machine to check the loaded payloads and its interlocks for `job`. Nothing moves. Returns an `Armed`:
+    /// the checked job with the number of the START that would begin it. Write the `Armed` to the journal before you
+    /// pass it to [`Machine::start`].
     fn prepare(&mut self, job: Job) -> impl Future<Output = Result<Armed, DeviceError>> + Send;
 
-    /// Begins the job, at most once. The call uses the `Armed` up, whatever its result.
+    /// Sends the START of a prepared job. The machine begins the job at most once. The call consumes `armed`, whatever
+    /// the result. An earlier call with a copy of `armed` may already have begun the job.
     ///
-    /// * `Ok`: the machine confirms that this START has begun the job.
-    /// * [`DeviceError::Refused`]: the machine refused, or its state before anything was sent did not allow a start.
+    /// - `Ok`: the machine confirms that this START has begun the job.
+    /// - [`DeviceError::Refused`]: the machine refused, or its state before anything was sent did not allow a start.
     ///   This START did not begin the job. Prepare again.
-    /// * [`DeviceError::StartUnknown`], or the future was dropped: the outcome is unknown. Only [`Machine::reconcile`]
+    /// - [`DeviceError::StartUnknown`], or the future was dropped: the outcome is unknown. Only [`Machine::reconcile`]
     ///   can determine it.
-    /// * Any other error occurs before the START is sent: if the `Armed` is used for the first time, nothing was begun.
+    /// - Any other error: this call has not sent the START. If no earlier call used a copy of `armed`, no job was
+    ///   begun.
     fn start(&mut self, armed: Armed) -> impl Future<Output = Result<Started, DeviceError>> + Send;
 
-    /// Holds the job at the next safe position, with the wheel or probe clear of the part.
+    /// Commands the machine to pause the job at the next safe position, with the wheel or probe clear of the part.
+    /// Returns the status with which the machine acknowledges the command. The machine may still be moving then: call
+    /// [`Machine::status`] until the state is HELD.
     fn hold(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Continues after a hold.
+    /// Continues the job after a hold. Returns the status with which the machine acknowledges the command.
     fn resume(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Ends the job in order, clear of the part.
+    /// Commands the machine to end the job in an orderly way, with the wheel or probe clear of the part. Returns the
+    /// status with which the machine acknowledges the command. The machine may still be moving then.
     fn stop(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Ends the job at once; only the safe sequence runs. Needs no ownership.
+    /// Commands the machine to end the job at once. The machine then runs only its safe sequence. Any client may abort;
+    /// it need not be the owner. Returns the status with which the machine acknowledges the command.
     fn abort(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Leaves ABORTED or FAULTED for IDLE.
+    /// Brings the machine from the state ABORTED or FAULTED back to IDLE. Returns the status with which the machine
+    /// acknowledges the command.
     fn clear(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Reports to the machine that the client has stored the result with this `done` number, so that the machine may
-    /// forget it.
+    /// Reports to the machine that the client has stored the result of a job. The machine may then delete the result.
+    /// `done` is the sequence number of the START whose job ended, as in the status. Returns the status with which the
+    /// machine acknowledges the command.
     fn acknowledge(&mut self, done: u32) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Gives up the ownership of the machine.
+    /// Gives up the ownership of the machine, so that another client can claim it. Returns the status with which the
+    /// machine acknowledges the command.
     fn release(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Asks the machine for the outcome of a start that is unknown: after a lost connection, or after a restart of this
-    /// client that found the start in its journal. Moves nothing. Takes a second or more if the answer is "not
-    /// started", because that must be seen twice.
+    /// Determines the outcome of the start `intended` from the status of the machine. Use it after a lost connection,
+    /// or after a restart of this client, if the journal contains the start but not its outcome. Moves nothing.
+    ///
+    /// Takes a second or more if the answer is "not started": two statuses, at least a second apart, must show this.
     fn reconcile(&mut self, intended: &Armed) -> impl Future<Output = Result<Reconciled, DeviceError>> + Send;
 
-    /// Accepts an operator confirmation for a machine that cannot report the fact itself. Every other machine refuses.
-    /// Returns the paths of the files that were kept, relative to the folder of the run.
+    /// Accepts `_word`, an operator confirmation of a fact that the machine cannot report itself. Returns the paths of
+    /// the files that were stored because of it, relative to the folder of the run.
+    ///
+    /// # Errors
+    /// The confirmation is not expected now. A machine that reports its own state always returns
+    /// [`DeviceError::ConfirmationNotNeeded`].
     fn confirm(
         &mut self,
         _word: OperatorConfirmation,
@@ -91,14 +112,17 @@ pub trait Machine: Send {
 
 /// Measuring machine.
 pub trait Cmm: Machine {
-    /// Transfers the plan to the machine and proves that the machine would use it.
+    /// Transfers `plan` to the machine and checks that the machine will use it for the next job. If `interrupt` is
+    /// raised, the transfer stops with [`DeviceError::Interrupted`] and must be repeated from its start.
     fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt)
     -> impl Future<Output = Result<(), DeviceError>> + Send;
 
-    /// Reads a few preliminary points of this job while it still runs, if the machine offers them. Call it after a
-    /// status, when no other request is due. It is short: it does at most one step between two calls of the status, and
-    /// stops if `_interrupt` is raised. Returns the new points, or `None` if there are none. Hides an error, because
-    /// the next status returns it.
+    /// Reads a few measured points of `_job` while the job still runs. The points are preliminary and only for display.
+    /// Returns the new points. Returns `None` if there are no new points or the machine does not offer this.
+    ///
+    /// Call it after [`Machine::status`], when no other request is due. Between two calls of the status it does at most
+    /// one short step. It stops if `_interrupt` is raised. It returns no errors; the next call of the status reports a
+    /// lost machine.
     fn read_ahead(
         &mut self,
         _job: Job,
@@ -107,7 +131,11 @@ pub trait Cmm: Machine {
         std::future::ready(None)
     }
 
-    /// Fetches the points of this job, which must be complete. Idempotent until the result is acknowledged.
+    /// Fetches the measured points of `job`. Can be repeated: the result stays the same until it is acknowledged. If
+    /// `interrupt` is raised, the transfer stops with [`DeviceError::Interrupted`].
+    ///
+    /// # Errors
+    /// The job is not complete, or the transfer fails.
     fn collect(
         &mut self,
         job: Job,
@@ -117,8 +145,9 @@ pub trait Cmm: Machine {
 
 /// Grinder.
 pub trait Grinder: Machine {
-    /// Transfers map and pass to the machine and proves that the machine would use them. The map is absolute: loading
-    /// it twice changes nothing.
+    /// Transfers `map` and `pass` to the machine and checks that the machine will use both for the next job. The map is
+    /// absolute: it replaces the previous map, so a second transfer of the same map changes nothing. If `interrupt` is
+    /// raised, the transfer stops with [`DeviceError::Interrupted`] and must be repeated from its start.
     fn load_pass(
         &mut self,
         map: &CorrectionMap,
@@ -126,7 +155,11 @@ pub trait Grinder: Machine {
         interrupt: &Interrupt,
     ) -> impl Future<Output = Result<(), DeviceError>> + Send;
 
-    /// Fetches the record of this job, which must be complete. Idempotent until the result is acknowledged.
+    /// Fetches the record of the pass that `job` ground. Can be repeated: the result stays the same until it is
+    /// acknowledged. If `interrupt` is raised, the transfer stops with [`DeviceError::Interrupted`].
+    ///
+    /// # Errors
+    /// The job is not complete, or the transfer fails.
     fn collect(
         &mut self,
         job: Job,

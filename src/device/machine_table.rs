@@ -10,8 +10,8 @@ pub struct MachineTable<'a> {
 }
 
 impl MachineTable<'_> {
-    /// Returns a key with the name of the machine's table before it, for messages: for example `cmm.wire.unit` for
-    /// `wire.unit`.
+    /// Returns the full path of a key in a cell file, for messages. `rest` is the path of the key within the table of
+    /// the machine. Example: `cmm.wire.unit` for `wire.unit`.
     pub fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.table)
     }

@@ -5,8 +5,8 @@ use regrind_formats::result::Coordinates;
 
 /// Payload that is sent as one string of bytes and identified by its SHA-256.
 pub trait Identified {
-    /// Returns the identity of the payload: the SHA-256 of its bytes with the high words first, whatever the word order
-    /// of the machine.
+    /// Returns the identity of the payload: the SHA-256 of its bytes with the high word and the high byte of each value
+    /// first. The identity does not depend on the word order of the machine.
     fn identity(&self) -> [u8; 32];
 }
 
@@ -193,7 +193,8 @@ pub struct PassRecord {
 }
 
 impl PassRecord {
-    /// Returns a pass record with only the outcome and the identities; every measured value is `None`.
+    /// Returns a pass record without measured values: each of them is `None`. `map_identity` is the SHA-256 of the
+    /// correction map, and `done` is the sequence number of the START that began the job.
     pub(super) fn unmeasured(outcome: super::Outcome, map_identity: [u8; 32], job: super::Job, done: u32) -> Self {
         Self {
             outcome,

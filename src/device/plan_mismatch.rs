@@ -39,14 +39,16 @@ const TOUCH_ALLOWANCE_MM: f64 = 1.0;
 const MAX_SIZE_DIFFERENCE: f64 = 0.02;
 
 impl Plan {
-    /// Compares a measurement with this plan, point by point.
+    /// Checks that a measurement can be the result of this plan. Compares the touched points of the part one by one
+    /// with their targets, after a rigid best fit of all these points. So the position of the part does not matter.
     ///
-    /// A rigid best fit first moves the points onto the plan, so the position of the part does not matter. Only touched
-    /// points of the part are compared.
+    /// Returns `Ok` without the fit if the points determine no fit (fewer than three points, or points on a line). Also
+    /// returns `Ok` if the size of the point set differs by more than 2 % from the plan; other checks report that.
     ///
     /// # Errors
-    /// * [`PlanMismatch::EqualsPlan`]: the points equal the planned points, to the last digit that they have.
-    /// * [`PlanMismatch::OffTarget`]: a point is too far from its target, or the fit needs too large a rotation.
+    /// - [`PlanMismatch::EqualsPlan`]: all points equal the planned points to their last decimal, so nothing was
+    ///   measured.
+    /// - [`PlanMismatch::OffTarget`]: a point is too far from its target, or the fit needs too large a rotation.
     pub fn check(&self, measurement: &Measurement) -> Result<(), PlanMismatch> {
         let pairs = measurement.points.iter().zip(&self.targets);
         let part = pairs.filter(|(p, t)| p.status == TouchStatus::Touched && t.kind == TargetKind::Part);
@@ -85,8 +87,9 @@ fn size(points: &[Point]) -> f64 {
     (points.iter().map(|p| (p.coords - middle).norm_squared()).sum::<f64>() / count).sqrt()
 }
 
-/// Returns true if points lie almost on a line: their largest distance from it is at most a tenth of the longest
-/// distance from their centroid.
+/// Returns true if points lie almost on a line. The line leads from the centroid of the points through the farthest
+/// point. No point may be farther from this line than a tenth of the distance between the centroid and the farthest
+/// point.
 fn is_nearly_collinear(points: &[Point]) -> bool {
     const MAX_WIDTH_SHARE: f64 = 0.1;
     let count = points.len().max(1) as f64;
@@ -99,8 +102,9 @@ fn is_nearly_collinear(points: &[Point]) -> bool {
     aside2 <= MAX_WIDTH_SHARE * MAX_WIDTH_SHARE * longest2
 }
 
-/// Returns true if all points equal the planned points, to the last decimal that they have. In a real measurement at
-/// least one touch ends somewhere else than planned. Returns false for fewer than three points.
+/// Returns true if each point of `found` equals the planned point at the same index, within the rounding to its last
+/// decimal. Such points are a copy of the plan and were not measured. Returns false for fewer than three points,
+/// because few points can agree by chance.
 fn equals_plan(found: &[Point], planned: &[Point]) -> bool {
     /// Minimum number of points; fewer can agree by chance.
     const MIN_POINTS: usize = 3;
@@ -108,8 +112,9 @@ fn equals_plan(found: &[Point], planned: &[Point]) -> bool {
     found.len() >= MIN_POINTS && found.iter().zip(planned).all(is_same)
 }
 
-/// Returns the largest rounding error of a coordinate in mm, from its number of decimals. A file with a fixed number of
-/// significant digits has more decimals in small values.
+/// Returns the largest rounding error of a coordinate, in mm: half a unit of its last decimal, with a small allowance.
+/// Finds the number of decimals, from 3 to 9, from the value itself, because it can differ between the values of a
+/// file.
 fn rounding_mm(value_mm: f64) -> f64 {
     const DECIMALS: std::ops::RangeInclusive<i32> = 3..=9;
     let has = |decimals: &i32| {

@@ -60,10 +60,11 @@ impl ValueRange {
     }
 }
 
-/// Checks the temperature in °C and the progress `(done, total)` of a status against their ranges. Returns the
-/// temperature and the progress, each as `None` if it is missing or outside its range. For each value outside its
-/// range, also returns a signal with the value and the range. An impossible value does not make the whole status an
-/// error, because the status also contains the state of the machine and the command that it acknowledged.
+/// Checks two values of a status: the temperature in °C, and the progress as `(done, total)`. Returns the temperature
+/// and the progress, each as `None` if it is missing or outside its possible range. Also returns a [`SignalValue`] for
+/// each value outside its range, so that the value is reported.
+///
+/// An impossible value is not an error of the whole status, because the status also contains the state of the machine.
 pub(super) fn plausible_status(
     temperature_c: Option<f64>,
     progress: (u32, u32),

@@ -56,7 +56,8 @@ pub struct Problem {
 }
 
 impl Problems {
-    /// Creates a list with one problem, `found`, that concerns the whole file and has no position in its text.
+    /// Creates a list with one problem that concerns the whole file and has no position. `text` is the content of the
+    /// file, `found` describes the problem, and `remedy` describes how to solve it.
     pub fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
         let problem =
             Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };

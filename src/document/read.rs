@@ -58,8 +58,9 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
 /// Opens a file for reading.
 ///
 /// # Errors
-/// A named pipe, which could block, and a device, which has no end. Below `/dev` and `/proc` they are accepted, because
-/// a shell places the input of a program under `/dev/fd`. Any error of the system.
+/// The file is a named pipe, which could block, or a device, which may have no end. Pipes and devices below `/dev` and
+/// `/proc` are accepted, because a shell can pass the output of a program as a file there. Any error of the operating
+/// system is returned too.
 fn open(path: &Path) -> std::io::Result<File> {
     let found = std::fs::metadata(path)?;
     if !found.is_file() && !found.is_dir() && !path.starts_with("/dev") && !path.starts_with("/proc") {
@@ -79,10 +80,11 @@ pub fn sha256(text: &str) -> [u8; 32] {
 }
 
 impl<'t> Document<'t> {
-    /// Parses a text as TOML; `file` names it in messages. Values are not checked yet.
+    /// Parses a text as TOML. `file` is the path of the file in messages. The values are not checked yet.
     ///
     /// # Errors
-    /// Every place where the text is not valid TOML.
+    /// Returns one problem for each place where the text is not valid TOML. Also fails if the text is larger than 256
+    /// KiB.
     pub fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
         if text.len() > MAX_BYTES {
             return Err(too_large(file));
@@ -115,11 +117,11 @@ impl<'t> Document<'t> {
         self.push(start..end, String::new(), format!("invalid TOML: {}", error.message().trim()), "", remedy);
     }
 
-    /// Moves the values of old keys to their new names, given by `renamed`. Returns a note for each old key in the
-    /// file, with its line.
+    /// Moves the value of each old key to its present name; `renamed` lists the pairs of names. Returns one note with
+    /// the line number for each value that was moved.
     ///
-    /// A table that becomes empty is removed. If a file has both names, the old one is reported as a problem and its
-    /// value is removed.
+    /// If the file has both names, reports the old key as a problem and removes its value. A table that becomes empty
+    /// is removed.
     pub fn rename_keys(&mut self, renamed: &[RenamedKey]) -> Vec<String> {
         let mut notes = Vec::new();
         for RenamedKey { old, new } in renamed {
@@ -142,7 +144,8 @@ impl<'t> Document<'t> {
         notes
     }
 
-    /// Checks the values against a JSON schema. Each value that does not fit is added to the problems and removed.
+    /// Checks all values of the file against a JSON schema. Reports each value that does not fit as a problem, and
+    /// removes it from the values. Also reports missing and unknown keys.
     pub fn check_schema(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
         Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
@@ -170,7 +173,8 @@ impl<'t> Document<'t> {
         self.problems.iter().any(|problem| within(&problem.key))
     }
 
-    /// Returns true if the file has the key, such as `measure.probe_radius_mm`.
+    /// Returns true if the file has `key`, such as `measure.probe_radius_mm`, even if its value was removed because it
+    /// is wrong. Returns false for a key within a list.
     pub fn contains_key(&self, key: &str) -> bool {
         let steps = steps(key);
         let Some((Step::Key(last), before)) = steps.split_last() else { return false };
@@ -186,8 +190,9 @@ impl<'t> Document<'t> {
         table.is_some_and(|table| table.contains_key(last.as_str()))
     }
 
-    /// Adds a problem with the value of `key` to the list: what was found, what is allowed, and the remedy. Its
-    /// position in the text is that of the value.
+    /// Reports a problem at the position of `key` in the file. `found` describes the value that was found, `allowed`
+    /// the allowed values, and `remedy` how to solve the problem. If the file does not have the key, the position is
+    /// that of the innermost existing table around it.
     pub fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
         let span = span_of(&self.places, &steps(key));
         self.push(span, key.to_owned(), found.into(), allowed, remedy);
@@ -198,7 +203,11 @@ impl<'t> Document<'t> {
         self.problems.push(Problem { span, key, found, allowed: allowed.to_owned(), remedy: remedy.to_owned() });
     }
 
-    /// Returns all reported problems as an error, sorted by their position; `Ok` if there are none.
+    /// Returns `Ok` if no problem was reported.
+    ///
+    /// # Errors
+    /// Returns the reported problems, sorted by their position in the text. Repeated problems are removed. If there are
+    /// more than 200, the last entry of the list gives the number of the problems that are not listed.
     pub fn finish(self) -> Result<(), Problems> {
         if self.problems.is_empty() { Ok(()) } else { Err(self.into_problems()) }
     }
@@ -222,9 +231,9 @@ impl<'t> Document<'t> {
     }
 }
 
-/// Returns one problem with the value of `key`, for a text whose keys and values were checked earlier. `key` is the
-/// present name; the text can have the old name, according to `renamed`. The last argument holds what was found, what
-/// is allowed, and the remedy.
+/// Returns one problem at the position of `key` in `text`, the content of `file`. Use it if a check after reading the
+/// file finds the problem. `key` is the present name of the key. If the text has the old name, the position is found
+/// via `renamed`. The last argument contains the value that was found, the allowed values, and the remedy.
 pub fn problem_at(
     file: &Path,
     text: &str,
@@ -249,8 +258,8 @@ fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
     })
 }
 
-/// Moves the position (in the text) of a value and of its name from an old key to a new key. Does nothing if the old
-/// key does not exist.
+/// Moves a value from the path `old` to the path `new` in `root`, the parsed file with text positions. The value and
+/// its key keep their positions in the text. Does nothing if the path `old` does not exist.
 fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     let Some(taken) = take_place(root, &names(old).collect::<Vec<_>>()) else { return };
     let mut inside = root;
@@ -268,8 +277,9 @@ fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
     }
 }
 
-/// Removes the value with the path `names`, and the tables that become empty by that. Returns the position of the name
-/// in the text, and the value; `None` if there is no such value.
+/// Removes the value with the path `names` from `table`, the parsed file with text positions. Also removes each table
+/// that becomes empty. Returns the position of the key in the text (range of bytes) and the value. Returns `None` if
+/// there is no such value.
 fn take_place<'t>(table: &mut DeTable<'t>, names: &[&str]) -> Option<(Range<usize>, Spanned<DeValue<'t>>)> {
     let (first, rest) = names.split_first()?;
     if rest.is_empty() {
@@ -341,8 +351,9 @@ fn key_of(steps: &[Step]) -> String {
     key
 }
 
-/// Returns the position in the text of a value; for a table, that of its name. If the value does not exist, returns the
-/// position of the innermost table around it that exists.
+/// Returns the position in the text, as a range of bytes, of the value with the path `steps`. For a table, returns the
+/// position of its name. If the value does not exist, returns the position of the innermost existing table or list
+/// entry around it, or `0..0` if there is none.
 fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let mut found = 0..0;
     let mut inside: Option<&DeValue> = None;
@@ -397,8 +408,8 @@ struct Shape<'d, 't> {
 }
 
 impl Shape<'_, '_> {
-    /// Reports all problems of `value`, and removes values within it that do not fit the schema. Returns false if
-    /// `value` itself does not fit and must be removed.
+    /// Checks `value` against `schema` and reports all problems. Removes those values within `value` that do not fit.
+    /// Returns false if `value` itself does not fit; then the caller must remove it.
     fn fits(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
         if let Some(words) = choices(schema) {
             return self.is_one_of(&words, value);
@@ -672,8 +683,9 @@ fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w 
         .map(|(_, word)| word)
 }
 
-/// Returns the name of the table, in the schema, that has `key`, for a message; `None` if no table has it. `path` must
-/// be empty at first; it holds the names of the tables around `schema`.
+/// Searches `schema` for a table that has `key`. Returns the name of the table for a message, such as `[cmm.wire]`, or
+/// `the top of the file`. Returns `None` if no table has the key. `path` collects the names of the tables during the
+/// search; pass an empty list.
 fn home_of(schema: &Schema, key: &str, path: &mut Vec<String>) -> Option<String> {
     let variants = schema.get("oneOf").and_then(Schema::as_array).into_iter().flatten();
     for schema in std::iter::once(schema).chain(variants) {

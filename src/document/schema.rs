@@ -5,11 +5,13 @@ use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema};
 use serde_json::Value;
 
-/// Returns the JSON schema of the settings file that is deserialized into `File`.
+/// Returns the JSON schema of the settings file that is deserialized into `File`. Optional and required keys are
+/// treated as follows:
 ///
-/// An optional key is an `Option`. TOML has no null, so null is removed from its types. A required key is optional for
-/// the deserializer too, so that its absence is reported with the other problems. Such a key has the default NaN, which
-/// JSON cannot represent, or the mark `x-required`.
+/// - An optional key is an `Option`. TOML has no null, so null is removed from the types of the key.
+/// - A required key is added to the list of required keys. In `File` it also has a default, so that a missing key is
+///   reported with all other problems. Such a key is marked by the default NaN, which JSON writes as null, or by
+///   `x-required`.
 pub fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();

@@ -32,8 +32,9 @@ pub fn visible(text: &str) -> String {
     })
 }
 
-/// Returns a text in which long numbers, whose digits nobody can count at a glance, are written with an exponent, such
-/// as `1e300`.
+/// Returns `text` with long numbers written with an exponent, such as `1e300`. A number is long if it has more than 15
+/// digits before the decimal point, or if `0.` is followed by more than 9 zeros and then other digits. Digits within a
+/// word, such as a hash, stay unchanged.
 pub fn countable(text: &str) -> String {
     let is_of_number = |c: char| c.is_ascii_digit() || c == '.';
     let mut shown = String::with_capacity(text.len());

@@ -22,12 +22,15 @@ pub(super) struct TouchEvaluation {
     pub(super) next: Option<(Vec<usize>, &'static str)>,
 }
 
-/// Evaluates the touches of an adaptive measurement after each batch, and returns the estimate of the form and the next
-/// targets, if more are required. `found` is the registration of the points so far, and `given` the inputs of the error
-/// model.
+/// Evaluates an adaptive measurement after a batch of touches. Returns the estimated form, and the indices of the next
+/// targets to touch with the reason. The next targets are `None` if enough is known.
 ///
-/// After the first batch, which only shows whether the part is in its place, there is no estimate. The next targets are
-/// then as many as the first estimate requires.
+/// `(number, cycle)` is the cycle with its number. `points` are the usable points of all batches so far. `found` is the
+/// registration of these points, and `given` are the inputs of the error model.
+///
+/// The first batch only shows whether the part is at its expected place. After this batch, the form is an error text,
+/// and the next targets are as many as the first estimate requires. If no model fits the points, the form is the reason
+/// as text, and the next targets are all remaining ones.
 pub(super) fn evaluate_touches(
     task: &Task,
     adaptive: &AdaptiveOptions,
@@ -67,12 +70,15 @@ pub(super) fn evaluate_touches(
     }
 }
 
-/// Returns the targets for a repetition of touches: the outliers, a few targets around each, and control points.
-/// Returns `None` if the machine has no plan of this program, if there are no outliers or too many to be bad touches,
-/// or if no further batch is possible.
+/// Plans the repetition of touches that the registration `found` marks as outliers. Returns the outliers, the control
+/// points, the largest allowed change of a control point in mm, and the targets in the model frame. The order of the
+/// targets is: one for each outlier, one for each control point, then up to four around each outlier.
 ///
-/// The targets around an outlier lie on the lines to its nearest other touched points: if the probe can touch two
-/// points, it can also reach the places between them. The control points are good touches as far apart as possible.
+/// The targets around an outlier lie on the lines to its nearest inliers. The probe can touch both ends of such a line,
+/// so it can also reach the points between them. The control points are inliers that are as far apart as possible.
+/// `noise_sigma_mm` is the standard deviation of the probe's noise, from which the allowed change follows.
+///
+/// Returns `None` if the task has no targets, if there is no outlier or more than 20, or if no batch number is left.
 pub(super) fn plan_repeated_touches(
     task: &Task,
     found: &Registration,
@@ -161,8 +167,8 @@ fn reason_message(why: Reason) -> &'static str {
     }
 }
 
-/// Computes an error map from the estimated form at the points of the error model. Returns `None` if these points do
-/// not determine a map.
+/// Computes an error map (deviations in mm at the nodes of a grid) from the points at which the error model estimated
+/// `form`. Returns `None` if these points do not determine a map.
 pub(super) fn interpolate_form(task: &Task, form: &Form) -> Option<ErrorMap> {
     let of = |p: &model::FormPoint| {
         (DeviationSample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm)

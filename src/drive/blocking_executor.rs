@@ -30,8 +30,9 @@ pub enum BlockingExecutor {
 }
 
 impl BlockingExecutor {
-    /// Starts the computation `work` as a task in the set `among`: on a thread for blocking work, or, in simulated
-    /// time, after its simulated duration. Returns the handle to abort the task.
+    /// Starts the computation `work` as a task of the set `among`, and returns the handle to abort this task. The
+    /// computation runs on a thread for blocking work. If time is simulated, it runs as an asynchronous task after its
+    /// simulated duration.
     pub(super) fn spawn_computation<T: Send + 'static>(
         &self,
         among: &mut JoinSet<T>,
@@ -46,8 +47,9 @@ impl BlockingExecutor {
         }
     }
 
-    /// Runs the future `attending`, which may block for long, on a separate thread with the given name, and returns the
-    /// thread. In simulated time, runs it as a task of the present runtime and returns `None`.
+    /// Runs the future `attending` on a separate thread with the name `name`, because this future may block for long.
+    /// Returns the handle of the thread. If time is simulated, runs the future as a task of the current runtime and
+    /// returns `None`.
     pub(super) fn spawn_service(
         &self,
         name: &str,

@@ -28,7 +28,8 @@ const TEXTS: [&str; 16] = [
 /// Table of figures. Its columns `removed`, `direction`, `cut_off` and `made` are texts for people.
 const FIGURES_TABLE: &str = "form.csv";
 
-/// Returns true if two recorded commands are equal, apart from texts for people such as reasons and remedies.
+/// Returns true if two commands in JSON are equal. Ignores the keys of texts for people ([`COMMAND_TEXTS`]), such as
+/// the reason and the remedy.
 pub(super) fn is_same_decision(one: &Value, other: &Value) -> bool {
     let decision = |command: &Value| {
         let mut command = command.clone();
@@ -40,8 +41,8 @@ pub(super) fn is_same_decision(one: &Value, other: &Value) -> bool {
     decision(one) == decision(other)
 }
 
-/// Returns true if two JSON values are equal. Ignores differences of sentences (strings with a space) below a key of
-/// [`TEXTS`], because these are texts for people.
+/// Returns true if two JSON values are equal. Two different strings also count as equal if both contain a space and
+/// both are the value of a key of [`TEXTS`] or elements of its array. Such strings are sentences for people.
 pub(super) fn is_same_result(one: &Value, other: &Value) -> bool {
     are_equal(one, other, false)
 }
@@ -64,8 +65,10 @@ fn are_equal(one: &Value, other: &Value, is_text: bool) -> bool {
     }
 }
 
-/// Returns true if the files `one` and `other` have the same content. Ignores differences of texts for people and of
-/// the version of the program. `name` is the name of both files and selects how they are compared.
+/// Returns true if the contents `one` and `other` of two files are equal, apart from texts for people and the version
+/// of the program. `name` is the name of both files. The name selects the comparison: JSON values for `.json`, rows of
+/// a table for [`FIGURES_TABLE`], and lines of text for every other file. Returns false if the contents differ and one
+/// of them is not UTF-8.
 pub(super) fn is_same_file(name: &str, one: &[u8], other: &[u8]) -> bool {
     if one == other {
         return true;
@@ -120,8 +123,9 @@ fn fields(row: &str) -> Vec<&str> {
     .collect()
 }
 
-/// Returns true if a line is a comment about a compensated parameter. Such a line is not compared, because its number
-/// is also in the correction.
+/// Returns true if a line of a file is a comment about a compensated machine parameter: after the comment sign it
+/// begins with `parameter: `. Two such lines count as equal, because the correction contains the same number and is
+/// compared too.
 fn is_remark(line: &str) -> bool {
     let comment = line.trim_start().trim_start_matches(['#', '(', ';']).trim_start();
     comment.len() < line.len() && comment.starts_with("parameter: ")

@@ -22,8 +22,9 @@ use crate::report::{HeatMap, ReportError, save_coloured_ply};
 /// Length over which slopes are computed, as a share of the cut-off of the map's filter. The map has no shorter waves.
 const SLOPE_LENGTH_SHARE: f64 = 0.5;
 
-/// Writes the file `figures.json` with the form figures of a cycle. If they cannot be computed, the file states the
-/// reason. `map` is the error map, and `form` the estimate of the error model, if there are any.
+/// Writes the file `figures.json` with the form figures of a cycle. The figures are computed from the deviations of the
+/// points that the registration `found` used. If they cannot be computed, the file states the reason. `map` is the
+/// error map, from which slopes are computed, and `form` the form that the error model estimated. Both may be `None`.
 pub(super) fn save_figures(
     task: &Task,
     files: &mut OutputFiles,
@@ -46,8 +47,9 @@ pub(super) fn save_figures(
     )
 }
 
-/// Returns the options for figures of an area: the centre of the part's outline in mm, and the length in mm over which
-/// slopes are computed.
+/// Returns the options for figures of an area. They contain the centre of the part's outline in mm, or `None` if the
+/// part has no outline. They also contain the length in mm over which slopes are computed: half the cut-off wavelength
+/// of the map's filter.
 pub(super) fn area_options(task: &Task) -> AreaOptions {
     let middle = |[low, high]: [[f64; 2]; 2]| std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     AreaOptions {
@@ -73,9 +75,15 @@ fn removed_components(task: &Task) -> RemovedParts {
     RemovedParts { motion, filter: format!("waves below {} mm ({smoothing})", task.map_options.cutoff_mm) }
 }
 
-/// Estimates the parameters of the machine that explain a part of the deviations: radius and setting of the wheel, tilt
-/// of the part, wear. Writes the estimates to `parameters.json`. If they cannot be estimated, writes the reason there
-/// and returns `None`. `contacts` are the measured points.
+/// Estimates the errors of machine parameters that explain a part of the deviations: radius and setting of the wheel,
+/// tilt of the part, wear. Writes the estimates to `parameters.json` and returns them. If they cannot be estimated,
+/// writes the reason to this file and returns `None`.
+///
+/// `contacts` are the measured points with their normals and deviations. `cycle` contains the parameter corrections
+/// with which the measured pass was ground.
+///
+/// # Errors
+/// The file cannot be written.
 pub(super) fn save_parameters(
     task: &Task,
     files: &mut OutputFiles,
@@ -93,8 +101,8 @@ pub(super) fn save_parameters(
     }
 }
 
-/// Returns the points used in a registration in the form for the estimation of machine parameters: with normals and
-/// deviations.
+/// Returns the points that the registration `found` used, with their normals and deviations. Outliers and points off
+/// the part are omitted. The estimation of machine parameters uses this form of the points.
 pub(super) fn surface_points(found: &Registration) -> Vec<SurfacePoint> {
     let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
     used_deviations(found).map(contact).collect()
@@ -116,8 +124,9 @@ fn parameter_document(task: &Task, told: &ParameterEstimation) -> Value {
     })
 }
 
-/// Returns the parameter corrections for the next pass: those of this pass, plus the compensation that the estimate
-/// `told` adds. Returns `None` if the recipe compensates no parameter, or if all corrections are 0.
+/// Returns the parameter corrections for the next pass: the corrections of the measured pass, plus the compensation
+/// that the estimate `told` adds. `cycle` is the measured cycle, and `contacts` are its measured points. Returns `None`
+/// if the recipe compensates no parameter, or if all corrections are 0.
 pub(super) fn next_parameter_corrections(
     task: &Task,
     cycle: &CycleState,
@@ -139,9 +148,12 @@ pub(super) fn next_parameter_corrections(
     )
 }
 
-/// Returns a function of values at the nodes of the correction. The function returns, at the same nodes, how much of
-/// the values an error of the machine parameters explains ([`compensation::explained_by_parameters`]). `contacts` are
-/// the measured points. Returns `None` if the recipe compensates no parameter.
+/// Returns a function that finds the effect of the machine parameters in a map. The argument of this function is a map
+/// in mm, with one value for each node of the correction's grid. The result is how much of each value, in mm at the
+/// same node, errors of the machine parameters explain ([`compensation::explained_by_parameters`]).
+///
+/// `contacts` are the measured points, and `cycle` is the measured cycle. Returns `None` if the recipe compensates no
+/// parameter.
 pub(super) fn parameter_explainer<'t>(
     task: &'t Task,
     cycle: &'t CycleState,
@@ -155,7 +167,11 @@ pub(super) fn parameter_explainer<'t>(
     })
 }
 
-/// Writes the error map of a cycle and the points from which it was computed.
+/// Writes the error map `map` of cycle `number` as CSV, X3P, SVG and PNG files. Also writes the deviations of the
+/// points that the registration `found` used as a coloured PLY file.
+///
+/// # Errors
+/// Returns `NotSaved` if the operating system reports an error, and `Failed` for every other error.
 pub(super) fn save_error_map(
     task: &Task,
     files: &mut OutputFiles,

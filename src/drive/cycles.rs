@@ -58,8 +58,9 @@ impl Cycles {
         self.get(number).map_or(0, |cycle| cycle.batch)
     }
 
-    /// Returns two numbers of touches, summed over all measurements: the targets on the part that were tried, and the
-    /// targets that measurements of the complete pattern would have had.
+    /// Returns two numbers, each summed over all measurements of the run. The first is the number of targets on the
+    /// part that were tried. The second is the number of targets if each measurement had touched every target of the
+    /// task. In a measurement that is not adaptive, only the touched points count as tried.
     pub(super) fn touch_counts(&self, task: &Task) -> [usize; 2] {
         let measured = self.0.values().filter_map(|cycle| cycle.points.as_ref());
         let tried = measured.clone().map(|points| match points.tried_targets.is_empty() {
@@ -69,8 +70,10 @@ impl Cycles {
         [tried.sum(), measured.count() * task.targets.len()]
     }
 
-    /// Returns the last judged cycle before cycle `number` whose measurement follows an earlier pass; `None` if there
-    /// is none. A cycle counts only if its measurement was accepted by the gate and has updated the learning.
+    /// Returns the last judged cycle before cycle `number` that measured the result of an earlier pass. A cycle counts
+    /// only if it was judged (its measurement was accepted by the gate) and its measurement has updated the learning
+    /// (the estimate of how the part responds to corrections). Returns `None` if there is no such cycle, or if cycle
+    /// `number` does not exist.
     pub(super) fn previous_judged(&self, number: u32) -> Option<&CycleState> {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&CycleState| c.is_judged() && c.learning.is_some() && c.correction.cycle < pass;
@@ -83,7 +86,8 @@ impl Cycles {
         self.0.range(..number).rev().find_map(|(earlier, cycle)| Some((*earlier, cycle.points.clone()?)))
     }
 
-    /// Stores the result of a computation in cycle `number`.
+    /// Stores the result `product` of a computation in cycle `number`. A correction is for the next pass, so it creates
+    /// cycle `number + 1`. Does nothing with any other result if cycle `number` does not exist.
     pub(super) fn store(&mut self, number: u32, product: ComputationProduct) {
         if let ComputationProduct::Correction(next) = product {
             self.0.insert(number + 1, CycleState::new(next));
@@ -100,14 +104,16 @@ impl Cycles {
         cycle.judgement_count
     }
 
-    /// Returns the last judged cycle whose measurement has updated the learning; `None` if there is none.
+    /// Returns the last judged cycle that contains a learning state (the estimate of how the part responds to
+    /// corrections). Returns `None` if there is no such cycle.
     pub(super) fn last_with_learning(&self) -> Option<&CycleState> {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.learning.is_some())
     }
 
-    /// Returns the priors of the error model for later parts, one for passes without and one for passes with a
-    /// correction. They combine the priors that this cell had before with the last judged cycle of each of these two
-    /// kinds. Priors from other cells are omitted, because these cells would receive their own results again.
+    /// Returns the priors of the error model for the next parts: one for passes without a correction, and one for
+    /// passes with a correction. Each prior is the earlier prior of this cell, updated with the last judged cycle of
+    /// the same kind. Priors that came from other cells are omitted. Otherwise these cells would later receive their
+    /// own results again.
     pub(super) fn part_priors(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
@@ -122,7 +128,9 @@ impl Cycles {
         taught
     }
 
-    /// Returns the results of the cycles as rows of the table that the status of the cell contains.
+    /// Returns the figures of each measured cycle as one row of the table in the status of the cell. The rows are in
+    /// the order of the cycle numbers, and the lengths in µm. `tolerance` determines which figures are judged. Cycles
+    /// without figures are omitted.
     pub(super) fn rows(&self, tolerance: &Tolerance) -> Vec<CycleRow> {
         let rows = self.0.iter().filter_map(|(&cycle, c)| {
             let figures = c.figures.as_ref()?;
@@ -142,9 +150,12 @@ impl Cycles {
     }
 }
 
-/// Creates the plan for the next batch of an adaptive measurement. The first batch has targets that are far apart. If
-/// the part may have been clamped again (`seated_anew`), its targets are approached slowly. `pose` is used until the
-/// cycle has a registration.
+/// Creates the plan for the next batch of an adaptive measurement, and stores the number of the batch and its targets
+/// in `cycle`. The targets of the first batch are as far apart as possible. Later batches have the targets that the
+/// last evaluation chose.
+///
+/// `pose` is the pose of the model in the CMM frame. It is used only if the cycle has no registration. If `seated_anew`
+/// is true, the part may have been clamped again, and the targets of the first batch are touched at low speed.
 fn next_batch_plan(task: &Task, cycle: &mut CycleState, pose: &Pose, seated_anew: bool) -> Plan {
     cycle.batch = cycle.points.as_ref().map_or(0, |points| points.tried_targets.len() as u32);
     cycle.batch_targets = match &cycle.next_targets {

@@ -113,14 +113,16 @@ impl OrderSender {
         let _ = self.orders.send(ReceivedOrder { request, actor, answer: None }).await;
     }
 
-    /// Sends an order, and returns the answer that the control socket would give. Returns `None` if the run is over.
+    /// Sends the order `request` of `actor` to the run, and waits for the answer. A client of the control socket would
+    /// get the same answer. Returns `None` if the run is over.
     pub async fn send_and_wait(&self, request: Request, actor: Actor) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
         self.orders.send(ReceivedOrder { request, actor, answer: Some(answer) }).await.ok()?;
         answered.await.ok()
     }
 
-    /// Returns a receiver for the snapshots of the run from now on.
+    /// Returns a receiver for the snapshots of the run. The receiver holds the latest snapshot and is notified of each
+    /// new one.
     pub fn status(&self) -> watch::Receiver<Snapshot> {
         self.status.clone()
     }
@@ -272,8 +274,8 @@ struct ComputationResult {
 }
 
 impl Drive {
-    /// Calls [`Drive::new`] with the machines of a cell file. This function is not generic, so the run is compiled once
-    /// here, and not again in every crate that calls it.
+    /// Prepares a run with the machine drivers that a cell file selects. Does the same as [`Drive::new`], but is not
+    /// generic. Therefore the code of a run is compiled once in this crate, and not in every crate that calls it.
     ///
     /// # Errors
     /// Those of [`Drive::new`].
@@ -281,8 +283,9 @@ impl Drive {
         Self::new(run, cmm, grinder)
     }
 
-    /// Prepares a run: creates a task for each machine, the control socket in the run folder, and the recorder of the
-    /// journal. Sends no command to a machine. Returns the run and the sender of orders from this process.
+    /// Prepares a run with the drivers `cmm` and `grinder`. Creates a task for each machine, the control socket in the
+    /// run folder, and the recorder of the journal. Sends no command to a machine. Returns the run, and a sender with
+    /// which this process gives orders to the run.
     ///
     /// # Errors
     /// The control socket cannot be created in the run folder.
@@ -360,7 +363,8 @@ impl Drive {
         Ok((drive, OrderSender { orders, status: seen }))
     }
 
-    /// Listens for orders also at a second path, so that clients can reach the cell even if its run folder is gone.
+    /// Accepts orders also at the socket path `place`. Clients can then reach the cell even if its run folder is gone.
+    /// Does nothing on Windows.
     ///
     /// # Errors
     /// Returns an error if no socket can be created at that path.
@@ -372,8 +376,8 @@ impl Drive {
         self.elapsed_before + self.started_at.elapsed()
     }
 
-    /// Executes the run until the cell reaches an end state, and returns the ending. The future is boxed so that it is
-    /// compiled in this crate.
+    /// Executes the run until the cell reaches an end state, and returns the ending. The future is boxed (its type is
+    /// erased), so that its code is compiled in this crate and not again in each calling crate.
     pub fn run(self) -> Pin<Box<dyn Future<Output = Ending> + Send>> {
         Box::pin(self.run_to_end())
     }
@@ -421,8 +425,9 @@ impl Drive {
         self.end_run().await
     }
 
-    /// Handles a computation that panicked, which is a fault of this program. Reports the computation to the cell as
-    /// failed. The reason says so, so that nobody looks for a fault of the part.
+    /// Reports to the cell that a computation has failed because its task panicked. The reason in the report states
+    /// that this is a fault of the program, so that nobody looks for a fault of the part. Does nothing if the task is
+    /// not a known computation.
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
         let why = format!("the computation failed by a fault of the program; report it: {}", panic_message(error));
@@ -437,8 +442,12 @@ impl Drive {
         self.handle_event(event, None).await;
     }
 
-    /// Handles the result for the oldest entry that waits to be recorded. If it was recorded, executes the action of
-    /// the entry (a command or an answer). If not, answers with the reason, and does not execute the command.
+    /// Removes the oldest entry from the queue of entries that wait for their record, and executes its action.
+    /// `recorded` is the result of recording this entry.
+    ///
+    /// If the entry was recorded, executes its command (if the cell still requires the command), sends its answer, or
+    /// passes its confirmation to the machine. If the entry was not recorded, does not execute the command, and answers
+    /// with the reason.
     async fn handle_recorded(&mut self, recorded: Result<(), RecordFailure>) {
         let Some(PendingRecord { action: then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
@@ -471,8 +480,8 @@ impl Drive {
         }
     }
 
-    /// Reports a START to the cell as refused, because it was not sent: it could not be recorded, or the cell changed
-    /// its state before. Does nothing for other commands.
+    /// Reports to the cell that a START was refused, because it was not sent. Either the START could not be recorded,
+    /// or the cell changed its state before the record was written. Does nothing for other commands.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
             let why = "START was not sent: it could not be recorded, or the cell was held before".to_owned();
@@ -480,8 +489,9 @@ impl Drive {
         }
     }
 
-    /// Reports to the cell that a command was not sent, because it could not be recorded; a START is reported as
-    /// refused. Does nothing for a command to which the cell expects no answer, or that it no longer requires.
+    /// Reports to the cell that `command` was not sent, because it could not be recorded. A START is reported as
+    /// refused. Does nothing for any other command that the cell no longer requires, or to which the cell expects no
+    /// answer.
     async fn report_not_recorded(&mut self, command: Command) {
         if !self.cell.still_requires(&command) && !matches!(command, Command::StartMachine { .. }) {
             return;
@@ -495,8 +505,8 @@ impl Drive {
         }
     }
 
-    /// Handles a record that cannot be written. Notifies people and the cell of the first of several failures in a row.
-    /// Answers all waiting orders.
+    /// Reports the failure `why` to write a record. Notifies people and the cell only of the first failure in a row.
+    /// Then answers all orders that wait for their record.
     async fn report_record_failure(&mut self, why: RecordFailure) {
         let message = failure_message(&why);
         let is_known = self.record_failure_reason.replace(message.clone()).is_some();
@@ -508,9 +518,9 @@ impl Drive {
         self.answer_unrecorded_orders();
     }
 
-    /// Withdraws the commands that wait for their record, while nothing can be recorded, and reports this to the cell.
-    /// Otherwise the cell would wait for their answers until the disk works again. The cell issues them again if it
-    /// needs them.
+    /// Withdraws the commands that wait for their record and to which the cell expects an answer, and reports this to
+    /// the cell. Otherwise the cell would wait for these answers until the disk works again. The cell issues a command
+    /// again if it still needs it. Does nothing while records can be written, or after the end of the run.
     async fn withdraw_pending_commands(&mut self) {
         if self.record_failure_reason.is_none() || self.ending.is_some() {
             return;
@@ -527,8 +537,9 @@ impl Drive {
         }
     }
 
-    /// Answers the orders that wait for their record, while nothing can be recorded. So no client waits for long. The
-    /// answer states what was carried out, and why it was not recorded.
+    /// Answers all orders that wait for their record with a refusal, so that no client waits for long. The message
+    /// states that only steps to make the cell safe were carried out, and why the order was not recorded. Does nothing
+    /// while records can be written.
     fn answer_unrecorded_orders(&mut self) {
         let Some(why) = &self.record_failure_reason else { return };
         let status = self.snapshot();
@@ -577,8 +588,12 @@ impl Drive {
         ending
     }
 
-    /// Handles an order and answers its sender. Refuses a resume if the state of the cell has changed since the person
-    /// saw it.
+    /// Handles the order `request` of `actor`. Most orders go to the cell as events. A remark is only recorded, and a
+    /// confirmation about a machine goes to the driver of this machine. Sends the reply through `answer`, if there is
+    /// one, after the order is recorded.
+    ///
+    /// Refuses a resume if the state of the cell has changed since the person saw it. Does nothing for the requests
+    /// `Status` and `Watch`.
     async fn handle_order(&mut self, ReceivedOrder { request, actor, answer }: ReceivedOrder) {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.state_changes
@@ -630,7 +645,9 @@ impl Drive {
         }
     }
 
-    /// Handles the confirmation of a person about a machine that cannot report its own state.
+    /// Records the confirmation of a person about a machine that cannot report its own state, and then passes it to the
+    /// driver of this machine. Sends the result through `answer`, if there is one. The reply is a refusal if the
+    /// confirmation does not fit the run, cannot be recorded, or is refused by the driver.
     fn handle_confirmation(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let asked = self.operator_confirmation(request).map(|(device, confirmed, word)| {
             let mut payload = serde_json::to_value(request).unwrap_or_default();
@@ -662,11 +679,13 @@ impl Drive {
         });
     }
 
-    /// Converts the request of a person into a confirmation for a machine. Returns the machine, the name of the
-    /// confirmation in the record, and the confirmation.
+    /// Converts a confirmation of a person (started, done, or at rest) into a confirmation for the driver of a machine.
+    /// Returns the machine, the name of the confirmation for the record, and the confirmation.
     ///
     /// # Errors
-    /// Returns the reason if no job is in progress, if no machine is named, or if the digits of the map are wrong.
+    /// Returns a message for the person. For "started" and "done": no job is in progress, or the digits of the
+    /// correction map are wrong. For "at rest": no machine is named and no job is in progress. For every other request:
+    /// it is not a confirmation.
     fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving_device);
         let job = || at_work.ok_or("no job of a machine is in progress");
@@ -687,9 +706,9 @@ impl Drive {
         })
     }
 
-    /// Returns the SHA-256 of the map of this cycle. `digits` are the first 8 or more hexadecimal digits of it, as a
-    /// person reads them at the grinder. Returns an error if they do not agree or are too few, or if no pass is in
-    /// progress.
+    /// Returns the SHA-256 of the correction map of the pass in progress. `digits` are at least the first 8 hexadecimal
+    /// digits of this hash, as a person reads them at the grinder. Returns an error if `digits` are fewer than 8 or
+    /// differ from the hash, or if no pass is in progress.
     fn map_identity(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving_device) == Some(Device::Grinder);
@@ -743,8 +762,8 @@ impl Drive {
         }
     }
 
-    /// Updates the preview with points of a measurement that still runs, and publishes it. Points of another job than
-    /// the current one delete the preview.
+    /// Adds the points of a running measurement to the preview (preliminary figures for display), and publishes the new
+    /// snapshot. Deletes the preview if the points belong to another job or batch than the current one.
     fn update_preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
         let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };
@@ -769,7 +788,8 @@ impl Drive {
         pass_record::implausible_figure(&told, record)
     }
 
-    /// Records how long the transfer of the points of a measurement took, and shows the speed.
+    /// Records how long the transfer of the points of a measurement took (`taken`), and notifies people of the number
+    /// of points, the time in s, and the time per point in ms.
     async fn record_transfer(&mut self, measurement: &Measurement, taken: Duration) {
         let cycle = BatchId::decode(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
@@ -820,9 +840,9 @@ impl Drive {
         }
     }
 
-    /// Records an event, lets the cell handle it, and starts the execution of the resulting commands. Returns the
-    /// reason if the cell refuses the event, and a receipt that completes when the event is recorded or cannot be
-    /// recorded.
+    /// Records `event`, lets the cell handle it, and starts the execution of the resulting commands. `detail` is stored
+    /// in the record of the event. Returns the reason if the cell refuses the event, otherwise `None`. Also returns a
+    /// receipt that completes when the event is recorded or cannot be recorded.
     async fn handle_event(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, RecordReceipt) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
@@ -882,8 +902,8 @@ impl Drive {
         }
     }
 
-    /// Queues a command to be recorded, and to be executed after that. A command that does not wait for its record
-    /// ([`is_immediate`]) is executed elsewhere, and only recorded here.
+    /// Queues a command to be recorded, and executed after that. An immediate command ([`is_immediate`]) is only
+    /// recorded here, because [`Self::handle_event`] has already executed it.
     fn queue_command(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
@@ -902,8 +922,9 @@ impl Drive {
         self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
     }
 
-    /// Waits until all queued entries are recorded, after the run is over. Still writes judgements and answers orders,
-    /// but executes no other command. Gives up after a time limit.
+    /// Waits after the end of the run until all queued entries are recorded. In this time, still writes judgements and
+    /// answers orders, but executes no other command. Gives up after [`recorder::CLOSE_TIMEOUT`], and then answers the
+    /// remaining orders with the reason.
     async fn finish_backlog(&mut self) {
         let by = Instant::now() + recorder::CLOSE_TIMEOUT;
         while !self.backlog.is_empty() {
@@ -969,7 +990,8 @@ impl Drive {
         }
     }
 
-    /// Writes the judgement of a cycle to a file in the folder of its measurement, and shows it.
+    /// Writes the judgement of a cycle to the file `result.json` in the folder of this cycle, and notifies people. A
+    /// second judgement of the same cycle goes to a subfolder of its own.
     async fn announce(&mut self, judgement: Judgement) {
         let which = self.cycles.count_judgement(judgement.cycle);
         self.write_judgement(which, &judgement).await;
@@ -995,8 +1017,8 @@ impl Drive {
         self.write_document(format!("{}/result.json", cycle_folder(number, which)), number, &result).await;
     }
 
-    /// Writes what this run has learned, as the initial state for the next part of this kind. Does nothing if the run
-    /// was stopped or aborted.
+    /// Writes the learned state of this run to the file [`LEARNED`]. The next part of this kind can begin with this
+    /// state. Does nothing if the run was stopped or aborted, or if no cycle gives a usable state.
     async fn save_learned(&mut self, ending: &Ending) {
         if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
             return;
@@ -1030,8 +1052,9 @@ impl Drive {
         }
     }
 
-    /// Checks that the disk has space for the files of this cycle. If it does not, reports this to the cell, which
-    /// holds before a machine moves. Data may still be sent to the machine.
+    /// Starts a check whether the disk has enough free space for the files of `cycle`. If it has not, reports this to
+    /// the cell, which then holds before a machine moves. Data may still be sent to the machine before the result of
+    /// the check arrives.
     fn check_disk_space(&mut self, cycle: u32) {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
         self.executor.spawn_computation(&mut self.computations, move || {
@@ -1086,9 +1109,9 @@ impl Drive {
         });
     }
 
-    /// Starts the computation `work` for a cycle on a thread for blocking work. Its files are also written to the disk
-    /// and read back on this thread, because they can be large, and neither the loop nor the journal should wait for
-    /// them.
+    /// Starts the computation `work` of the kind `kind` for a cycle, on a thread for blocking work. `work` returns the
+    /// event for the cell and the result to store. The same thread writes the created files to the disk and hashes
+    /// them. These files can be large, and neither the loop nor the journal should wait for them.
     fn start_computation(
         &mut self,
         kind: Computation,
@@ -1141,7 +1164,8 @@ impl Drive {
         Notice::State { state, cycle, event: event.name().to_owned(), at_job }
     }
 
-    /// Shows an event to people, and updates the progress and the preview. Called after the cell has handled the event.
+    /// Notifies people of `event`, and updates the progress of the job and the preview of the points. Must be called
+    /// after the cell has handled the event. `now` is the time since the run began.
     fn show_event(&mut self, now: Duration, event: &Event) {
         self.progress_estimator.update_state(self.cell.state());
         if self.progress_estimator.progress().is_none_or(|progress| progress.device != Device::Cmm) {
@@ -1219,7 +1243,8 @@ fn panic_message(error: JoinError) -> String {
     text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no further information".into())
 }
 
-/// Waits until the first entry in the queue is recorded.
+/// Waits until the first entry of the queue is recorded, and returns the result. Returns an error if the entry cannot
+/// be recorded, or if the journal writer has ended. Never returns if the queue is empty.
 async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<(), RecordFailure> {
     match backlog.front_mut() {
         Some(next) => (&mut next.receipt).await.unwrap_or_else(|_| {

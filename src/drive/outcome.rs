@@ -15,8 +15,8 @@ pub(super) fn expects_answer(command: &Command) -> bool {
     )
 }
 
-/// Returns true if `event` is the answer to `command`. A START for which it is unknown whether the machine executes it
-/// has no answer until the job is reconciled.
+/// Returns true if `event` is the answer to `command`. The reconciliation of a START (the question to the machine
+/// whether it executes the job) is an answer only if its outcome is known. Otherwise the START stays without an answer.
 pub(super) fn answers(event: &Event, command: &Command) -> bool {
     use Command as C;
     use Event as E;
@@ -59,8 +59,8 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
     }
 }
 
-/// Returns the machine that gets a command, and the request by which a refusal names the command. Returns `None` for a
-/// command that no machine can refuse.
+/// Returns the machine to which a command goes, and the kind of request that an [`Event::Refused`] names if the machine
+/// refuses the command. Returns `None` for a command that no machine can refuse.
 fn machine_request(command: &Command) -> Option<(Device, MachineRequest)> {
     Some(match command {
         Command::LoadPass { .. } => (Device::Grinder, MachineRequest::Load),

@@ -33,9 +33,10 @@ pub(super) struct CommandedPass<'t> {
     pub(super) outline: Option<&'t Aperture>,
 }
 
-/// Returns a text about the first implausible figure of a pass record, with its limit; `None` if there is none. `told`
-/// is the commanded pass. The figures of a pass that did not complete, and figures that were not reported, are not
-/// checked.
+/// Compares the pass record of the grinder with the commanded pass `told`. Returns a text about the first
+/// contradiction: another job, another map, a figure outside its limits, or two figures that contradict each other.
+/// Returns `None` if there is none. The figures are not checked if the pass did not complete. A figure that the grinder
+/// did not report is not checked either.
 pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> Option<String> {
     let CommandedPass { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {

@@ -37,9 +37,12 @@ use super::task::{
     deviation_samples, used_deviations,
 };
 
-/// Checks whether the measurement of cycle `number` can be used (the gate), and writes its points to `files`. `earlier`
-/// is the last measurement before it, with the number of its cycle; a machine could have returned that result again.
-/// Returns the event for the cell and the usable points.
+/// Checks whether the measurement of cycle `number` can be used (this check is the gate). If it can, writes its points
+/// to `files`. Returns the event for the cell, and the usable points if the gate accepts them and they are saved.
+///
+/// `cycle` is the state of this cycle, with the plan that was sent. `earlier` is the last measurement of an earlier
+/// cycle, with the number of that cycle. The gate compares the two measurements, because a machine could return an old
+/// result again.
 pub(super) fn gate_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -94,13 +97,14 @@ pub(super) fn gate_cycle(
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
 
-/// Merges a repetition of touches into a measurement. Replaces each outlier by its repeated touch, and adds the touches
-/// around the outliers. Keeps the first touch of an outlier whose repetition missed the part, and the first touches of
-/// the control points. Returns the points, and the number of points that the repetition found.
+/// Merges the touches that were repeated (`measurement`) into the earlier points of the same part (`points`). Replaces
+/// each outlier by its repeated touch, and adds the touches around the outliers. Keeps an outlier unchanged if its
+/// repeated touch did not find the part. Keeps the control points (good touches that were repeated as a check)
+/// unchanged. Returns the merged points, and the number of repeated touches that found a surface.
 ///
 /// # Errors
-/// One set of points are probe centres and the other contact points, points are missing, or control points have moved.
-/// The part may then have moved between the two sets.
+/// One of the two sets contains probe centres and the other contact points, the measurement has too few points, or the
+/// control points have changed. In the last case the part may have moved between the two sets.
 fn merge_repeated_touches(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -131,12 +135,12 @@ fn merge_repeated_touches(
     Ok((all, found as u32))
 }
 
-/// Checks that the part has not moved between a measurement and its repeated touches. Compares the control points with
-/// their first touches, along the normals. The second largest change counts, because one control point may be a wrong
-/// touch.
+/// Checks with the control points that the part has not moved between the first touches (`points`) and the repeated
+/// touches (`repeated`). The change of a control point is the distance of its two touches along the surface normal. The
+/// second largest change is compared with the limit, because one control point may be a wrong touch.
 ///
 /// # Errors
-/// The change exceeds the limit of `again`, or fewer than two control points were touched.
+/// This change exceeds the limit in `again`, or fewer than two control points were touched.
 fn check_control_points(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -165,8 +169,9 @@ fn check_control_points(
     }
 }
 
-/// Returns the touched points on the part, and those on the reference sphere. If the plan has no targets (`planned` is
-/// 0), all touched points are of the part.
+/// Returns the touched points in the CMM frame in mm: first those on the part, then those on the reference sphere.
+/// `planned` is the number of planned targets on the part. If it is 0, the plan has no targets, and all touched points
+/// count as points on the part.
 fn touched_points(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
     let taken = measurement.points.iter().filter(|p| p.status == TouchStatus::Touched).map(|p| p.position_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
@@ -216,9 +221,11 @@ fn gate_points(
     })
 }
 
-/// Estimates the noise of the probe from a fit to a sphere. `rms_mm` is the RMS of the residuals, `points` the number
-/// of points. Returns the standard deviation in mm, corrected for the four degrees of freedom of the fit, and its
-/// relative standard uncertainty.
+/// Estimates the noise of the probe from a sphere fit with `points` points. `rms_mm` is the RMS of the residuals.
+/// Returns the standard deviation of the noise in mm, and the relative standard uncertainty of this standard deviation.
+///
+/// With f = `points` - 4 (but at least 1) degrees of freedom, the standard deviation is rms (points / f)^(1/2), and its
+/// relative uncertainty is (2 f)^(-1/2).
 fn probe_noise(rms_mm: f64, points: usize) -> [f64; 2] {
     const FITTED: f64 = 4.0;
     let free = (points as f64 - FITTED).max(1.0);
@@ -236,8 +243,10 @@ pub(super) struct TouchRecord {
 }
 
 impl TouchRecord {
-    /// Returns the targets that were tried and found so far, with those of a new batch. `asked` are the targets of this
-    /// batch; `plan` and `measurement` are its plan and result.
+    /// Returns the record of the targets that were tried and found so far (from `so_far`), extended by a new batch of
+    /// an adaptive measurement. `asked` are the indices of the batch's targets in the pattern. `plan` and `measurement`
+    /// are the plan and the result of the batch. If `asked` is empty, the measurement is not adaptive, and nothing is
+    /// added.
     fn with_batch(so_far: Option<&UsablePoints>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
         let (mut tried, mut of) =
             so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
@@ -251,12 +260,15 @@ impl TouchRecord {
     }
 }
 
-/// Returns the usable points of a measurement that an interrupted program had accepted, from the contents of its files.
-/// `part` and `sphere` are the points, and `told` the kind of coordinates with the temperature in °C. `rounds` is the
-/// number of repetitions of touches.
+/// Restores the usable points of a measurement that an interrupted program had accepted. The arguments come from the
+/// recorded files.
+///
+/// `part` and `sphere` are the touched points on the part and on the reference sphere, in mm. `told` is the kind of
+/// coordinates (probe centres or contact points) and the temperature in °C. `touches` are the targets of an adaptive
+/// measurement. `rounds` is the number of times that outliers were touched again.
 ///
 /// # Errors
-/// The points do not pass the gate.
+/// The points do not pass the gate (the check whether they can be used).
 pub(super) fn gate_recorded_points(
     task: &Task,
     part: Vec<Point>,
@@ -271,8 +283,9 @@ pub(super) fn gate_recorded_points(
 /// Maximum relative difference of a qualified probe's radius from the stated one. A larger one means another stylus.
 const MAX_PROBE_RADIUS_DIFFERENCE: f64 = 0.01;
 
-/// Returns a failure if a result belongs to another plan than the one sent, or if its values contradict the cell or the
-/// recipe. Returns `None` if neither is the case.
+/// Returns a failure of the gate if `measurement` belongs to another plan than `plan`, or if it contradicts the plan,
+/// the cell file or the recipe. Examples are another kind of coordinates, another probe radius, a wrong number or order
+/// of points, and a value out of range. Returns `None` if no contradiction is found.
 fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
         return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
@@ -315,8 +328,10 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
 /// reports coarse steps.
 const MIN_COMPARED_TOUCHES: usize = 8;
 
-/// Returns a failure if the points equal those of the measurement `earlier` in every bit. Two real measurements never
-/// do, so the machine has returned its old result again.
+/// Returns a failure of the gate if the touched points contain all points of the measurement `earlier`, equal in every
+/// bit. Two real measurements never give such points, so the machine has returned its old result again. Returns `None`
+/// otherwise. Also returns `None` in a rehearsal, without an earlier measurement, or if that measurement has fewer than
+/// [`MIN_COMPARED_TOUCHES`] points.
 fn repeated_result_failure(
     task: &Task,
     earlier: Option<&(u32, Arc<UsablePoints>)>,
@@ -351,12 +366,13 @@ fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFai
     }
 }
 
-/// Fits a sphere to the points on the reference sphere. Returns the radius of the probe, its standard uncertainty, and
-/// the RMS of the residuals, all in mm. Returns `None` if the recipe does not measure a reference sphere.
+/// Measures the radius of the probe by a sphere fit to `points`, the touched points on the reference sphere. Returns
+/// the probe radius, its standard uncertainty, and the RMS of the residuals, all in mm. Returns `None` if the recipe
+/// does not measure a reference sphere.
 ///
 /// # Errors
-/// No sphere fits, or its radius shows that the points are contact points instead of probe centres, or inches instead
-/// of millimetres.
+/// No sphere fits. Or the fitted radius shows a wrong kind of points: contact points instead of probe centres, or
+/// inches instead of millimetres.
 fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.reference_sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
@@ -371,8 +387,9 @@ fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, G
     Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
 }
 
-/// Registers the points of cycle `number`, computes its figures and its error map, and writes the results to `files`.
-/// `before` is the last judged cycle of an earlier pass. Returns the event for the cell and the results.
+/// Registers the points of cycle `number`, computes the form figures and the error map, and writes these results to
+/// `files`. `before` is the last judged cycle of an earlier pass. Returns the event for the cell and the results. If
+/// the registration fails or cannot be saved, the event states the reason, and there are no results.
 pub(super) fn register_cycle(
     task: &Task,
     files: &mut OutputFiles,
@@ -529,14 +546,15 @@ fn register_and_evaluate(
     })
 }
 
-/// Returns the message of each estimated parameter of the machine that should be corrected as a parameter: it is
-/// separable from other effects and larger than its expanded uncertainty.
+/// Returns a message for people for each machine parameter that should be corrected as a parameter. Such a parameter
+/// can be separated from other effects, and its estimated error is larger than its expanded uncertainty.
 fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<Item = String> {
     told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
 }
 
-/// Returns the prior of the error model for a cycle. Passes with a correction and passes without have different priors.
-/// The prior is from earlier parts, or else from the previous cycle `before` of this run; `None` if there is neither.
+/// Returns the prior of the error model for a cycle. A pass with a correction and a pass without one have different
+/// priors. The prior learned from earlier parts is preferred. Without one, the prior comes from the cycle `before`, if
+/// its pass is of the same kind. Returns `None` if neither gives a prior.
 fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> Option<Prior> {
     let is_corrected = !cycle.correction.is_zero();
     let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
@@ -545,8 +563,10 @@ fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> 
     taught.or_else(of_this_part).map(|lesson| lesson.prior())
 }
 
-/// Returns the state of the learning after a measured pass. `before` is the previous judged cycle, `error` the error
-/// map of this one, and `answer` the response of the part to the correction, if it was estimated.
+/// Returns the state of the learning (the estimate of how the part responds to corrections) after a measured pass.
+/// Updates the state of `before`, the previous judged cycle. If `before` has none, updates the initial state of the
+/// run. `error` is the error map of this cycle. `answer` is the response of the part to the correction, if it was
+/// estimated. `contacts` are the measured points.
 fn update_learning(
     task: &Task,
     cycle: &CycleState,
@@ -677,11 +697,12 @@ fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFi
     RecordedFormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
 }
 
-/// Returns the interval (k = 2) of F, the root mean square of the form without the noise of the probe. `scatter_mm` is
-/// s, the standard deviation of the noise.
+/// Returns the interval (k = 2) in mm of F, the root mean square of the form without the noise of the probe.
+/// `scatter_mm` is s, the standard deviation of this noise. `verdict` contains RMS, the root mean square of the
+/// deviations, and n, the number of points that the registration used.
 ///
-/// With n used points, and p = 6 degrees of freedom of the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty u
-/// is given by u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n.
+/// With p = 6 degrees of freedom of the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty u is given by
+/// u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n.
 fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> RecordedInterval {
     const MOTIONS: f64 = 6.0;
     let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
@@ -797,8 +818,9 @@ fn compute_correction(
     Ok((summary, step.correction))
 }
 
-/// Returns the estimates of the parameters that the recipe compensates, in the form that the cell records. Returns none
-/// for a later pass, because only the error after the first pass is used for the estimate.
+/// Returns the estimated errors of the machine parameters that the recipe compensates, as the cell records them (in the
+/// display unit of each parameter). Parameters that cannot be separated from other effects are omitted. Returns an
+/// empty list for a later pass, because only the error after the first pass of a run is used for the estimate.
 pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<RecordedParameter> {
     let Some(taken) = &task.parameter_compensation else { return Vec::new() };
     let told = cycle.parameters.iter().flat_map(|told| told.estimates.iter().enumerate());
@@ -822,8 +844,8 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// Returns a question to a person for each parameter of the machine whose compensation exceeds its tolerance in the
-/// recipe. The cell asks them before the next pass.
+/// Returns a text for each machine parameter whose compensation exceeds its tolerance in the recipe. Each text states
+/// the error, its expanded uncertainty and the compensation, so that a person can decide before the next pass.
 fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     let beyond = cycle.parameters.iter().flat_map(|told| &told.estimates).filter(|p| p.exceeds_tolerance);
     let question = |p: &compensation::EstimatedParameter| {
@@ -840,9 +862,11 @@ fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     beyond.map(question).collect()
 }
 
-/// Returns what a run has learned, as the initial state for the next part of this kind. `run` is the name of the run,
-/// `cycle` its last judged cycle. Returns `None` if the learning of this cycle has no state, or if the part responded
-/// wrongly to the correction.
+/// Returns the learned state of a run, with which the next part of this kind can begin. `run` is the name of the run,
+/// `cycle` its last judged cycle, and `fields` the priors of the error model for later parts.
+///
+/// Returns `None` if the cycle has no learning state or no figures. Also returns `None` if the part responded wrongly
+/// to the correction: with the wrong sign, mirrored, doubled, or not at all.
 pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleState, PartPriors)) -> Option<Learned> {
     let known = cycle.learning.as_deref()?;
     let wrong = [PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::NoEffect, PartResponse::Doubled];
@@ -878,8 +902,13 @@ pub(super) struct MeasurementConditions {
     pub(super) temperature_c: f64,
 }
 
-/// Writes the points of a measurement, in the CMM frame in mm, and the conditions of the measurement, such as the
-/// temperature.
+/// Writes the points of a measurement as CSV files: those on the part, and those on the reference sphere if there are
+/// any. The coordinates are in the CMM frame in mm. Also writes JSON files: the temperature if the thermal expansion is
+/// compensated, the targets of an adaptive measurement, and the number of times that outliers were touched again, if it
+/// is not 0.
+///
+/// # Errors
+/// A file cannot be written.
 fn write_measured_points(task: &Task, files: &mut OutputFiles, points: &UsablePoints) -> Result<(), FormatError> {
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = MeasurementConditions { simulation: task.simulation, temperature_c };

@@ -17,8 +17,9 @@ pub(super) struct PreviewAccumulator {
 }
 
 impl PreviewAccumulator {
-    /// Adds new points of a running measurement to the preview. If they do not continue the points before, or do not
-    /// fit the targets of `plan`, deletes the preview.
+    /// Adds the points `preliminary` of a running measurement to the preview (preliminary figures for display). Points
+    /// with the first index 0 begin a new preview. Deletes the preview if the points belong to another job, do not
+    /// follow the last added point, or do not match the targets of `plan`.
     pub(super) fn add_points(&mut self, plan: &Plan, preliminary: &PreliminaryPoints) {
         let PreliminaryPoints { job, first_index: from, points, coordinates } = preliminary;
         if *from == 0 {
@@ -58,8 +59,9 @@ impl PreviewAccumulator {
     }
 }
 
-/// Returns the signed distance in mm of a touched point from its target, along the normal of the target, after the ball
-/// radius is subtracted. It contains both the error of the part and its displacement in the fixture.
+/// Returns the signed deviation in mm of a touched point from its target: the distance along the unit normal `normal`,
+/// minus `ball_mm`. `ball_mm` is the radius of the probe, or 0 for contact points. The deviation contains the error of
+/// the part and the displacement of the part in the fixture. All arguments are in the CMM frame.
 fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
     (0..3).map(|k| (point.position_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
 }

@@ -77,11 +77,11 @@ pub enum ProgramError {
 }
 
 impl Programs {
-    /// Returns the nominal surface of a part as a height over x and y, with its outline. The paths of the wheel are
-    /// planned on these.
+    /// Returns the nominal surface of a part as a height z over x and y, with the outline of the part. The paths of the
+    /// wheel are planned on this surface, within this outline.
     ///
     /// # Errors
-    /// A surface that is not a height over x and y.
+    /// The surface cannot be described as a height over x and y.
     pub fn surface_and_outline(nominal: &Nominal) -> Result<(HeightField, Aperture), PathError> {
         nominal_height_field(nominal)
     }
@@ -91,11 +91,11 @@ impl Programs {
         format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
     }
 
-    /// Checks that the dialect can express a program with these settings: path tolerance, arcs, and the rotary axis if
-    /// the wheel is tilted.
+    /// Checks that the dialect can express a program with these settings: the path tolerance, arcs, and the rotary axis
+    /// if the wheel is tilted.
     ///
     /// # Errors
-    /// A requirement that the dialect cannot express.
+    /// The dialect cannot express a setting, or arcs are required together with a tilted wheel.
     pub fn check_dialect(&self) -> Result<(), DialectError> {
         if let Some(rotary) = self.options.tilting_axis() {
             self.dialect.turning(rotary)?;
@@ -116,10 +116,11 @@ impl Programs {
         }
     }
 
-    /// Creates the path of a pass and checks it against the limits of the grinder.
+    /// Plans the path of the wheel for a pass with the correction `correction`, and checks it against the limits of the
+    /// grinder. Returns the path and its summary (extent, length, duration, and peak speeds).
     ///
     /// # Errors
-    /// A wheel that does not fit the corrected surface, or a path beyond the limits of the grinder.
+    /// The wheel does not fit the corrected surface, or the path exceeds a limit of the grinder.
     pub fn path(&self, correction: &Correction) -> Result<(ToolPath, PathSummary), PathError> {
         let (nominal, outline) = (self.nominal(correction), &self.surface_and_outline.1);
         let wheel = self.wheel(correction);
@@ -130,24 +131,28 @@ impl Programs {
         Ok((path, summary))
     }
 
-    /// Returns the number and length of arcs in the program of `path`. Returns `None` if the program has lines only.
+    /// Returns the number of moves, arcs and lines in the program of `path`, and the largest deviation of an arc from
+    /// the path. Returns `None` if the program has lines only.
     ///
     /// # Errors
-    /// A requirement that the dialect cannot express.
+    /// The dialect cannot express the settings of the program.
     pub fn arc_summary(&self, path: &ToolPath) -> Result<Option<ArcSummary>, DialectError> {
         let post = self.dialect.post(&self.exactness())?;
         Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
-    /// Returns the wheel for a pass: that of the recipe, with the radius error that measurements have estimated added.
+    /// Returns the wheel for a pass: the wheel of the recipe, with a radius that is larger by the estimated radius
+    /// error in `correction`.
     fn wheel(&self, correction: &Correction) -> Wheel {
         self.options.wheel.with_larger_radius(self.wheel_radius_error_mm(correction))
     }
 
-    /// Returns the nominal surface relative to the zero of the machine, lowered by the radius error dR of the wheel.
+    /// Returns the nominal surface relative to the zero of the machine, lowered by dR, the estimated error of the wheel
+    /// radius in `correction`.
     ///
     /// The zero is set by touching off with the lowest point of the wheel, while the recipe's radius is assumed. The
-    /// centre of a wheel that is larger by dR is therefore already higher by dR.
+    /// centre of a wheel that is larger by dR is then higher by dR than assumed. Lowering the surface by dR compensates
+    /// this difference.
     fn nominal(&self, correction: &Correction) -> HeightField {
         self.surface_and_outline.0.clone().lowered(self.wheel_radius_error_mm(correction))
     }
@@ -157,8 +162,8 @@ impl Programs {
         correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Writes the program of a pass to `file`, and returns the summary of its path. `map_identity` is written into the
-    /// program.
+    /// Plans the path of a pass and writes its program to `file`. Returns the summary of the path. `map_identity` is
+    /// the SHA-256 of the correction map, which the header of the program states.
     ///
     /// # Errors
     /// Those of [`Programs::path`], and a file that cannot be written.
@@ -173,15 +178,16 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes the program and the table `toolpath_z.csv` of a pass into `files`. Copies the program to the program
-    /// folder of the controller, if the cell file names one.
+    /// Writes the program of a pass, and the table `toolpath_z.csv` with the offsets of axis Z, into `files`. Copies
+    /// the program to the program folder of the controller, if the cell file names one. `map_identity` is the SHA-256
+    /// of the correction map.
     ///
-    /// Returns `None` if both files were written. Returns the reason if one was omitted: the program is too long, or
-    /// the table cannot be computed.
+    /// Returns `None` if program and table were written. Returns the reason if one of them was omitted: the program is
+    /// too long (then the table is omitted too), or the table cannot be computed.
     ///
     /// # Errors
-    /// No path can be planned, a file cannot be written, or the program is too long for a controller with a program
-    /// folder.
+    /// No path can be planned, a file cannot be written, the copy differs, or the program is too long and the cell file
+    /// names a program folder.
     pub(super) fn save(
         &self,
         files: &mut OutputFiles,
@@ -206,8 +212,12 @@ impl Programs {
         }
     }
 
-    /// Copies a program to the program folder of the controller, under a name in the form of the dialect, and reads the
-    /// copy back. Does nothing if the cell file names no program folder.
+    /// Copies `program` to the program folder of the controller, and reads the copy back. The dialect forms the name of
+    /// the copy from the name of the part and the number of the cycle. Does nothing if the cell file names no program
+    /// folder.
+    ///
+    /// # Errors
+    /// A file cannot be read or written, or the copy differs from the program.
     fn copy_to_controller(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let bytes = read_bytes(program).map_err(GcodeError::from)?;
@@ -220,8 +230,12 @@ impl Programs {
         }
     }
 
-    /// Writes the correction of a pass as a table: the offset of axis Z at each node over X and Y. Controllers that
-    /// compensate by a table read this file.
+    /// Writes the correction of a pass as a table for controllers that compensate by a table. The table contains the
+    /// offset of axis Z in mm at each node of the correction's grid over x and y. `path` is the path with the
+    /// correction.
+    ///
+    /// # Errors
+    /// The wheel is tilted, the offsets cannot be computed, or the file cannot be written.
     fn save_table(
         &self,
         file: &Path,
@@ -272,9 +286,10 @@ impl Programs {
     }
 }
 
-/// Returns the correction from which a path is planned. With parameter corrections, its map values are the sum of the
-/// residual map and the displacement by wheel setting and tilt. The error of the wheel radius is not in the map:
-/// [`Programs::path`] uses the corrected radius.
+/// Returns the correction from which a path is planned. Without parameter corrections, this is `correction` itself.
+/// With parameter corrections, each map value is the sum of the residual map and the displacement by wheel setting and
+/// tilt. The map does not contain the error of the wheel radius, because [`Programs::path`] plans with the corrected
+/// radius.
 fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     match &correction.set {
         None => Cow::Borrowed(correction),
@@ -282,8 +297,9 @@ fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     }
 }
 
-/// Returns a line for each parameter of the machine that the correction compensates: its error, the pass since which it
-/// is compensated, and how. `wheel_radius_mm` is the radius in the recipe.
+/// Returns a line of text for each machine parameter that `correction` compensates. The line states the error, the pass
+/// since which it is compensated, and whether the map or the wheel radius compensates it. `wheel_radius_mm` is the
+/// radius in the recipe. Returns an empty list if no parameter is compensated.
 pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
     let Some(set) = &correction.set else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);

@@ -41,8 +41,8 @@ impl ProgressEstimator {
         self.marks.push_back((now, done));
     }
 
-    /// Adapts the estimate to the state of the cell. Outside of Execute the earlier reports are forgotten, because a
-    /// held job has no speed. If the job is over, its progress is forgotten too.
+    /// Adapts the estimate to the state of the cell. Deletes the earlier reports if the cell is not in the state
+    /// Execute, because a held job has no speed. Deletes the job too if the cell no longer runs or reconciles it.
     pub(super) fn update_state(&mut self, state: State) {
         let at = state.phase().and_then(|phase| phase.job());
         let is_at_it = |device| matches!(at, Some((at, JobStep::Run | JobStep::Reconcile)) if at == device);
@@ -54,7 +54,8 @@ impl ProgressEstimator {
         }
     }
 
-    /// Returns the progress of the job, if one runs.
+    /// Returns the progress of the job, with the remaining time if it can be estimated. Returns `None` if no job is in
+    /// progress.
     pub(super) fn progress(&self) -> Option<JobProgress> {
         let (device, _) = self.job?;
         let (done, total) = self.done_and_total;

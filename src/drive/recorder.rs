@@ -101,8 +101,9 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Creates a recorder for a journal. `open` are the journal's numbers of the commands without an outcome. The
-    /// recorder names these commands by the intent numbers 1, 2, 3, in this order. `beside` executes the writing.
+    /// Creates a recorder for `journal`. `open` are the commands without an outcome, by their numbers in the journal.
+    /// The recorder gives these commands the intent numbers 1, 2, 3 and so on, in the order of `open`. `beside` is the
+    /// executor on which the entries are written.
     pub(super) fn new(journal: Box<dyn JournalSink>, open: &[u32], beside: &BlockingExecutor) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
@@ -138,9 +139,9 @@ impl Recorder {
         self.enqueue(JournalTask::Append(Box::new(entry)))
     }
 
-    /// Queues a command to be recorded before it is executed (an intent). Returns the number by which
-    /// [`Recorder::append_outcome`] refers to it, and a receipt that completes when it is on the disk or cannot be
-    /// written.
+    /// Queues a command to be recorded before its execution (such a record is an intent). Returns the number of the
+    /// intent, which [`Recorder::append_outcome`] requires. Also returns a receipt that completes when the intent is on
+    /// the disk or cannot be written.
     pub(super) fn append_intent(&mut self, entry: Entry) -> (u64, RecordReceipt) {
         self.intent_count += 1;
         (self.intent_count, self.enqueue(JournalTask::Intent(self.intent_count, Box::new(entry))))
@@ -152,14 +153,17 @@ impl Recorder {
         self.enqueue(JournalTask::Outcome(intent, Box::new(entry)))
     }
 
-    /// Queues files of the run folder to be recorded, with their lengths and hashes. Returns a receipt that completes
-    /// when this is on the disk or cannot be written.
+    /// Queues a record of `files` of the run folder, with their lengths and hashes. Returns a receipt that completes
+    /// when the record is on the disk or cannot be written. `now` is the time since the run began.
     pub(super) fn append_artefacts(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> RecordReceipt {
         self.enqueue(JournalTask::Artefacts(files, now, cycle))
     }
 
-    /// Writes the end of the record, with `ending` as its content, and closes the journal. Returns an error if it is
-    /// not written within [`CLOSE_TIMEOUT`].
+    /// Writes the last record of the run, with `ending` as its content, and closes the journal. `now` is the time since
+    /// the run began.
+    ///
+    /// # Errors
+    /// The record cannot be written, or is not written within [`CLOSE_TIMEOUT`].
     pub(super) async fn close(&mut self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
         let closed = tokio::time::timeout(CLOSE_TIMEOUT, self.enqueue(JournalTask::Close(now, cycle, ending))).await;
         self.abandoned.store(true, Ordering::Release);
@@ -218,8 +222,9 @@ impl JournalWriter {
         }
     }
 
-    /// Writes an entry to the journal, and retries as long as it fails. Reports the failure to the loop at the first
-    /// attempt and at every tenth one, because an earlier report may be about an earlier entry.
+    /// Executes `job` (usually the writing of one entry) on the journal, and retries as long as the failure can pass.
+    /// Reports the failure to the loop at the first attempt and at every tenth further one. The report is repeated,
+    /// because an earlier report may have been about an earlier entry.
     ///
     /// # Errors
     /// The failure cannot pass by itself, or the run has ended meanwhile.
@@ -285,8 +290,12 @@ pub(super) fn nanoseconds(now: Duration) -> u64 {
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Writes files of a run folder to the disk and reads them back. Returns the length and the hash of each, for
-/// [`Recorder::append_artefacts`]. Blocks the thread, and takes long for large files.
+/// Flushes the files `names` of a run folder to the disk and reads them back. Returns the name, length and hash of each
+/// file, in the order of `names`, for [`Recorder::append_artefacts`]. Blocks the thread, and takes long for large
+/// files.
+///
+/// # Errors
+/// A file cannot be read, or the disk fails.
 pub(super) fn sync_and_hash(folder: &Path, names: &[String]) -> Result<Vec<Artefact>, RecordFailure> {
     names.iter().map(|name| Artefact::from_file(folder, name).map_err(record_failure)).collect()
 }
@@ -307,8 +316,8 @@ impl OutputFiles {
         Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new() }
     }
 
-    /// Sets the subfolder `settled` for the results on which the cell decides.
-    /// [`OutputFiles::switch_to_final_subfolder`] switches to it.
+    /// Sets `settled` as the subfolder for the final results of an adaptive measurement, on which the cell decides.
+    /// [`OutputFiles::switch_to_final_subfolder`] switches to this subfolder.
     pub(super) fn with_final_subfolder(self, settled: String) -> Self {
         Self { final_subfolder: Some(settled), ..self }
     }
@@ -376,7 +385,8 @@ fn record_failure(error: JournalError) -> RecordFailure {
     }
 }
 
-/// Creates a journal entry. `now` is the time since the run began, and `actor` the name and the place of its origin.
+/// Creates a journal entry of the kind `kind` with the content `payload`. `now` is the time since the run began.
+/// `actor` contains the name of the person or machine that caused the entry, and the place from which it came.
 pub(super) fn entry(kind: RecordKind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
     let (actor, station) = actor;
     Entry { actor, station, ..Entry::new(kind, nanoseconds(now), cycle, payload) }

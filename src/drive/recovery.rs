@@ -82,19 +82,23 @@ impl RecoveryStep {
     }
 }
 
-/// Connects and returns the status of a machine. Writes nothing to it but the heartbeat of this client.
+/// Connects to a machine and returns its status. Does not change the machine: the program writes only the heartbeat
+/// that shows the machine that its client is alive.
+///
+/// # Errors
+/// The machine cannot be reached, or its answer is invalid.
 pub async fn read_status<M: Machine>(machine: &mut M) -> Result<Status, RecoveryError> {
     machine.connect().await?;
     Ok(machine.status().await?)
 }
 
-/// Sends one step to a machine, and returns the status after the machine has come to rest. Sends nothing if the status
-/// differs from `seen`, which a person has seen. `limit` is the maximum time until the machine is at rest, `by` the
-/// person who decided. Records the step before it is sent, and its outcome after it.
+/// Sends one recovery step to a machine, waits until the machine is at rest, and returns its status. `seen` is the
+/// status on which the person `by` decided. Sends nothing if the machine now has another status. `limit` is the maximum
+/// time until the machine is at rest. Records the step in `journal` before it is sent, and its outcome afterwards.
 ///
 /// # Errors
-/// A machine that cannot be reached, belongs to another client, has changed, refuses, or does not come to rest within
-/// the limit; a record that cannot be written.
+/// The machine cannot be reached, belongs to another client, has changed, refuses the step, or is not at rest within
+/// the limit. Or a record cannot be written.
 pub async fn execute_step<M: Machine>(
     machine: &mut M,
     device: Device,
@@ -132,8 +136,9 @@ pub async fn execute_step<M: Machine>(
     ended
 }
 
-/// Claims the machine for this program. Retries for [`OWNER_RELEASE_TIME`] while the machine still belongs to another
-/// client, because this client may have ended a moment ago.
+/// Makes this program the owner of the machine. If the machine belongs to another client, retries for up to
+/// [`OWNER_RELEASE_TIME`]. The other client may have ended a moment ago, and the machine then releases it within this
+/// time.
 async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     let by = Instant::now() + OWNER_RELEASE_TIME;
     loop {

@@ -82,11 +82,12 @@ pub enum ReplayError {
 }
 
 impl InterruptedRun {
-    /// Reads the record of an interrupted run and repeats its decisions and computations. `plan` and `task` must be
-    /// those with which the run began. Returns the state in which the run was interrupted.
+    /// Reads the record of an interrupted run from the run folder `run`, and repeats its decisions and computations
+    /// (replay). Returns the state in which the run was interrupted. `plan` and `task` must be those with which the run
+    /// began.
     ///
     /// # Errors
-    /// A record that cannot be read, a disk that fails, or the first difference from the decisions of this program.
+    /// The record cannot be read, the disk fails, or a decision or result of this program differs from the record.
     pub fn read(run: &Path, plan: CellPlan, task: &Task) -> Result<Self, ReplayError> {
         let reader = Reader::open(run)?;
         let mut replay = Replay::new(run, plan, task)?;
@@ -112,8 +113,9 @@ impl InterruptedRun {
         }
     }
 
-    /// Returns the cycle and the data of the last START that was prepared for a machine; `None` if there was none. The
-    /// flag is true if the machine may still execute this job.
+    /// Returns the last START that was prepared for a machine: the number of its cycle, and the data of the prepared
+    /// job. Returns `None` if no START was prepared. The second value is true if the machine may still execute this
+    /// job.
     pub(super) fn last_preparation(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
         let intent = self.armed[device as usize].clone();
         let Some(intent) = intent.and_then(|value| serde_json::from_value::<StartIntent>(value).ok()) else {
@@ -226,7 +228,8 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Repeats what a command changed in this program, such as the plan of a cycle. Sends nothing to a machine.
+    /// Repeats the effect of a command on the data of this program: the payloads of a pass, the plan of a measurement,
+    /// a judgement, or the ending. Does nothing for other commands, and sends nothing to a machine.
     fn apply_command(&mut self, command: &Command) {
         let (cycles, task) = (&mut self.replayed.cycles, self.task);
         match command {
@@ -261,8 +264,12 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Repeats the computation whose result is `event`, from recorded data, and stores the result. For a gate, only
-    /// reads the accepted points. Does nothing for other events.
+    /// Repeats the computation that produced `event`, and stores its result. Compares the event and the files with the
+    /// recorded ones. For the gate (the check whether a measurement can be used), only reads the accepted points from
+    /// the record. Does nothing if no computation produced the event.
+    ///
+    /// # Errors
+    /// The result differs from the record, or a file cannot be read or written.
     fn repeat_computation(&mut self, event: &Event) -> Result<(), ReplayError> {
         let (number, kind) = match event {
             Event::Collected { cycle, gate: GateResult::Passed, .. } => (*cycle, Computation::Gate),
@@ -326,7 +333,8 @@ impl<'t> Replay<'t> {
             .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))
     }
 
-    /// Reads the newest recorded JSON file `name` of cycle `number`; `None` if there is none.
+    /// Reads the newest recorded JSON file `name` of cycle `number`. Returns `None` if no such file is recorded.
+    /// Returns an error if the file cannot be read or has other content than expected.
     fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
         let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
         let bytes = file.read(self.run_folder)?;
@@ -334,7 +342,8 @@ impl<'t> Replay<'t> {
     }
 
     /// Compares the files of a repeated computation, in the folder `scratch`, with the recorded files of cycle
-    /// `number`. Returns an error for the first difference.
+    /// `number`. Ignores files that are not recorded, and X3P files, which contain the time of writing. Returns an
+    /// error for the first difference.
     fn compare_files(&self, number: u32, scratch: &Path, files: &OutputFiles) -> Result<(), ReplayError> {
         // A file of this format contains the time of its writing.
         let dated = |name: &str| name.ends_with(".x3p");
@@ -357,8 +366,12 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Completes the replay: checks that the last START prepared for each machine agrees with the pass or plan of its
-    /// cycle, and finds the files in the run folder that are not recorded.
+    /// Completes the replay and returns the interrupted run. Checks for each machine that the last prepared START
+    /// agrees with the pass or the plan of its cycle. Also finds the files of each cycle in the run folder, with their
+    /// attempts, and lists those that are not recorded.
+    ///
+    /// # Errors
+    /// A prepared START differs from the replay, or its record cannot be read.
     fn finish(mut self) -> Result<InterruptedRun, ReplayError> {
         for device in Device::BOTH {
             self.check_preparation(device)?;
@@ -379,9 +392,9 @@ impl<'t> Replay<'t> {
         Ok(self.replayed)
     }
 
-    /// Registers a file that exists in the run folder. The next attempt of its computation then gets a higher number
-    /// than `attempt`, so that it does not overwrite the file. A file that is not recorded is added to the unrecorded
-    /// files.
+    /// Registers the file `name` that exists in `folder` of the run folder. Stores `attempt` as an attempt of the
+    /// computation that wrote the file. The next attempt then has a higher number and does not overwrite the file. A
+    /// file that is not recorded is added to the list of unrecorded files. Ignores hidden files and `result.json`.
     fn add_existing_file(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
         if name == "result.json" || name.starts_with('.') {
             return;

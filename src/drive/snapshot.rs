@@ -39,7 +39,8 @@ impl Drive {
     }
 }
 
-/// Returns what a person has to do next. `waits_for` are the notes of the machines on why they wait.
+/// Returns the next action that the cell needs from a person. `waits_for` are the texts in which the machine of the
+/// current job states why it waits. The first text is returned if nothing more urgent is to be done.
 fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
     if let (State::Execute(_), Some(device)) = (cell.state(), cell.clear_confirmation_device()) {
         return NextStep::SeeClear { device };

@@ -85,8 +85,9 @@ pub(super) trait StationDriver: Send + 'static {
     type Machine: Machine;
     const DEVICE: Device;
     fn machine(&mut self) -> &mut Self::Machine;
-    /// Transfers a payload (the pass or the measuring plan) to the machine. Returns the digest of the identities of its
-    /// contents, by which the machine names it. `interrupt` cancels the transfer.
+    /// Transfers a payload (the pass with its correction map, or the measuring plan) to the machine. Returns the digest
+    /// (a short hash) of the identities of its contents. A job names the payload by this digest. `interrupt` cancels
+    /// the transfer.
     fn load(
         &mut self,
         load: &MachinePayload,
@@ -97,7 +98,8 @@ pub(super) trait StationDriver: Send + 'static {
         job: Job,
         interrupt: &Interrupt,
     ) -> impl Future<Output = Result<FetchedResult, DeviceError>> + Send;
-    /// Reads new preliminary data while the job still runs; see [`Cmm::read_ahead`].
+    /// Reads new preliminary points of a job that still runs. See [`Cmm::read_ahead`]. The default implementation
+    /// always returns `None`.
     fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<PreliminaryPoints>> + Send {
         std::future::ready(None)
     }
@@ -166,8 +168,8 @@ impl AbortCounter {
         Self { ordered_count: ordered, handled_count: 0 }
     }
 
-    /// Waits until an abort is ordered that this station has not handled. Never returns if no abort can be ordered any
-    /// more.
+    /// Waits until an abort is ordered that this station (the task of one machine) has not yet handled. Never returns
+    /// if no sender is left that could order one.
     async fn wait_for_abort(&mut self) {
         let taken = self.handled_count;
         if self.ordered_count.wait_for(|ordered| *ordered > taken).await.is_err() {
@@ -281,8 +283,9 @@ const MIN_COMPLETE_SHARE: f64 = 0.95;
 const MIN_PROGRESS_INTERVAL: Duration = Duration::from_millis(250);
 
 impl<B: StationDriver> MachineTask<B> {
-    /// Creates the task of a machine for the run `job`. `intent` is the last START of an interrupted run with its
-    /// cycle; with it, the station can reconcile that job.
+    /// Creates the task of a machine. `job` is the number of the run. `intent` is the last START that an interrupted
+    /// run prepared, with the number of its cycle. With `intent`, the task can ask the machine what became of this job
+    /// (reconcile).
     pub(super) fn new(
         driver: B,
         job: u32,
@@ -305,8 +308,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Gives the driver the last prepared job of an interrupted run. The machine may still execute it, because only
-    /// this program was restarted.
+    /// Passes the last prepared job of an interrupted run to the driver, if there is one. Only this program was
+    /// restarted, so the machine may still execute this job.
     pub(super) fn restore_preparation(mut self) -> Self {
         if let Some(armed) = &self.armed {
             self.driver.machine().restore(armed);
@@ -314,9 +317,12 @@ impl<B: StationDriver> MachineTask<B> {
         self
     }
 
-    /// Serves the requests of the drive, and polls the machine, until all senders of `asks` are gone. If the task
-    /// panics, which is a fault of this program, sends [`Event::StationFailed`]. The run then continues without
-    /// communication with this machine.
+    /// Serves the requests of the drive and polls the machine, until all senders of `asks` are dropped. `poll` is the
+    /// interval between two polls, `aborts` counts the ordered aborts, and `pulse` shows whether the loop of the drive
+    /// is alive. If it is not, the machine is not polled.
+    ///
+    /// If the task panics, which is a fault of this program, sends [`Event::StationFailed`]. The run then continues
+    /// without communication with this machine.
     pub(super) async fn serve(
         self,
         asks: mpsc::Receiver<StationRequest>,
@@ -331,7 +337,8 @@ impl<B: StationDriver> MachineTask<B> {
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
 
-    /// Serves requests until no sender is left, then releases the machine.
+    /// Serves the requests from `asks` and polls the machine every `poll`. An ordered abort cancels the request or the
+    /// poll in progress. Releases the machine and returns when no sender of requests is left.
     async fn serve_requests(
         mut self,
         mut asks: mpsc::Receiver<StationRequest>,
@@ -451,8 +458,9 @@ impl<B: StationDriver> MachineTask<B> {
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
-    /// Returns whether a machine that was just connected is idle, busy, or must be cleared. A machine that an earlier
-    /// client has prepared, but not started, gets STOP and is then idle.
+    /// Returns whether a machine that was just connected is idle, busy, or must be cleared. If an earlier client has
+    /// prepared a job but not started it, sends STOP to withdraw this preparation. The machine is then idle, or busy if
+    /// STOP fails.
     async fn occupation(&mut self, status: &Status) -> Occupation {
         match status.state {
             MachineState::Idle => Occupation::Idle,
@@ -632,8 +640,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Connects a machine before an abort, if it was not connected since the restart of this program. Returns an error
-    /// if the machine has a job of another run or refuses the connection. A lost link is no error here.
+    /// Connects to a machine before an abort, if this program has not connected to it yet. Returns an error if the
+    /// machine has a job of another run, or refuses the connection. Returns `Ok` if the machine cannot be reached,
+    /// because the abort itself then reports the failure.
     async fn connect_for_abort(&mut self) -> Result<(), String> {
         let met = async {
             self.driver.machine().connect().await?;
@@ -743,8 +752,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports the failure of the request `what` as events. Reports a lost link first. A fault of the machine is
-    /// reported as a fault, any other failure as a refusal.
+    /// Reports to the cell that the request `what` failed with `error`. If the link is lost, reports the loss first.
+    /// Then reports a fault of the machine as a fault, and every other error as a refusal of the request.
     async fn report_failure(&mut self, what: MachineRequest, error: DeviceError) {
         if error.is_link() {
             self.report_link_lost(&error).await;
@@ -789,7 +798,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reads the points that the machine has measured so far in a running job. The next order interrupts this transfer.
+    /// Reads the points that the machine has measured so far in a running job, and sends new ones to the drive for
+    /// display. An urgent request (HOLD, STOP or ABORT) interrupts this transfer. Does nothing if no job runs.
     async fn read_ahead(&mut self) {
         let Some(armed) = self.armed.as_ref().filter(|_| self.observed.running && !self.observed.end_reported) else {
             return;
@@ -800,7 +810,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports the notes of a machine for people, such as why it waits, if they have changed.
+    /// Sends the texts in which the machine informs people (for example why it waits) to the drive, if they have
+    /// changed since the last report.
     async fn report_notes(&mut self) {
         let notes = self.driver.machine().notes();
         let new: Vec<String> = notes.iter().filter(|message| !self.reported_notes.contains(message)).cloned().collect();
@@ -881,8 +892,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports that a machine has lost the job of this run: it reported this job before, and now reports none or
-    /// another one, without an end of the job.
+    /// Reports that a machine has lost the job of this run, after [`VANISHED_AFTER_READS`] status reads without it. The
+    /// job counts as lost if the machine reported it before, now reports no job or a job of another run, and has not
+    /// reported the end of the job. Does nothing while a stop, clear or abort is in progress.
     async fn report_absence(&mut self, status: &Status) {
         let ObservedState { running, end_reported: ended, stopping, clearing, aborting, .. } = self.observed;
         if !running || ended || stopping || clearing || aborting {
@@ -904,8 +916,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports a contradiction in the status of a machine. It reports HELD, but its progress increases; or it has
-    /// accepted STOP, but does not stop.
+    /// Reports a status that contradicts an accepted command, as a refusal of this command. For HOLD: the machine
+    /// reports HELD, but its progress has increased [`MOVING_AFTER_RISES`] times. For STOP: the machine accepted it,
+    /// but is still in EXECUTE after [`STOP_TIMEOUT`]. `before` is the state in the previous status.
     async fn report_contradiction(&mut self, before: Option<MachineState>, status: &Status) {
         let device = B::DEVICE;
         let is_held = status.state == MachineState::Held && before == Some(MachineState::Held);
@@ -931,8 +944,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports a pass as doubtful if the grinder calls it complete at a progress below the share
-    /// [`MIN_COMPLETE_SHARE`].
+    /// Reports the record of a pass as doubtful if the grinder reports the pass as complete, but the reported progress
+    /// is below the share [`MIN_COMPLETE_SHARE`] of its total. Does nothing for a CMM, or if the grinder reports no
+    /// progress.
     async fn check_early_end(&mut self, status: &Status) {
         let (Device::Grinder, Outcome::Complete, Some((done, total))) = (B::DEVICE, status.outcome, status.progress)
         else {
@@ -960,8 +974,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.report(event).await;
     }
 
-    /// Reports if a machine without a running job is no longer clear of the part, for example because a person has
-    /// moved it.
+    /// Reports that a machine without a running job is no longer clear of the part (out of its way), for example
+    /// because a person has moved the machine. Does nothing if the machine does not report whether it is clear.
     async fn report_clear(&mut self, status: &Status) {
         let Some(clear) = status.clear_of_part else { return };
         let before = self.observed.clear.replace(clear);
@@ -987,8 +1001,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.report(event).await;
     }
 
-    /// Reports if a signal of the machine has left its range. Also reports when all signals have been in their ranges
-    /// for the time [`SIGNAL_SETTLING_TIME`].
+    /// Reports once that signals of the machine have left their ranges in the cell file. Reports again when all signals
+    /// have been within their ranges for [`SIGNAL_SETTLING_TIME`].
     async fn report_signals(&mut self, status: &Status) {
         let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::problem).collect();
         let (device, condition) = (B::DEVICE, Condition::Signals);
@@ -1016,7 +1030,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports the end of a job as an event. For a pass, first reads its pass record.
+    /// Reports the end of a finished job to the cell. For a pass, first reads the pass record. If the link is lost
+    /// while it is read, reports no end, and the next poll tries again. Does nothing if no job was running, or if its
+    /// end was already reported and no stop is in progress.
     async fn finish_job(&mut self, status: &Status) {
         if self.observed.end_reported && !self.observed.stopping {
             return;
@@ -1104,8 +1120,8 @@ fn fault_message(device: Device, fault: Fault) -> String {
     }
 }
 
-/// Returns a gate failure if a measurement arrived, but its data is invalid or belongs to another job. Returns `None`
-/// for every other error.
+/// Returns the failure of the gate (the check whether a measurement can be used) if a measurement arrived, but its data
+/// are invalid or belong to another job. Returns `None` for every other error.
 fn gate_failure(error: &DeviceError) -> Option<GateFailure> {
     match error {
         DeviceError::NotFinite { .. }
@@ -1140,7 +1156,8 @@ pub(super) struct StartIntent {
 }
 
 impl StartIntent {
-    /// Converts the recorded data of a START into the driver's data of this prepared job.
+    /// Converts this recorded intent of a START into the data of the prepared job that a driver uses, for example to
+    /// reconcile the job.
     pub(super) fn to_armed(&self) -> Armed {
         let job = Job { job: self.job, cycle: self.cycle, digest: self.digest };
         Armed { job, start_sequence: self.start_sequence, token: self.token, boot_id: self.boot_id }

@@ -135,15 +135,20 @@ impl AdaptiveOptions {
     /// Ratio of an rms limit to a PV limit that is equally hard to meet.
     const RMS_TO_PV_RATIO: f64 = 0.2;
 
-    /// Returns the accepted probability of a wrong decision for one evaluation of an adaptive measurement. It is the
-    /// accepted risk divided by the maximum number of evaluations. It is at most 1 minus the required probability of
-    /// the tolerance, so that a part that an evaluation accepts is also accepted by the final judgement.
+    /// Returns the accepted probability that one evaluation of an adaptive measurement decides wrongly (0 to 1). This
+    /// probability is `accepted_risk` divided by the maximum number of evaluations.
+    ///
+    /// The result is limited to 1 minus the probability that the tolerance requires. A part that an evaluation accepts
+    /// is therefore also accepted by the final judgement.
     pub fn decision_risk(&self) -> f64 {
         (self.accepted_risk / Self::MAX_DECISIONS).min(1.0 - self.tolerance.probability)
     }
 
-    /// Returns the criteria by which an adaptive measurement stops. `may_grind` is true if a further pass is allowed,
-    /// so that the measurement must also be sufficient for a correction.
+    /// Returns the criteria by which an adaptive measurement stops: the limits of PV and RMS, and the maximum
+    /// uncertainty of the form for a correction, all in mm.
+    ///
+    /// `may_grind` is true if another pass of the grinder is allowed. The measurement must then also be exact enough to
+    /// compute a correction.
     pub fn stopping_criteria(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
@@ -208,7 +213,8 @@ pub(super) struct CycleState {
 }
 
 impl CycleState {
-    /// Returns the state of a cycle before its pass. `correction` is that of this pass.
+    /// Returns the state of a cycle whose pass is not ground yet. `correction` is the correction for this pass. All
+    /// results of the cycle are still empty.
     pub(super) fn new(correction: Correction) -> Self {
         Self {
             correction: Arc::new(correction),
@@ -234,7 +240,8 @@ impl CycleState {
         self.judgement_count > 0
     }
 
-    /// Stores the result of a computation in this cycle.
+    /// Stores `product`, the result of one computation (such as the usable points or the registration), in the fields
+    /// of this cycle.
     pub(super) fn store(&mut self, product: ComputationProduct) {
         match product {
             ComputationProduct::Points(points) => self.points = Some(Arc::new(points)),
@@ -341,11 +348,12 @@ pub(super) struct UsablePoints {
 }
 
 impl Task {
-    /// Begins the learning of this run with the state `learned`, from an earlier part or from other cells. The first
-    /// pass is ground with the correction in this state.
+    /// Makes `learned` the initial state of the learning in this run. `learned` comes from an earlier part or from
+    /// other cells. The first pass is then ground with the correction in `learned`.
     ///
     /// # Errors
-    /// Returns an error if the first correction exceeds the limits of this run. The task is then unchanged.
+    /// Returns an error if this correction exceeds the maximum correction at a node, or the removal budget of this run.
+    /// The task is then unchanged.
     pub fn start_from_learned(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
         let within = self.first_correction().removed_mm(&self.correction_limits).map_err(|error| match error {
@@ -360,15 +368,19 @@ impl Task {
         within.map(|_| ())
     }
 
-    /// Combines the results `others` of other cells into an initial state for this task, weighted by the similarity of
-    /// the machines (`alike`). Returns `None` if they contribute nothing.
+    /// Combines the learned states in `others` into one initial state for this task. Each entry of `others` names a run
+    /// of another cell and holds the state that this run learned. `alike` is the similarity of the machines: the more
+    /// similar the machines are, the more is taken over.
+    ///
+    /// Returns `None` if no state in `others` contains a learned error in the same bands of wavelengths as this task.
     pub fn learned_from_others(&self, others: &[(CellRun, Learned)], alike: &MachineSimilarity) -> Option<Learned> {
         let of_this = (self.simulation, self.setting.clone());
         Learned::from_others(others, alike, of_this, (&self.new_learning(), self.zero_correction()))
     }
 
-    /// Writes the correction and the program of the first pass into `folder`, for a run that begins with a learned
-    /// state. Returns the names of the files.
+    /// Writes the files of the first pass into `folder`: the correction, and the program if one can be planned. This is
+    /// meant for a run that begins with a learned state. Creates `folder` if it does not exist. Returns the names of
+    /// the written files.
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
@@ -381,8 +393,8 @@ impl Task {
         Ok(files.into_existing())
     }
 
-    /// Returns the correction of the first pass: that of the learned state with which the run begins, or a correction
-    /// of 0.
+    /// Returns the correction of the first pass. If the run begins with a learned state, this is the correction in that
+    /// state, resampled to the grid of this task. Otherwise the correction is 0 at all nodes.
     pub fn first_correction(&self) -> Correction {
         let none = self.zero_correction();
         match &self.learned {
@@ -402,11 +414,13 @@ impl Task {
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
-    /// Computes the path of the first pass. Returns `None` if this program cannot plan a path for the part, but the
-    /// controller of the grinder may be able to; `programs` then contains the reason.
+    /// Computes the path of the first pass, and its summary.
+    ///
+    /// Returns `None` if the path planning of this program fails for the part. The controller of the grinder may still
+    /// be able to plan a path from the correction map. The field `programs` then contains the reason.
     ///
     /// # Errors
-    /// A surface that the wheel cannot grind, and limits of the grinder that the path exceeds.
+    /// A surface that the wheel cannot grind; a path that exceeds the limits of the grinder.
     pub fn first_path(&self) -> Result<Option<(ToolPath, PathSummary)>, PathError> {
         match &self.programs {
             Ok(programs) => programs.path(&self.first_correction()).map(Some),
@@ -415,14 +429,14 @@ impl Task {
         }
     }
 
-    /// Returns the root mean square of the scallops (the ridges between the tracks of the wheel) in mm; 0 if it is
-    /// unknown.
+    /// Returns the root mean square, in mm, of the scallops (the ridges between the tracks of the wheel). Returns 0 if
+    /// no path can be computed, because the scallops are then unknown.
     pub(super) fn scallops_rms_mm(&self) -> f64 {
         self.scallops.map_or(0.0, |scallops| scallops.rms_mm)
     }
 
-    /// Returns the state of the learning before the first pass: that of an earlier part if the run begins with one,
-    /// otherwise a new one.
+    /// Returns the state of the learning before the first pass. If the run begins with a learned state, the result is
+    /// derived from that state for the next part. Otherwise the result is a state without any learned error.
     pub(super) fn initial_learning(&self) -> LearningState {
         self.learned.as_ref().map_or_else(|| self.new_learning(), |learned| learned.known.for_next_part())
     }
@@ -433,12 +447,14 @@ impl Task {
         LearningState::new(self.gain_rule, &self.map_options, size_mm, self.repeatability_mm)
     }
 
-    /// Registers points to the nominal surface, offset by `probe_radius_mm`. Returns the registration and the options
-    /// used.
+    /// Registers the measured `points` (CMM frame) to the nominal surface. `probe_radius_mm` is the distance of the
+    /// points from this surface, such as the radius of the probe ball. It is 0 for contact points. Returns the
+    /// registration, and the options with which it was computed.
     ///
-    /// Starts with a search or at the fixture pose, as the task sets. If a search finds a pose of which the surface
-    /// does not determine a direction, the position in this direction is arbitrary, and a correction would be ground
-    /// there. The registration is then repeated from the fixture pose.
+    /// The field `start_at_fixture` of the task selects the start: the fixture pose, or a search over poses. The
+    /// surface may not determine one direction of a pose that the search finds, for example the rotation about the axis
+    /// of symmetry. The position in this direction would then be arbitrary, and the correction would be ground at the
+    /// wrong place. In this case the registration is repeated from the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -450,8 +466,9 @@ impl Task {
         self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
-    /// Registers points as [`Self::register`] does, but starts at the fixture pose if `start_at_fixture` is true, and
-    /// with a search otherwise.
+    /// Registers the measured `points` to the nominal surface, as [`Self::register`] does, but the caller selects the
+    /// start. If `start_at_fixture` is true, the registration starts at the fixture pose. Otherwise it starts with a
+    /// search over poses. `probe_radius_mm` is the distance of the points from the surface, and 0 for contact points.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -474,9 +491,11 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
-    /// Returns the standard uncertainties of the pose of the part in the fixture, in the order x, y, z in mm and rx,
-    /// ry, rz in rad. The value of a locked direction without a stated uncertainty is 0. Returns `None` if no direction
-    /// is locked.
+    /// Returns the standard uncertainties with which the fixture locks the pose of the part. The order is x, y, z in
+    /// mm, then rx, ry, rz in rad. The value is 0 for a direction that is not locked, and for a locked direction whose
+    /// uncertainty the recipe does not state.
+    ///
+    /// Returns `None` if no direction is locked.
     pub fn locked_direction_sigmas(&self) -> Option<[f64; 6]> {
         let [shift_mm, turn_rad] = self.locked_sigmas.unwrap_or_default();
         let of = |k: usize| if k < 3 { shift_mm } else { turn_rad };
@@ -484,8 +503,8 @@ impl Task {
         locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
     }
 
-    /// Returns the options for the estimation of machine parameters. `told` are the parameter corrections of the pass
-    /// that was measured.
+    /// Returns the options for the estimation of machine parameters (such as the wheel radius) from a measurement.
+    /// `told` holds the parameter corrections with which the measured pass was ground; `None` if there were none.
     pub fn parameter_options(&self, told: Option<&ParameterCorrections>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration_options.locked.map(|locked| !locked),
@@ -499,18 +518,20 @@ impl Task {
         }
     }
 
-    /// Returns the wheel radius in mm with which a pass is ground: that of the recipe plus the radius correction in
-    /// `told`, the parameter corrections of the pass.
+    /// Returns the wheel radius, in mm, with which a pass is ground. This is the radius of the recipe plus the
+    /// correction of the wheel radius in `told`, the parameter corrections of the pass. If `told` is `None`, the radius
+    /// of the recipe is returned.
     pub fn wheel_radius_mm(&self, told: Option<&ParameterCorrections>) -> f64 {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Returns the SHA-256 that identifies the correction map of a pass.
+    /// Returns the SHA-256 that identifies the correction map which the grinder receives for `correction`.
     pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
         self.payloads(correction).0.identity()
     }
 
-    /// Returns what the grinder receives for a pass: the correction map and the parameters of the pass.
+    /// Returns the two messages that the grinder receives for a pass with `correction`: the correction map, and the
+    /// parameters of the pass (such as the level and the corrected wheel radius).
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
         let map = CorrectionMap {
             grid: correction.grid,
@@ -522,24 +543,31 @@ impl Task {
         (map, Pass { wheel_radius_mm, ..pass })
     }
 
-    /// Creates the complete measuring plan: the reference sphere first, then all targets on the part. `cmm_from_model`
-    /// is the last measured pose, and `level_mm` the height of the ground surface above the nominal one.
+    /// Creates the complete measuring plan in the CMM frame: first the reference sphere, if the task has one, then all
+    /// targets on the part. `cmm_from_model` is the last measured pose. `level_mm` is the height, in mm, of the ground
+    /// surface above the nominal surface.
     ///
-    /// If `seated_anew` is true, the part may have been clamped again. A few targets that are as far apart as possible
-    /// then come first, at low speed, to detect a displaced part.
+    /// If `seated_anew` is true, the part may have been clamped again. The plan then begins with a few targets on the
+    /// part that are far apart from each other. They are touched at low speed, to detect a displaced part. The
+    /// reference sphere and the other targets follow.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let first = if seated_anew { farthest_points(&self.target_places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
         self.plan_by_index(level_mm, cmm_from_model, (first, rest), true)
     }
 
-    /// Returns the position and the normal of each target, for the error model.
+    /// Returns the position (in mm) and the unit normal of each target on the nominal surface, in the model frame. The
+    /// error model uses them.
     pub(super) fn target_places(&self) -> Vec<(Point, Vector)> {
         self.targets.iter().map(|target| (target.point, target.normal)).collect()
     }
 
-    /// Creates a plan with the targets of the task whose indices are in `first` and `rest`. The targets in `first` are
-    /// touched at low speed. If `with_sphere` is true, the reference sphere comes between `first` and `rest`.
+    /// Creates a measuring plan for some targets of the task. `first` and `rest` are indices into the targets of the
+    /// task. The plan begins with the targets in `first`, touched at low speed, and ends with those in `rest`. If
+    /// `with_sphere` is true, the targets of the reference sphere come between these two groups.
+    ///
+    /// `cmm_from_model` is the pose of the part. `level_mm` is the height, in mm, of the ground surface above the
+    /// nominal surface.
     pub(super) fn plan_by_index(
         &self,
         level_mm: f64,
@@ -551,7 +579,12 @@ impl Task {
         self.plan_targets(level_mm, cmm_from_model, (first, rest), with_sphere)
     }
 
-    /// Creates a plan as [`Self::plan_by_index`] does, for given targets. They need not be targets of the task.
+    /// Creates a measuring plan for any targets, also for targets that do not belong to the task. The plan begins with
+    /// the targets in `first`, touched at low speed, and ends with those in `rest`. If `with_sphere` is true, the
+    /// targets of the reference sphere come between these two groups.
+    ///
+    /// `cmm_from_model` is the pose of the part. `level_mm` is the height, in mm, of the ground surface above the
+    /// nominal surface.
     pub(super) fn plan_targets(
         &self,
         level_mm: f64,
@@ -581,8 +614,8 @@ impl Task {
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
 
-    /// Writes the correction of a pass to `correction.csv`. The file also states the identity of the map of `base`, the
-    /// earlier correction that it replaces.
+    /// Writes `correction`, the correction of a pass, to the file `correction.csv` in `files`. The file also states the
+    /// SHA-256 of the map of `base`. `base` is the earlier correction that `correction` replaces.
     pub(super) fn save_correction(
         &self,
         files: &mut OutputFiles,
@@ -595,12 +628,15 @@ impl Task {
         write_correction(&files.add_file("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
-    /// Writes the program of the next pass. Returns `None` if it is complete. Returns the reason if this program cannot
-    /// plan it, or if a file of it was omitted: the grinder can then still grind from the correction map.
+    /// Writes the program and the axis table for the pass with `correction` into `files`.
+    ///
+    /// Returns `None` if both files were written. Otherwise returns the reason why a file was omitted: this program
+    /// cannot plan the path, the program is too long, or the table cannot be computed. The grinder can then still grind
+    /// from the correction map.
     ///
     /// # Errors
-    /// A surface that the wheel cannot grind, limits of the grinder that the path exceeds, files that cannot be
-    /// written.
+    /// A surface that the wheel cannot grind; a path that exceeds the limits of the grinder; a file that cannot be
+    /// written; a program that is too long for a controller with a program folder.
     pub(super) fn save_program(
         &self,
         files: &mut OutputFiles,
@@ -614,7 +650,9 @@ impl Task {
     }
 }
 
-/// Returns the grid for the corrections of a part whose minimum and maximum are `x_mm` and `y_mm`.
+/// Returns the grid of nodes for the corrections of a part. `x_mm` and `y_mm` are the minimum and the maximum of x and
+/// of y on the part. The distance of the nodes is at most `spacing_mm`. If no such grid is possible, the grid has only
+/// the four corners of the part as nodes.
 pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
     let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
     Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {
@@ -635,7 +673,8 @@ pub(super) fn used_deviations(found: &Registration) -> impl Iterator<Item = &Dev
     found.deviations.iter().filter(|d| d.status == PointStatus::Inlier)
 }
 
-/// Returns the deviations of the points that a registration used, each with its x and y in the model frame.
+/// Returns the points that a registration used, each as its x and y in the model frame and its deviation, in mm.
+/// Outliers and points off the part are omitted.
 pub(super) fn deviation_samples(found: &Registration) -> Vec<DeviationSample> {
     used_deviations(found)
         .map(|d| DeviationSample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm })

@@ -31,8 +31,8 @@ pub struct Table {
 }
 
 impl Table {
-    /// Returns the units of x, y and z. x and y have the unit [`Self::unit`], or else millimetres. z has the unit
-    /// [`Self::height_unit`], or else that of x and y.
+    /// Returns the units of x, y and z, in this order. x and y have the unit [`Self::unit`]; if it is `None`, they are
+    /// in millimetres. z has the unit [`Self::height_unit`]; if it is `None`, z has the unit of x and y.
     pub(super) fn units(&self) -> [Unit; 3] {
         let unit = self.unit.unwrap_or_default();
         [unit, unit, self.height_unit.unwrap_or(unit)]
@@ -118,7 +118,9 @@ impl fmt::Display for Columns {
 }
 
 impl Columns {
-    /// Returns true if each column that is given by its name occurs exactly once in `names`, the names of a header.
+    /// Returns true if the header contains all columns that these settings give by name. `names` are the names in the
+    /// header, in lower case. Each of these columns must occur in `names` exactly once. Columns given by number are not
+    /// checked.
     pub(super) fn are_in(&self, names: &[String]) -> bool {
         self.0.iter().all(|column| match column {
             Column::Named(_) => column.among(names).len() == 1,
@@ -131,12 +133,13 @@ impl Columns {
         self.0.iter().all(|column| matches!(column, Column::Numbered(_)))
     }
 
-    /// Returns the indices, from 0, of the columns x, y and z in a table with `count` columns, whose header has the
-    /// names `names`.
+    /// Returns the indices of the columns x, y and z in a table, counted from 0. `names` are the names in the header of
+    /// the table, and `count` is the number of its columns.
     ///
     /// # Errors
-    /// A column number above `count`; a column name that `names` contains not exactly once; the same column for two
-    /// axes. The text continues a sentence about the header, as the `reason` of [`FormatError::HeaderNames`] does.
+    /// A column number above `count`; a column name that does not occur exactly once in `names`; the same column for
+    /// two axes. The error text continues a sentence that begins with "the header", such as "has 3 columns, and no
+    /// column 5". It is used as the `reason` of [`FormatError::HeaderNames`].
     pub(super) fn places(&self, names: &[String], count: usize) -> Result<[usize; 3], String> {
         let mut places = [0; 3];
         for (place, column) in places.iter_mut().zip(&self.0) {
@@ -157,8 +160,8 @@ impl Columns {
 }
 
 impl Column {
-    /// Returns the indices in `names` of all columns with the name of this column. A unit in a name of `names` is
-    /// ignored: `x` finds `x [mm]` too. Returns an empty list if this column is given by its number.
+    /// Returns the indices of all entries of `names` that are equal to the name of this column. A unit in an entry is
+    /// ignored: the column `x` also finds `x [mm]`. Returns an empty list if this column is given by its number.
     fn among(&self, names: &[String]) -> Vec<usize> {
         let Self::Named(wanted) = self else { return Vec::new() };
         let is = |name: &String| name.trim() == wanted || split_unit(name).0 == wanted;
@@ -265,8 +268,8 @@ pub(super) enum Group {
 impl Group {
     const ALL: [Self; 3] = [Self::Plain, Self::Measured, Self::Nominal];
 
-    /// Returns the words in the name of a column that state this group of points, such as `act` or `soll`, in the
-    /// languages that machines print.
+    /// Returns the words that assign a column to this group of points, in several languages and in lower case. For
+    /// example, `act` in a column name means measured points, and `soll` means nominal points.
     fn words(self) -> &'static [&'static str] {
         match self {
             Self::Plain => &["coord", "coordinate", "coordinates", "pos", "position", "koordinate", "koord"],
@@ -325,10 +328,11 @@ impl fmt::Display for Group {
     }
 }
 
-/// Returns the axis (0 for x, 1 for y, 2 for z) and the group of points that the name of a column states. `name` must
-/// be in lower case and without a unit.
+/// Returns the meaning of a column name: the axis (0 for x, 1 for y, 2 for z) and the group of points (measured,
+/// nominal or not stated). For example, `x_act` is the axis 0 of the measured points. `name` must be in lower case and
+/// without a unit.
 ///
-/// Returns `None` if the name has no axis, has two axes or two groups, or has any other word.
+/// Returns `None` if `name` contains no axis, more than one axis, words of two groups, or any other word.
 fn axis_of(name: &str) -> Option<(usize, Group)> {
     let mut axis = None;
     let mut group = Group::Plain;
@@ -373,9 +377,11 @@ const NON_COORDINATE_WORDS: [&str; 41] = [
     "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
 ];
 
-/// Returns the axis (0 for x, 1 for y, 2 for z) that the name of a column contains, and the rest of the name; `None` if
-/// the name has no axis, or nothing else. `name` must be in lower case. If it is one word, its first or last letter is
-/// the axis.
+/// Splits a column name into its axis and the rest. Returns the axis (0 for x, 1 for y, 2 for z) and the rest of the
+/// name: `x probe` gives 0 and `probe`. If `name` is one word, its first or last letter must be the axis: `xprobe`
+/// gives the same result. `name` must be in lower case.
+///
+/// Returns `None` if `name` contains no axis, or if nothing remains without the axis.
 fn axis_in_name(name: &str) -> Option<(usize, String)> {
     let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
     let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
@@ -417,17 +423,19 @@ impl Axes {
         &self.groups[group as usize]
     }
 
-    /// Returns true if the header names x, y and z of at least one group of points. The group can be one of [`Group`],
-    /// or an unknown word that the names of all three axes contain.
+    /// Returns true if the header names x, y and z for at least one group of points: measured, nominal, or not stated.
+    /// A group with an unknown word also counts, if this word occurs in the names of all three axes.
     pub(super) fn are_named(&self) -> bool {
         self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
 
-    /// Returns the indices of the columns x, y and z. `of_nominal` is true if nominal points are wanted; if it is
-    /// false, columns of nominal points are rejected.
+    /// Returns the indices, from 0, of the columns x, y and z of the one group of points that the header names. If
+    /// `of_nominal` is true, the nominal points may be this group. If it is false, columns of nominal points are
+    /// rejected.
     ///
     /// # Errors
-    /// The reason why the names of the columns do not determine x, y and z.
+    /// A header that names no group, more than one group, a group with an unknown word, or not exactly one column for
+    /// each axis. The error text gives the reason and continues a sentence that begins with "the header".
     pub(super) fn chosen(&self, of_nominal: bool) -> Result<[usize; 3], String> {
         let there: Vec<Group> = Group::ALL
             .into_iter()
@@ -468,8 +476,11 @@ pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// Splits `name`, the name of a column in lower case, into the name without its unit, and the unit. The unit is `None`,
-/// and the name is complete, if it states no unit.
+/// Splits a column name into the name without the unit, and the unit: `x [mm]` gives `x` and `mm`. `name` must be in
+/// lower case. The unit can be in square brackets, in round brackets, or after `_`, `/` or a blank; an inch mark (`"`)
+/// is understood too. Any text in square brackets is returned as the unit, even if it is no known unit.
+///
+/// Returns the complete name and `None` if `name` states no unit.
 pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
     let name = name.trim();
     for (open, close) in [('[', ']'), ('(', ')')] {
@@ -503,11 +514,12 @@ pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
-/// Returns the unit that a title or a comment states, as in "units: inch", "units/inch" or "all dimensions in inches".
-/// Returns `None` if it states no unit. `text` must be in lower case.
+/// Returns the unit that `text`, a title or a comment, states: "units: inch", "units/inch" or "all dimensions in
+/// inches". `text` must be in lower case. Returns `None` if `text` states no unit.
 ///
-/// A statement such as "units: inch" has priority over a single word of a sentence. A single word is used only if it
-/// has at least four letters, because a shorter word can mean anything, and if it does not mean millimetres.
+/// A statement with the word "unit" has priority. Without such a statement, the first word that names a unit is used.
+/// This word must have at least four letters, because a shorter word can have another meaning. A word for millimetres
+/// is ignored here.
 fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
     unit_statement(text).or_else(|| {
@@ -526,7 +538,8 @@ pub(super) struct StatedUnits {
 }
 
 impl StatedUnits {
-    /// Finds the units that a title or a comment states.
+    /// Finds the units that `text`, a title or a comment, states: the unit of the heights alone, and the unit of all
+    /// coordinates. A unit that `text` does not state is `None` in the result.
     pub(super) fn found_in(text: &str) -> Self {
         let text = text.to_lowercase();
         match height_unit(&text) {
@@ -594,8 +607,10 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
-/// Returns the unit that follows the word "unit" or "units" in `text`, which must be in lower case; `None` if no unit
-/// follows. After a colon, `=` or `/`, a text that is no known unit is returned too, because it is meant as a unit.
+/// Returns the unit that follows the word "unit" or "units" in `text`. `text` must be in lower case. After a colon, `=`
+/// or `/`, any text is returned, even if it is no known unit, because it is clearly meant as one.
+///
+/// Returns `None` if no unit follows.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind
@@ -613,8 +628,12 @@ fn unit_statement(text: &str) -> Option<String> {
         .next()
 }
 
-/// Rejects a file if `header`, the text in line number `line`, states a unit other than `unit` for all coordinates, or
-/// other than `height_unit` for z.
+/// Checks the unit that a file states in `header`, the text of its line number `line`. `unit` is the expected unit of
+/// all coordinates, and `height_unit` the expected unit of z. `path` only names the file in the error.
+///
+/// # Errors
+/// A header that states another unit than `unit` for all coordinates, or another unit than `height_unit` for z. A
+/// header without a unit is accepted.
 pub(super) fn check_stated_unit(
     path: &Path,
     line: u64,

@@ -42,7 +42,8 @@ struct Reading {
     is_ended: bool,
 }
 
-/// Reads what a DMIS file states about its measurement, such as the plan and the cycle. `path` only names the file in
+/// Reads the general statements of a DMIS file about its measurement, such as the plan, the cycle and the kind of
+/// coordinates. The points are not returned. `text` is the content of the file, and `path` only names the file in
 /// messages.
 ///
 /// # Errors
@@ -51,8 +52,11 @@ pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, Fo
     read(path, text).map(|reading| reading.statements)
 }
 
-/// Reads the points of a DMIS file. If the file does not state whether its coordinates are centres or contacts,
-/// `content` decides. `path` only names the file in messages.
+/// Reads the points of a DMIS file, in mm, with their names. `text` is the content of the file, and `path` only names
+/// the file in messages.
+///
+/// The file can state whether its coordinates are centres of the probe ball or contact points. If it does not, the
+/// setting in `content` is used.
 ///
 /// # Errors
 /// A file without `ENDFIL`, without a point, or without `UNITS` before its first point; a point that is not cartesian
@@ -158,8 +162,12 @@ impl Reading {
         Ok(())
     }
 
-    /// Reads `after`, the text after `TEXT/` that the measuring program wrote into the file, such as `OUTFIL,'plan:
-    /// 5f3c...'`. A text that has no colon between its quotes is ignored.
+    /// Reads a statement that the measuring program wrote into the file with `TEXT/`, and stores its value. `after` is
+    /// the text after `TEXT/`, such as `OUTFIL,'plan: 5f3c...'`. The text in quotes has the form `key: value`. A text
+    /// without quotes or without a colon is ignored.
+    ///
+    /// # Errors
+    /// An impossible value; a kind of coordinates (centres or contacts) that contradicts an earlier statement.
     fn written(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
         let quoted = after.split_once('\'').and_then(|(_, rest)| rest.rsplit_once('\''));
         match quoted.and_then(|(text, _)| text.split_once(':')) {

@@ -188,8 +188,8 @@ pub enum FormatError {
 }
 
 impl FormatError {
-    /// Returns true for an error that means only that the file is empty or ends too early. Everything up to its end is
-    /// valid.
+    /// Returns true if the only fault of the file is that it is empty or that its end is missing. The part of the file
+    /// that exists is then valid.
     pub fn is_cut(&self) -> bool {
         matches!(self, Self::Cut { .. } | Self::CutLine { .. } | Self::Empty { .. })
     }

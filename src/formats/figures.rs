@@ -71,9 +71,11 @@ struct TermDocument {
 pub type CycleFigures<'a> =
     (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
-/// Writes `figures.json` to `path`: the figures of the form, of the points, and the slopes of the map. `taken_out`
-/// names the terms, such as piston and tilt, that were removed before these figures were computed; the file states them
-/// for each figure. For figures that do not exist, the file gives the reason.
+/// Writes all figures of a cycle to the JSON file `path` (`figures.json`): the figures of the measured points, the
+/// slopes of the error map, and the figures of the form. For each missing figure, the file states the reason.
+///
+/// `taken_out` names the terms, such as piston and tilt, that were removed before the figures were computed. The file
+/// repeats these names for each figure. If `simulation` is true, the file is marked as simulated.
 ///
 /// # Errors
 /// A file that cannot be written.

@@ -56,8 +56,9 @@ struct FormDocument<'a> {
     frame_covariance: [[f64; 6]; 6],
 }
 
-/// Writes the result of the form model into `folder`: the parameters and figures to `model.json`, and the form at each
-/// measured point that was used to `form.csv`, in the order given.
+/// Writes the result of the form model into `folder`. `model.json` receives the parameters and the figures. `form.csv`
+/// receives one row for each point of `form`, in the same order: x, y, the form and its standard uncertainty, in mm.
+/// `simulation` is written to `model.json` unchanged.
 ///
 /// # Errors
 /// A file that cannot be written.

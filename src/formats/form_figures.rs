@@ -35,11 +35,13 @@ const RMS_TOTAL: &str = "of the form without piston and tilt";
 const RMS_IRREGULARITY: &str = "of the form without piston, tilt and power";
 const RMS_VARYING: &str = "of the part of the irregularity that is not symmetric about the middle";
 
-/// Returns the figures of a form, in the order of a report, each with its median and its credible interval. `raw` holds
-/// the same figures of the measured deviations, and `slope` the slopes of the error map. `taken_out` names the terms
-/// removed before.
+/// Returns the figures of a form, in the order of a report: PV and RMS, then slopes, then figures of ISO 10110-5. Each
+/// row holds the median and the limits of the credible interval. PV and RMS are in micrometres, slopes in microradians,
+/// and figures of ISO 10110-5 in nanometres. Slopes and ISO figures are omitted if `form` has none.
 ///
-/// PV and RMS are in micrometres, slopes in microradians, and figures of ISO 10110-5 in nanometres.
+/// `raw` holds the same figures of the measured deviations, which include the noise of the probe. `slope` holds the
+/// slopes of the error map. Both only fill the column for comparison, and can be `None`. `taken_out` names the terms
+/// that were removed before the figures were computed.
 pub(super) fn form_figure_rows(
     form: &Form,
     raw: Option<&DeviationFigures>,
@@ -101,8 +103,9 @@ fn values(of: Interval) -> [f64; 3] {
     [of.median_mm, of.low_mm, of.high_mm]
 }
 
-/// Returns the ISO 10110-5 indication, for a drawing, that the form meets. It consists of the upper limits of the
-/// credible intervals, so that the form meets each of its values with a probability of 97.5 %.
+/// Returns the indication of ISO 10110-5, as on a drawing, that the form meets: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F;
+/// lambda=G`. Each of the values A to F is the upper limit of the credible interval of this figure, in nanometres. The
+/// form meets each single value with a probability of 97.5 %. G is `wavelength_nm`.
 pub(super) fn notation(of: &IsoFigures, wavelength_nm: f64) -> String {
     let most = |of: Interval| 1e6 * of.high_mm;
     iso_10110_notation(

@@ -137,9 +137,12 @@ impl MapFormat {
     }
 }
 
-/// Rejects a map in which the lowest or the highest height, such as -9999, occurs more than once and is far from all
-/// others. Some programs write such a value for samples that were not measured. A real surface that far away would have
-/// different heights.
+/// Rejects a map in which one height is probably a mark for samples that were not measured, such as -9999. Some
+/// programs write such marks.
+///
+/// # Errors
+/// The lowest or the highest height occurs more than once, and its distance from all other heights is more than 10
+/// times their range. A real surface that far away would have different heights.
 fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Result<(), FormatError> {
     const FAR: f64 = 10.0;
     let (low, high) = heights_mm.clone().fold((f64::MAX, f64::MIN), |(low, high), z| (low.min(z), high.max(z)));

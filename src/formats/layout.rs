@@ -33,7 +33,8 @@ impl Separator {
         }
     }
 
-    /// Returns true if `byte` is padding: it can stand before or after a field without belonging to it.
+    /// Returns true if `byte` is padding, which is removed before and after a field. Padding is the blank, and the tab
+    /// unless the tab separates columns.
     pub(super) fn pads(self, byte: u8) -> bool {
         byte == b' ' || (byte == b'\t' && self != Self::Tab)
     }
@@ -47,8 +48,8 @@ impl Separator {
         }
     }
 
-    /// Returns the number in a field without the blanks between its thousands (`1 234` becomes `1234`), if a tab or a
-    /// semicolon separates columns. Returns any other field unchanged.
+    /// Returns `field` without the blanks between the thousands of its number: `1 234` becomes `1234`. Returns `field`
+    /// unchanged if a comma or blanks separate the columns, or if `field` is not a number with such blanks.
     pub(super) fn ungrouped(self, field: &[u8]) -> Cow<'_, [u8]> {
         let may = matches!(self, Self::Tab | Self::Semicolon);
         may.then(|| without_blanks(field)).flatten().map_or(Cow::Borrowed(field), Cow::Owned)
@@ -109,7 +110,8 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Returns the fields x, y and z of a line, and the number of columns of the line. A missing field is empty.
+    /// Returns the texts of x, y and z in `line`, and the number of columns of `line`. The text of a coordinate is
+    /// empty if `line` does not have its column.
     pub(super) fn pick<'a>(&self, line: &'a [u8]) -> ([&'a [u8]; 3], usize) {
         let mut picked = [&line[..0]; 3];
         let mut count = 0;
@@ -122,11 +124,14 @@ impl Layout {
         (picked, count)
     }
 
-    /// Determines the decimal mark from `text`, which begins with the first line of data, and stores it in
-    /// `self.decimal`. The first number that shows the mark decides.
+    /// Determines the decimal mark of a file (point or comma) and stores it in `self.decimal`. `text` is the rest of
+    /// the file from the first line of data. The first coordinate with an unambiguous mark decides: `2.5`, `0,123` or
+    /// `2,512.1`, but not `2,512`. `self.decimal` stays unchanged if no coordinate has a mark, or if a comma separates
+    /// the columns and `text` contains no quotes. `path` only names the file in messages.
     ///
     /// # Errors
-    /// The first number with a comma, if no number shows whether commas are decimal marks or separate thousands.
+    /// Coordinates with a comma, none of which shows whether the comma is the decimal mark or separates thousands. The
+    /// error names the first of these coordinates.
     pub(super) fn settle_decimal(&mut self, path: &Path, text: &[u8]) -> Result<(), FormatError> {
         if self.separator == Separator::Comma && !text.contains(&b'"') {
             return Ok(());
@@ -182,18 +187,21 @@ impl<'p> Preamble<'p> {
         Self { path, of_nominal, table, comment: None, header: None, units: None, title: None }
     }
 
-    /// Returns the names of the columns in lower case; empty if there is no header.
+    /// Returns the names of the columns, in lower case. They are read from the header, or else from the last comment
+    /// that can be a header. `separator` separates the columns. Returns an empty list if there is no header and no such
+    /// comment.
     pub(super) fn names(&self, separator: Separator) -> Vec<String> {
         let header = self.header.as_ref().or(self.comment.as_ref());
         header.map_or(Vec::new(), |(_, line)| names(line, separator))
     }
 
-    /// Reads the next line of the file; `number` is its line number. Returns the layout of the table if this line
-    /// contains the first point, and `None` if it is above the data.
+    /// Reads the next line of a table. Returns the layout of the table if `line` contains the first point. Returns
+    /// `None` if `line` is above the first point: a blank line, a comment, a title, a header or a line of units.
+    /// `number` is the line number, from 1.
     ///
     /// # Errors
-    /// A line that is neither a point nor a possible line above the data; a unit other than that in which the table is
-    /// read; columns that are not clear.
+    /// A line that is neither a point nor one of these; a unit other than the unit in which the table is read; a table
+    /// whose columns x, y and z are ambiguous.
     pub(super) fn read_line(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
         let content = line.trim_ascii();
         if content.is_empty() || (number == 1 && is_separator_line(content)) {
@@ -215,7 +223,9 @@ impl<'p> Preamble<'p> {
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
     }
 
-    /// Reads a line without a point: stores it as a header, a title or a line of units; any other line is an error.
+    /// Stores `line`, a line without a point, as the header, the units of the columns, or a title (a line above the
+    /// header). `number` is the line number. Returns an error if `line` is below the header and does not contain units,
+    /// or if a title states a unit other than the unit in which the table is read.
     fn read_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::new(line, likely).collect();
@@ -242,7 +252,8 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// Returns the error for a line that is not a point: too few columns, or the first field that is not a number.
+    /// Returns the error for `line`, which contains no point. The error states that `line` has fewer than three
+    /// columns, or else names the first field that is not a number. `number` is the line number.
     fn no_point(&self, line: &[u8], number: u64) -> FormatError {
         let path = self.path.to_owned();
         let fields: Vec<&[u8]> = Fields::new(line, likely_separator(line)).collect();
@@ -253,7 +264,9 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Returns the error for a text in which no point was found.
+    /// Returns the error for a file in which no point was found. The error names the first line that is neither a point
+    /// nor a header. If there is no such line, the error states that the file has only a header, or that the file is
+    /// empty.
     pub(super) fn without_points(mut self) -> FormatError {
         let path = self.path.to_owned();
         match (self.title.take(), &self.header) {
@@ -264,7 +277,9 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Returns true if `header` can be the header of the table: it names x, y and z, or the columns that a person gave.
+    /// Returns true if `header` can be the header of the table. If a person gave no columns, `header` must name x, y
+    /// and z. If a person gave columns by their names, `header` must contain each of these names once. If a person gave
+    /// all columns by their numbers, `header` must have at least three columns.
     fn is_understood(&self, header: &[u8]) -> bool {
         let names = names(header, likely_separator(header));
         match &self.table.columns {
@@ -280,26 +295,32 @@ impl<'p> Preamble<'p> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
 
-    /// Rejects a text that states a unit other than the units in which the table is read.
+    /// Rejects `text`, the content of line number `line`, if it states a unit other than the unit in which the table is
+    /// read. A unit for all coordinates is compared with the unit of x and y. A unit for the heights is compared with
+    /// the unit of z.
     fn check_stated(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         self.check_heights(line, text)?;
         let of_all = StatedUnits::found_in(&text_of(text)).of_all;
         of_all.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[0]))
     }
 
-    /// Rejects a text that states, for the heights, a unit other than the unit in which z is read.
+    /// Rejects `text`, the content of line number `line`, if it states a unit for the heights that is not the unit in
+    /// which z is read. For example, `height in um` is rejected if z is read in millimetres.
     fn check_heights(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         let of_heights = StatedUnits::found_in(&text_of(text)).of_heights;
         of_heights.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[2]))
     }
 
-    /// Rejects a title that states a unit other than the units in which the table is read. If a person gave the unit,
-    /// the title is checked only for the unit of the heights.
+    /// Rejects `title`, a line above the header, if it states a unit other than the unit in which the table is read. A
+    /// unit for the heights is always checked. A unit for all coordinates is checked only if no person gave the unit of
+    /// the table. `number` is the line number of the title.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
         if self.table.unit.is_some() { self.check_heights(number, title) } else { self.check_stated(number, title) }
     }
 
-    /// Rejects a header that states, for x, y or z, a unit other than the unit in which this column is read.
+    /// Rejects a header that states, for x, y or z, a unit other than the unit in which this coordinate is read.
+    /// `names` are the names of all columns, with their units. `columns` are the indices of x, y and z in `names`.
+    /// `line` is the line number of the header.
     fn check_units(&self, line: u64, columns: [usize; 3], names: &[String]) -> Result<(), FormatError> {
         let stated = |column: usize| split_unit(names.get(column)?).1;
         let pairs = columns.into_iter().zip(self.table.units());
@@ -308,9 +329,12 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(line, found, unit))
     }
 
-    /// Rejects units in the line below the header that differ from those in which the table is read. `count` is the
-    /// number of columns of the table. If the line does not have one unit per column, each of its units is compared
-    /// with the unit of x and y.
+    /// Rejects a table if the line of units below its header contains a unit other than the unit in which the table is
+    /// read. Accepts a table without such a line. `columns` are the indices of x, y and z, and `count` is the number of
+    /// columns of the table.
+    ///
+    /// If the line has one unit for each column, only the units of x, y and z are compared, each with the unit of its
+    /// coordinate. Otherwise all units in the line are compared with the unit of x and y.
     fn check_unit_line(&self, columns: [usize; 3], count: usize) -> Result<(), FormatError> {
         let Some((line, units)) = &self.units else { return Ok(()) };
         let of_axes = self.table.units();
@@ -326,8 +350,9 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(*line, found.clone(), unit))
     }
 
-    /// Stores the units of a line below a header. Returns false, and stores nothing, if a field is neither empty nor a
-    /// unit of length, if all fields are empty, or if there is a line of units already.
+    /// Stores `fields`, the fields of a line below the header, as the units of the columns, and returns true. A field
+    /// can be empty. Returns false, and stores nothing, if a field is neither empty nor a unit of length, if all fields
+    /// are empty, or if units are already stored. `number` is the line number.
     fn take_units(&mut self, fields: &[&[u8]], number: u64) -> bool {
         let unit = |field: &&[u8]| text_of(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
         let units: Vec<String> = fields.iter().map(unit).collect();
@@ -352,14 +377,17 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// Returns the indices of the columns x, y and z. They are the columns that a person gave, or those that the header
-    /// names. In a table without names they are its only three columns, or the first three of six if unit normals
-    /// follow.
+    /// Returns the indices, from 0, of the columns x, y and z. Columns that a person gave have priority over the names
+    /// in the header. A table without given columns and without a header must have three columns, or six columns of
+    /// which the last three are a unit normal. In this case, the first three columns are x, y and z.
     ///
-    /// `data` is the first line with a point, `count` its number of columns and `data_line` its line number.
+    /// `separator` separates the columns. `data` is the first line with a point, `count` the number of its columns and
+    /// `data_line` its line number.
     ///
     /// # Errors
-    /// Columns that are not clear; a header with another number of columns than the data, or with another unit.
+    /// Given columns that do not exist; a header that does not name x, y and z once each; a header with another number
+    /// of columns than `data`, or with a unit other than the unit in which the table is read; a table without a header
+    /// that has another number of columns than three or six.
     fn columns(
         &self,
         separator: Separator,
@@ -424,8 +452,9 @@ fn has_normal(line: &[u8], separator: Separator) -> bool {
     squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
 }
 
-/// Returns the separator with which a line contains a point. The first three fields are numbers with it, or else any
-/// three fields. Returns `None` if the line contains no point.
+/// Returns the separator that divides `line` into fields of which the first three are numbers. If there is none,
+/// returns a separator that divides `line` into fields of which any three are numbers. The separators are tried in the
+/// order tab, semicolon, comma, blank. Returns `None` if no separator gives three numbers.
 fn data_separator(line: &[u8]) -> Option<Separator> {
     let numbers = |separator: Separator, first: usize| {
         let fields = Fields::new(line, separator).take(first);
@@ -441,8 +470,8 @@ fn likely_separator(line: &[u8]) -> Separator {
     Separator::ALL.into_iter().find(there).unwrap_or(Separator::Blank)
 }
 
-/// Returns the names of the columns in a header, converted to lower case. A unit in brackets that a blank separates
-/// belongs to the name before it.
+/// Returns the names of the columns in `header`, converted to lower case. If blanks separate the columns, a unit in
+/// brackets is appended to the name before it: `x [mm]` is one name.
 fn names(header: &[u8], separator: Separator) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for field in Fields::new(header, separator) {
@@ -461,8 +490,8 @@ pub(super) fn is_separator_line(line: &[u8]) -> bool {
     line.len() <= 5 && line.get(..4).is_some_and(|word| word.eq_ignore_ascii_case(b"sep="))
 }
 
-/// Returns true if `lines` contains only separators, quotes, blanks and end-of-file marks of old systems, and so no
-/// data.
+/// Returns true if `lines` contains no data: only separators, quotes, blanks, line ends and the end-of-file marks of
+/// old systems (0x1A).
 pub(super) fn are_empty_rows(lines: &[u8], separator: Separator) -> bool {
     lines.iter().all(|b| b"\"\x1a \t\r\n".contains(b) || separator.separates(*b))
 }

@@ -88,21 +88,26 @@ pub enum LearnedError {
 }
 
 impl Learned {
-    /// Creates the knowledge that the run named `run` leaves to the next part. `correction` is the correction of its
-    /// next pass, and `known` its state of learning. `setting` names what all passes have in common, and `simulation`
-    /// is true if they were simulated.
+    /// Creates the knowledge of a finished run, which the next part of the same kind begins with. `run` is the name of
+    /// the run. `correction` is the correction that a further pass of this run would have. `known` is the state of the
+    /// learning: the estimated error common to all passes, with its uncertainty. `setting` is the text of the settings
+    /// that two runs must share so that one can learn from the other. `simulation` is true if the passes were
+    /// simulated.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         let (fields, kind, taught_by) = (PartPriors::default(), None, None);
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
-    /// Returns the knowledge for the first part of a recipe on a machine that has not ground this recipe yet. It is
-    /// computed from `others`, the knowledge of runs on other machines, as far as machines are similar (`alike`).
-    /// `fresh` and `none` are the state of learning and the correction of a machine without knowledge. Returns `None`
-    /// if `others` give no information.
+    /// Returns the knowledge (the learned correction and the state of the learning) for the first part of a recipe on a
+    /// machine that has not ground this recipe yet. It is predicted from `others`: runs on other machines, each with
+    /// its knowledge. `alike` is the similarity of the machines. `simulation` and `setting` are stored in the result,
+    /// as in [`Self::new`]. `fresh` is the state of the learning before the first pass. `none` is a correction of 0 for
+    /// the new part.
     ///
-    /// The wheel and the setting of another machine differ from those of this machine. Therefore the correction by
-    /// parameters of the other machine becomes part of the map.
+    /// Returns `None` if no run in `others` has learned an error in the same bands of wavelengths as `fresh`.
+    ///
+    /// The parameter corrections of another machine (such as that of its wheel radius) do not apply to this machine.
+    /// Therefore the result has no parameter corrections, and its map compensates the predicted error alone.
     pub fn from_others(
         others: &[(CellRun, Self)],
         alike: &MachineSimilarity,
@@ -120,22 +125,26 @@ impl Learned {
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
-    /// Returns the same knowledge with the kind of its passes. Another cell can begin with it only if its passes have
-    /// the same kind.
+    /// Returns this knowledge of a run with its kind set to `kind`: the text of the settings, without those of the
+    /// cell, that runs of two cells must share. Another cell can begin with this knowledge only if its own text is
+    /// equal.
     #[must_use]
     pub fn with_kind(self, kind: String) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
-    /// Returns the same knowledge with `fields`, the prior distributions of the error fields.
+    /// Returns this knowledge of a run with its prior distributions of the error fields replaced by `fields`.
     #[must_use]
     pub fn with_fields(self, fields: PartPriors) -> Self {
         Self { fields, ..self }
     }
 
-    /// Reads the knowledge that a run left in its folder `run`, and returns it with the bytes of its file. Returns
-    /// `None` if the file does not exist, has another layout, or is for another `setting` or another value of
-    /// `simulation`.
+    /// Reads the knowledge that a finished run saved in its folder `run`. Returns the knowledge (the learned correction
+    /// and the state of the learning) and the bytes of its file. `setting` is the text of the settings that both runs
+    /// must share. `simulation` is true if the passes of the new run are simulated.
+    ///
+    /// Returns `None` if the file does not exist, has another version of the layout, or has another `setting` or
+    /// another value of `simulation`.
     ///
     /// # Errors
     /// A file that cannot be read, is too large, is not written by Regrind, or has an impossible number.
@@ -160,12 +169,15 @@ impl Learned {
         Self::from_saved(&path, &text).map(|learned| Some((learned, text)))
     }
 
-    /// Reads the knowledge of a run of another cell from the `text` of its file. `from` only names the file in
+    /// Parses the knowledge of a run of another cell (the learned correction and the state of the learning) from
+    /// `text`, the content of its file. `kind` is the text of the settings, without those of the cell, that both runs
+    /// must share. `simulation` is true if the passes of this cell are simulated. `from` only names the file in
     /// messages.
     ///
     /// # Errors
-    /// A text that Regrind did not write; passes of another kind than `kind` or another value of `simulation`;
-    /// knowledge that is itself from other cells; an impossible number, or a state that cannot be transferred.
+    /// A text that Regrind did not write; knowledge of another `kind`, of another value of `simulation`, or of another
+    /// version of the layout; knowledge that its cell took from other cells; an impossible number; a state of the
+    /// learning that cannot be transferred.
     pub fn read_other(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
         let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
@@ -180,8 +192,8 @@ impl Learned {
         }
     }
 
-    /// Parses the knowledge from the `text` of its file, such as the copy that a run saves at its start. `path` only
-    /// names the file in messages.
+    /// Parses the knowledge of a run (the learned correction and the state of the learning) from `text`, the content of
+    /// its file. The file can be a copy that a later run saved at its start. `path` only names the file in messages.
     ///
     /// # Errors
     /// A text that Regrind did not write, or that has an impossible number.
@@ -194,7 +206,8 @@ impl Learned {
         }
     }
 
-    /// Returns a description of the first impossible value; `None` if there is none.
+    /// Returns a description of the first impossible value in this knowledge, such as a correction that is not finite.
+    /// Returns `None` if all values are possible.
     fn flaw(&self) -> Option<String> {
         let Correction { grid, values_mm, level_mm, .. } = &self.correction;
         if !grid.is_valid() || values_mm.len() != grid.len() {
@@ -219,8 +232,10 @@ impl Learned {
         (!self.known.is_valid()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
-    /// Returns the correction for the first pass of the next part, resampled to the grid of `none`, a correction of 0.
-    /// It compensates the error that repeated in every pass of the last part.
+    /// Returns the correction for the first pass of the next part: the learned correction, interpolated to the grid of
+    /// `none`. It compensates the error that repeated in every pass of the last part. `none` is the correction of 0 for
+    /// the new part. It also gives the number of the pass and the height of the target surface above the nominal
+    /// surface.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
         let set = self.correction.set.as_ref().map(|set| ParameterCorrections {

@@ -102,8 +102,9 @@ enum Kind {
     Map(&'static MapFormat),
 }
 
-/// Reads a nominal surface as [`read_nominal_as`] does, and returns it with its SHA-256. The hash covers the bytes of
-/// the file, and the columns and units that `table` gives, because other columns are another surface.
+/// Reads a nominal surface from a file, and returns it with its SHA-256. `table` gives the columns and units that a
+/// table of points does not state. The hash is computed from the bytes of the file and from the columns and units in
+/// `table`, because another choice of columns gives another surface.
 ///
 /// # Errors
 /// The same as for [`read_nominal_as`].
@@ -134,7 +135,8 @@ pub fn read_nominal_with_identity(
     }
 }
 
-/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), or the text of a TOML definition.
+/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), or the text of a TOML definition. Points
+/// and vertices are in millimetres.
 ///
 /// The content decides the format. The extension decides only if the content is ambiguous.
 ///
@@ -145,11 +147,12 @@ pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> 
     read_nominal_as(path, &Table::default())
 }
 
-/// Reads a nominal surface as [`read_nominal`] does; for a table of points, `table` gives the columns and units that
-/// the file does not state.
+/// Reads a nominal surface from a file: points, a mesh or the text of a TOML definition, as [`read_nominal`] does. If
+/// the file is a table of points, `table` gives the columns and units that the file does not state.
 ///
 /// # Errors
-/// The same as for [`read_nominal`]; columns that do not exist; columns or a unit for a file that is not a table.
+/// The same as for [`read_nominal`]; columns that do not exist; columns or a unit in `table` for a file that is not a
+/// table.
 pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalFile, FormatError> {
     let path = path.as_ref();
     let kind = kind(path)?;
@@ -176,11 +179,11 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
     })
 }
 
-/// Reads measured points, in millimetres and in the order of the file, from text, the vertices of a PLY file, or the
-/// measured samples of a map: X3P, SDF or MetroPro.
+/// Reads measured points, in millimetres and in the order of the file. The file is text, PLY (its vertices are the
+/// points), or a map (X3P, SDF or MetroPro; its measured samples are the points).
 ///
-/// The points of a map lie on the surface. Centres of a probe lie above it; the file does not show which of them it
-/// has.
+/// The points of a map lie on the surface. The points of another file can lie on the surface or can be the centres of a
+/// spherical probe; the file does not show which.
 ///
 /// # Errors
 /// A file that cannot be read, or that is not valid in its format; an STL or TOML file; a format that this program does
@@ -189,11 +192,13 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
     read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads measured points as [`read_measured`] does, and returns them with notes on what the file leaves ambiguous; for
-/// a table, `table` gives the columns and units that the file does not state.
+/// Reads measured points from a text file, a PLY file or a map, as [`read_measured`] does. Returns the points in
+/// millimetres, with notes on the content of the file that is ambiguous. If the file is a table, `table` gives the
+/// columns and units that the file does not state.
 ///
 /// # Errors
-/// The same as for [`read_measured`]; columns that do not exist; columns or a unit for a file that is not a table.
+/// The same as for [`read_measured`]; columns that do not exist; columns or a unit in `table` for a file that is not a
+/// table.
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
@@ -211,8 +216,9 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
     }
 }
 
-/// Reads the positions of a measuring plan, in millimetres, as [`read_measured`] reads points; the columns of a table
-/// can be named nominal, as those of a plan are.
+/// Reads the positions of a measuring plan, in millimetres and in the order of the file. The same formats are accepted
+/// as in [`read_measured`]. In a table of text, the names of the columns can state that the points are nominal (such as
+/// `X_nom`). `table` gives the columns and units that the file does not state.
 ///
 /// # Errors
 /// The same as for [`read_measured_with_notes`].
@@ -224,8 +230,8 @@ pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, Fo
     }
 }
 
-/// Rejects a file that is not a table of points if `table` gives columns or a unit, because the file states both
-/// itself.
+/// Rejects a file of the format `kind` if `table` gives columns or a unit and the format is not a table of text. Other
+/// formats state their coordinates themselves.
 fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
     if matches!(kind, Kind::Text) || *table == Table::default() {
         return Ok(());
@@ -238,7 +244,8 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
     })
 }
 
-/// Determines the format of a file from its beginning, and from its extension if the beginning is ambiguous.
+/// Determines the format of the file `path` from its first 64 KiB and its length. If they are ambiguous, the extension
+/// decides. A file of no detected format is read as text.
 ///
 /// # Errors
 /// A file that cannot be read; a known format that this program does not read.
@@ -270,14 +277,15 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     })
 }
 
-/// Returns the first line that is neither blank nor a comment (`#`), without blanks at its ends; `None` if there is
-/// none.
+/// Returns the first line in `head`, the beginning of a file, that is neither blank nor a comment (`#`). Blanks at both
+/// ends of the line are removed. Returns `None` if there is no such line.
 fn first_words(head: &[u8]) -> Option<&[u8]> {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
     head.split(|&b| b == b'\n').map(<[u8]>::trim_ascii).find(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
-/// Returns true if the first line that is neither blank nor a comment is TOML: `[table]` or `key = value`.
+/// Returns true if `head`, the beginning of a file, is TOML. The first line that is neither blank nor a comment
+/// decides: it must be `[table]` or `key = value`.
 fn is_toml(head: &[u8]) -> bool {
     let Some(line) = first_words(head) else { return false };
     let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.".contains(b);

@@ -21,12 +21,14 @@ pub struct ErrorMapOrigin {
     pub ground_with: Option<[u8; 32]>,
 }
 
-/// Writes `map` to `path` (`error_map.csv`): `x_mm,y_mm,error_mm,sigma_mm,valid`, one row per node, row by row with x
+/// Writes `map`, the measured error on a grid, to `path` (`error_map.csv`). The columns are
+/// `x_mm,y_mm,error_mm,sigma_mm,valid`, in the model frame. There is one row for each node of the grid; x changes
 /// fastest.
 ///
-/// A positive error is proud. `sigma_mm` is the standard uncertainty of the error due to the noise of the points, 0 if
-/// unknown. If `valid` is 0, nothing was measured at the node, and its values are those of the nearest measured node.
-/// Comments give the origin of the measurement, and `SIMULATION` if `simulation` is true.
+/// A positive error means that material stands above the nominal surface. `sigma_mm` is the standard uncertainty of the
+/// error due to the noise of the points, 0 if unknown. If `valid` is 0, nothing was measured at the node, and its
+/// values are those of the nearest measured node. Comments above the columns give `origin` (the part, the cycle and the
+/// previous correction), and `SIMULATION` if `simulation` is true.
 ///
 /// # Errors
 /// The same as for [`super::write_deviations`].
@@ -77,20 +79,21 @@ impl MapNode {
     }
 }
 
-/// Reads a file that [`write_error_map`] wrote. Returns its measured nodes, without those that were not measured.
+/// Reads an error map from the file `path`, which [`write_error_map`] wrote. Returns the measured nodes in the order of
+/// the file. Nodes that were not measured are omitted.
 ///
 /// # Errors
-/// A file that cannot be read; other columns; a row that is not finite numbers.
+/// A file that cannot be read, or that does not have the columns of an error map; a row that is not finite numbers.
 pub fn read_error_map(path: &Path) -> Result<Vec<MapNode>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     parse_error_map(path, &std::fs::read_to_string(path).map_err(unreadable)?)
 }
 
-/// Parses the text of a file that [`write_error_map`] wrote. Returns its measured nodes. `path` only names the file in
-/// messages.
+/// Parses an error map from `text`, the content of a file that [`write_error_map`] wrote. Returns the measured nodes in
+/// the order of the file. Nodes that were not measured are omitted. `path` only names the file in messages.
 ///
 /// # Errors
-/// Other columns; a row that is not finite numbers.
+/// A text that does not have the columns of an error map; a row that is not finite numbers.
 pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatError> {
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
     let unexpected = |found: &str, line: u64, expected: &str| FormatError::Unexpected {
@@ -136,9 +139,13 @@ pub struct CorrectionIdentities {
     pub replaces: [u8; 32],
 }
 
-/// Writes `correction` to `path` (`correction.csv`): `x_mm,y_mm,correction_mm`, as sent to the grinder. Comments give
-/// the part, the cycle, the level, the identities, and `parameters`, descriptions of the machine parameters that are
-/// compensated too.
+/// Writes `correction` to `path` (`correction.csv`), as the map that is sent to the grinder. The columns are
+/// `x_mm,y_mm,correction_mm`, in the model frame. A positive correction leaves material.
+///
+/// Comments above the columns give the number of the pass, the height of the target surface above the nominal surface,
+/// and `identities`: the SHA-256 of the part, of this map and of the previous map. One further comment is written for
+/// each text in `parameters`, which describes a machine parameter that is compensated too. `SIMULATION` is added if
+/// `simulation` is true.
 ///
 /// # Errors
 /// The same as for [`super::write_deviations`].

@@ -9,7 +9,8 @@ use super::{metropro, sdf, whole, x3p};
 /// All formats of maps. A new format needs its own source file and an entry here.
 const FORMATS: [MapFormat; 3] = [x3p::FORMAT, sdf::FORMAT, metropro::FORMAT];
 
-/// Returns the map format (X3P, SDF or MetroPro) whose first bytes `head` has; `None` for any other file.
+/// Detects the format of a measured map (X3P, SDF or MetroPro) from `head`, the first bytes of a file. Returns `None`
+/// for any other file.
 pub(super) fn map_format(head: &[u8]) -> Option<&'static MapFormat> {
     FORMATS.iter().find(|format| (format.begins)(head))
 }

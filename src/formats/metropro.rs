@@ -27,7 +27,7 @@ pub(super) const FORMAT: MapFormat = MapFormat {
     parse: |path, bytes| parse_metropro(path, bytes).map(Into::into),
 };
 
-/// Reads a MetroPro map of at most 1 GiB.
+/// Reads a MetroPro map of at most 1 GiB. Returns the heights on a grid, in millimetres.
 ///
 /// # Errors
 /// A file that is not readable, not MetroPro, cut, without phases or without lateral scale; invalid numbers in its

@@ -33,13 +33,14 @@ pub(super) enum Evidence {
     Nothing,
 }
 
-/// Parses a coordinate. Its value is not converted to another unit. `decimal` is the decimal mark of the file.
+/// Parses `field` as a coordinate. `decimal` is the decimal mark of the file. The value stays in the unit of the file.
 ///
-/// A field can have a sign, digits with at most one decimal mark, and an exponent of ten. Thousands separators (the
-/// other mark) are accepted only if the decimal mark is present too, so that 2,512 is never accepted silently.
+/// A field can have a sign, digits with at most one decimal mark, and an exponent of ten. Points or commas between
+/// thousands are accepted only if the field also contains its decimal mark: `2,512.1` is accepted, but `2,512` is
+/// ambiguous and is rejected if the decimal mark is a point.
 ///
 /// # Errors
-/// A field that is not a number, is not finite, exceeds [`LIMIT_MM`], or has the other decimal mark.
+/// A field that is not a number, is not finite, exceeds [`LIMIT_MM`], is ambiguous, or has the other decimal mark.
 pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFault> {
     let value = match (decimal, field.contains(&b','), field.contains(&b'.')) {
         (Decimal::Point, false, _) | (Decimal::Comma, false, false) => plain(field)?,
@@ -63,13 +64,14 @@ pub(super) fn is_believable(value: f64) -> bool {
     value.abs() <= LIMIT_MM
 }
 
-/// Parses a number with a decimal point, which can be NaN or infinite; `None` if the field is not such a number.
+/// Parses a number with a decimal point. The result can be NaN or infinite. Returns `None` if `field` is not such a
+/// number.
 pub(super) fn any_number(field: &[u8]) -> Option<f64> {
     fast_float2::parse(field).ok()
 }
 
-/// Returns true if a field is a number with any decimal mark, with or without thousands separators; NaN and infinity
-/// too.
+/// Returns true if `field` is a number. The decimal mark can be a point or a comma, and thousands can be separated by
+/// the other mark. NaN and infinity are numbers too.
 pub(super) fn looks_numeric(field: &[u8]) -> bool {
     any_number(field).is_some() || plain_with_point(field, b',', None).is_ok() || {
         let grouped = |mark, group| plain_with_point(field, mark, Some(group)).is_ok();
@@ -77,13 +79,14 @@ pub(super) fn looks_numeric(field: &[u8]) -> bool {
     }
 }
 
-/// Returns true if a text has both a point and a comma, so that one is the decimal mark and the other separates
-/// thousands.
+/// Returns true if `text` contains both a point and a comma. If `text` is one number, one of them is its decimal mark
+/// and the other separates thousands.
 pub(super) fn has_both_marks(text: &[u8]) -> bool {
     text.contains(&b'.') && text.contains(&b',')
 }
 
-/// Returns two counts for a number: its digits after the decimal mark, and the digits of its exponent.
+/// Returns `[decimals, exponent]` for the number `field`: the number of digits after its decimal mark, and the number
+/// of digits of its exponent. A count is 0 if the number has no mark or no exponent.
 pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     let begins = |is: fn(&u8) -> bool| field.iter().rposition(is).map(|at| &field[at + 1..]);
     let digits = |text: Option<&[u8]>| {
@@ -94,8 +97,8 @@ pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     [digits(begins(|b| matches!(b, b'.' | b','))), digits(begins(|b| matches!(b, b'e' | b'E')))]
 }
 
-/// Returns what a field shows about the decimal mark of its file: which mark it is, that a comma can mean both, or
-/// nothing.
+/// Returns the evidence of `field` for the decimal mark of its file: the mark (point or comma), or that its comma can
+/// be the decimal mark or a thousands separator, or nothing. A field that is not a number gives no evidence.
 pub(super) fn evidence(field: &[u8]) -> Evidence {
     let last = |mark: u8| field.iter().rposition(|&b| b == mark);
     let count = |mark: u8| field.iter().filter(|&&b| b == mark).count();
@@ -110,10 +113,11 @@ pub(super) fn evidence(field: &[u8]) -> Evidence {
     }
 }
 
-/// Returns a number without the blanks between its thousands: 1234,56 for 1 234,56. Returns `None` if the field has no
-/// such blanks.
+/// Returns the number in `field` without the blanks between its thousands: `1234,56` for `1 234,56`. The blank can be a
+/// plain blank, a no-break space (U+00A0) or a narrow no-break space (U+202F).
 ///
-/// A plain blank, a no-break space (U+00A0) and a narrow no-break space (U+202F) are accepted.
+/// Returns `None` if `field` is not a number with such blanks, has a blank at another position, or is longer than 64
+/// bytes.
 pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     let text = std::str::from_utf8(field).ok().filter(|text| text.len() <= LONGEST_MARKED)?;
     let is_blank = |c: char| matches!(c, ' ' | '\u{a0}' | '\u{202f}');
@@ -125,10 +129,12 @@ pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     Some(marked.bytes().filter(|&b| b != b' ').chain(fraction.bytes()).collect())
 }
 
-/// Parses a number with a decimal point and without thousands separators.
+/// Parses a number with a decimal point and without thousands separators. The value can be infinite if the number has
+/// too many digits.
 ///
 /// # Errors
-/// [`NumberFault::Text`] if it is not a number; [`NumberFault::NotFinite`] for a NaN or infinity in letters.
+/// [`NumberFault::Text`] if `field` is not a number; [`NumberFault::NotFinite`] if `field` is the word for NaN or
+/// infinity.
 fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     let value: f64 = fast_float2::parse(field).map_err(|_| NumberFault::Text)?;
     let spelt_out = field.iter().any(|b| matches!(b, b'n' | b'N'));
@@ -136,8 +142,8 @@ fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
 }
 
-/// Parses a number that contains the decimal mark `mark`. If `group` is given, the digits before the mark must be in
-/// groups of three, separated by `group`.
+/// Parses a number that contains the decimal mark `mark` (a point or a comma). If `group` is given, the digits before
+/// the mark must be in groups of three, separated by `group`. If `group` is `None`, thousands separators are rejected.
 fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
     let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
     let (whole, fraction) = (&field[..at], &field[at + 1..]);
@@ -154,7 +160,8 @@ fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, Nu
     plain(&text[..length])
 }
 
-/// Returns true if `whole` is a whole number in groups of three digits, such as -1,234,567, separated by `group`.
+/// Returns true if `whole` is a whole number whose digits are in groups of three, such as `-1,234,567`. `group` is the
+/// byte between the groups. At least one separator is required, and the first digit must not be 0.
 fn is_grouped(whole: &[u8], group: u8) -> bool {
     let digits = whole.strip_prefix(b"-").or(whole.strip_prefix(b"+")).unwrap_or(whole);
     let mut parts = digits.split(|&b| b == group);
@@ -164,7 +171,8 @@ fn is_grouped(whole: &[u8], group: u8) -> bool {
     well_begun && rest.peek().is_some() && rest.all(|part| part.len() == 3 && part.iter().all(u8::is_ascii_digit))
 }
 
-/// Returns true if the commas of a field, such as 2,512, can be decimal marks or thousands separators.
+/// Returns true if `field` is a whole number in groups of three digits separated by commas, such as `2,512`. Without
+/// other evidence, such a comma can be a decimal mark or a thousands separator.
 fn is_one_group(field: &[u8]) -> bool {
     is_grouped(field, b',')
 }

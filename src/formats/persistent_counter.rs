@@ -11,8 +11,8 @@ pub struct PersistentCounter {
 }
 
 impl PersistentCounter {
-    /// Opens the file of a number, or creates it, and locks it until the value is dropped. Returns `None` if another
-    /// program holds the lock.
+    /// Opens the file `path` that stores the number of a counter, or creates it, and locks it. The lock ends when the
+    /// returned counter is dropped. Returns `None` if another program holds the lock.
     ///
     /// # Errors
     /// A file that cannot be created, written or locked.

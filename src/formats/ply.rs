@@ -44,8 +44,12 @@ pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
     parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses a PLY file. `units` are the units in which its coordinates are read: of all coordinates, and of z. A comment
-/// that states another unit is rejected. The coordinates are not converted.
+/// Parses a PLY file from its `bytes`. The coordinates stay in the unit of the file. `units` are the unit of all
+/// coordinates, and the unit of z. The file is rejected if a comment in its header states another unit. `path` only
+/// names the file in messages.
+///
+/// # Errors
+/// The same as for [`read_ply`].
 pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
     let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];
@@ -136,7 +140,8 @@ impl Element {
         if let [Some(a), Some(b), Some(c)] = found { Some([a, b, c]) } else { None }
     }
 
-    /// Returns the smallest number of bytes that one item of this element can have in a file.
+    /// Returns the minimum number of bytes, at least 1, that one item of this element (such as one vertex) has in a
+    /// file with this `encoding`.
     fn min_size(&self, encoding: Encoding) -> usize {
         let size = |p: &Property| if encoding == Encoding::Ascii { 2 } else { p.list.unwrap_or(p.scalar).size() };
         self.properties.iter().map(size).sum::<usize>().max(1)
@@ -183,7 +188,8 @@ impl Header {
         Ok(header)
     }
 
-    /// Returns the next line of the header. `rest` is the file after the lines that were read.
+    /// Reads the next line of the header, and returns it without blanks at its ends. `rest` is the part of the file
+    /// that is not yet read. `path` only names the file in messages.
     ///
     /// # Errors
     /// A line without a line end; a line or a header that is too long.
@@ -211,10 +217,11 @@ impl Header {
         Ok(line)
     }
 
-    /// Reads a line of the header that declares an element or a property. `words` are the words of the line.
+    /// Reads a line of the header that declares an element or a property, and adds it to this header. `words` are the
+    /// words of the line.
     ///
     /// # Errors
-    /// A line that is not valid; the text names what was expected.
+    /// A line that is not a valid declaration. The error is a text that names the expected content.
     fn declare(&mut self, words: &[&[u8]]) -> Result<(), &'static str> {
         let text = |word: &[u8]| String::from_utf8_lossy(word).into_owned();
         let (name, list, scalar) = match *words {
@@ -240,8 +247,8 @@ impl Header {
         Ok(())
     }
 
-    /// Checks that the header declares exactly one element `vertex` with x, y and z, and that vertex indices of faces
-    /// have an integer type.
+    /// Returns an error if the header does not declare exactly one element `vertex` with the scalar properties x, y and
+    /// z, if it declares no vertices or too many, or if the vertex indices of faces do not have an integer type.
     fn check(&self, path: &Path) -> Result<(), FormatError> {
         let fault = |expected: &str, found: &str| FormatError::Unexpected {
             path: path.to_owned(),
@@ -272,10 +279,11 @@ impl Header {
         }
     }
 
-    /// Reads the data of all elements, in the order of their declarations. Faces of area 0 are omitted and counted.
+    /// Reads the data of all elements from `source`, in the order in which the header declares them. Triangles of area
+    /// 0 are omitted and counted. `path` only names the file in messages.
     ///
     /// # Errors
-    /// Data that are not valid, that end too early, or that do not end after the last element.
+    /// Data that are not valid, that end too early, or that continue after the last element.
     fn read(&self, path: &Path, source: &mut impl Source) -> Result<PlyFile, FormatError> {
         let mut file = PlyFile::default();
         let vertices = self.elements.iter().find(|e| e.name == "vertex").map_or(0, |e| e.count);
@@ -335,8 +343,8 @@ struct Reading<'a> {
 }
 
 impl Reading<'_> {
-    /// Reads all items of this element. Calls `value` for each number, with the index of its property and the number.
-    /// Calls `done` at the end of each item, with the index of the item.
+    /// Reads all items of this element from `source`. Calls `value` for each number, with the index of its property,
+    /// the number and `source`. Calls `done` after each item, with the index of the item (from 0) and `source`.
     ///
     /// # Errors
     /// Data that are not valid or end too early; the first error of `value` or `done`.

@@ -33,13 +33,18 @@ const SHARE: usize = 256 << 10;
 
 /// Reads a point cloud from a text file, in millimetres and in the order of the file.
 ///
-/// One point per line. Columns are separated by comma, semicolon, tab or blanks: the first point determines the
-/// separator, and all lines must use it. Blank lines and lines that begin with `#` or `//` are skipped. A header, or a
-/// comment that serves as one, names x, y and z once each. A table with columns of both nominal and measured points is
-/// rejected, unless a person chooses ([`read_points_with_notes`]). A table without a header has three columns, or six
-/// with unit normals after the points. Lines above a header are titles. Decimal commas are accepted if the comma does
-/// not separate columns. Thousands separators are accepted if the number also has its decimal mark. Blanks between
-/// thousands are accepted if a tab or a semicolon separates columns.
+/// The file has one point per line:
+///
+/// - Columns are separated by comma, semicolon, tab or blanks. The line of the first point determines the separator,
+///   and all lines must use it.
+/// - Blank lines and comments (lines that begin with `#` or `//`) are skipped.
+/// - A header names x, y and z once each. It can be a comment. Lines above the header are titles.
+/// - A table with columns of both nominal and measured points is rejected. [`read_points_with_notes`] reads such a
+///   table if its columns are given.
+/// - A table without a header has three columns, or six if a unit normal follows the point.
+/// - Decimal commas are accepted if the comma does not separate columns.
+/// - Commas or points between thousands are accepted if the number also has its decimal mark.
+/// - Blanks between thousands are accepted if a tab or a semicolon separates columns.
 ///
 /// # Errors
 /// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; a coordinate
@@ -49,8 +54,9 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     read_points_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads the points of a nominal surface as [`read_points`] does; their columns can be named nominal. `table` gives the
-/// columns and units that the file does not state.
+/// Reads the points of a nominal surface from a text file, in millimetres and in the order of the file. The format is
+/// that of [`read_points`], but the names of the columns can state that the points are nominal (such as `X_nom`).
+/// `table` gives the columns and units that the file does not state.
 ///
 /// # Errors
 /// The same as for [`read_points`]; columns that do not exist.
@@ -68,8 +74,8 @@ fn opened(path: &Path) -> Result<(File, u64), FormatError> {
     Ok((file, length))
 }
 
-/// Reads a point cloud as [`read_points`] does, and returns it with notes on what the file leaves ambiguous. `table`
-/// gives the columns and units that the file does not state.
+/// Reads a point cloud from a text file in the format of [`read_points`]. Returns the points in millimetres, with notes
+/// on the content of the file that is ambiguous. `table` gives the columns and units that the file does not state.
 ///
 /// # Errors
 /// The same as for [`read_points`]; columns that do not exist.
@@ -79,7 +85,8 @@ pub fn read_points_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<N
     Cloud::new(path, length, table).read(file)
 }
 
-/// Reads a point cloud from a stream of text, in millimetres. `path` only names the file in messages.
+/// Reads a point cloud from `reader`, a stream of text in the format of [`read_points`]. Returns the points in
+/// millimetres, in the order of the stream. `path` only names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_points`].
@@ -87,9 +94,9 @@ pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<
     Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
-/// Parses a point cloud from the `text` of a file, and converts it to millimetres. `table` gives the columns and units,
-/// and `decimal` the decimal mark; if `decimal` is `None`, the mark is detected. `path` only names the file in
-/// messages.
+/// Parses a point cloud from `text`, the content of a file in the format of [`read_points`]. Returns the points in
+/// millimetres, in the order of the file. `table` gives the columns and units that the file does not state. `decimal`
+/// is the decimal mark; if `decimal` is `None`, the mark is detected. `path` only names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_points`]; columns that do not exist.
@@ -129,8 +136,9 @@ struct Grouped {
 }
 
 impl Grouped {
-    /// Counts a line in which a coordinate has thousands separators, and keeps the first such number. `lines_before` is
-    /// the number of lines before it in the text. Lines after the second one are not counted.
+    /// Counts `line` if one of its coordinates has points or commas between thousands, and stores the first such
+    /// number. Does nothing if two lines are already counted. `lines_before` is the number of lines before `line` in
+    /// the text that is parsed.
     fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
         if self.lines > 1 || !has_both_marks(line) {
             return;
@@ -143,7 +151,8 @@ impl Grouped {
         }
     }
 
-    /// Adds the numbers with thousands separators of `share`, a part of the text that follows `lines_before` lines.
+    /// Adds the count and the first number with thousands separators that were found in a part of the text. `share` is
+    /// the result for this part, and `lines_before` is the number of lines of the file before this part.
     fn add(&mut self, share: Self, lines_before: u64) {
         self.lines += share.lines;
         let first = share.first.map(|(line, found, value)| (line + lines_before, found, value));
@@ -160,8 +169,8 @@ struct Batch {
 }
 
 impl Batch {
-    /// Fills this batch with `left_over`, the unread rest of the previous batch, and then from `reader`. Returns the
-    /// number of bytes from `reader`.
+    /// Fills this batch with `left_over`, the unparsed end of the previous batch, and then with bytes from `reader`.
+    /// Returns the number of bytes that were read from `reader`.
     fn read(&mut self, left_over: &[u8], reader: &mut impl Read) -> std::io::Result<usize> {
         self.bytes.resize(BATCH, 0);
         self.bytes[..left_over.len()].copy_from_slice(left_over);
@@ -214,8 +223,8 @@ impl<'p> Cloud<'p> {
         Ok(NotedPoints { notes, points: self.finish()? })
     }
 
-    /// Returns notes on what the file leaves ambiguous. `text` is the last part of the file; its last line can be
-    /// incomplete.
+    /// Returns notes on ambiguous content of the file: thousands separators in only one line of the file, and a last
+    /// line without a line end. `text` is the last part of the file.
     fn notes(&mut self, text: &[u8]) -> Vec<PointNote> {
         let mut notes = Vec::new();
         if let (1, Some((before, found, value_mm))) = (self.grouped.lines, self.grouped.first.take()) {
@@ -225,8 +234,10 @@ impl<'p> Cloud<'p> {
         notes
     }
 
-    /// Returns a note if the last line has a point but no line end: the file may be cut. The note states whether its
-    /// last number has fewer digits than those of the lines above. Otherwise returns `None`.
+    /// Returns a note if the last line of `text` contains a point but has no line end, because the file may be cut. The
+    /// note states whether the last number of this line has fewer digits than the last number of every line above.
+    /// Returns `None` if the last line has a line end, contains no point or is a comment. `text` is the last part of
+    /// the file.
     fn note_of_end(&self, text: &[u8]) -> Option<PointNote> {
         /// Number of lines above whose digits are compared with the last line, and the minimum number required.
         const ABOVE: usize = 1000;
@@ -247,10 +258,12 @@ impl<'p> Cloud<'p> {
         Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
 
-    /// Returns the length of the complete lines at the beginning of a full batch, in bytes.
+    /// Returns the number of bytes from the beginning of the text in `batch` to the end of its last complete line.
+    /// `batch` must be full.
     ///
     /// # Errors
-    /// A last line that is longer than any line may be; an earlier error in the lines before it.
+    /// An incomplete last line that is longer than the limit for a line; an error in the lines before such a line,
+    /// which are then parsed first.
     fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
         let text = &batch.bytes[batch.begin..];
         let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
@@ -263,8 +276,9 @@ impl<'p> Cloud<'p> {
         Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
     }
 
-    /// Parses `text`, which ends with a complete line unless it is the end of the file. `bytes_so_far` is the number of
-    /// bytes of the file up to its end.
+    /// Parses `text`, a part of the file that consists of complete lines, and stores its points. Only the last line of
+    /// the file can be incomplete. `bytes_so_far` is the number of bytes of the file up to the end of the batch that
+    /// contains `text`.
     ///
     /// # Errors
     /// The first line that is not valid; too many points; too much text before the first point.
@@ -307,8 +321,9 @@ impl<'p> Cloud<'p> {
         if found > limit { Err(too_many()) } else { Ok(()) }
     }
 
-    /// Reads the lines above the first point until the layout is known. Returns the rest of `text`, which begins with
-    /// the first point, or is empty if there is no point in it.
+    /// Reads the lines of `text` above the first point, until the layout of the table is known. Returns the rest of
+    /// `text`, which begins with the line of the first point. Returns all of `text` if the layout is already known, and
+    /// an empty rest if `text` contains no point.
     fn take_preamble<'t>(&mut self, text: &'t [u8]) -> Result<&'t [u8], FormatError> {
         let mut rest = text;
         while self.layout.is_none() && !rest.is_empty() {
@@ -337,7 +352,8 @@ impl<'p> Cloud<'p> {
         Err(self.preamble.without_points())
     }
 
-    /// Rejects a file in which the first `bytes` bytes have no point and are more than one batch.
+    /// Returns an error if `bytes`, the number of bytes read without finding a point, is at least the size of one batch
+    /// (4 MiB).
     fn check_preamble(&self, bytes: u64) -> Result<(), FormatError> {
         let (path, limit, unit) = (self.path, BATCH as u64 - 1, "bytes before the first point");
         let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit };
@@ -350,8 +366,8 @@ impl<'p> Cloud<'p> {
         if bytes > limit { Err(too_large()) } else { Ok(()) }
     }
 
-    /// Checks that `head`, the beginning of a file, is text with one byte per character and with lines that end with LF
-    /// or CR LF.
+    /// Returns an error if `head`, the beginning of a file, is not text that can be parsed: a known format that this
+    /// program does not read, UTF-16, lines that end with CR only, or control characters.
     fn check_head(&self, head: &[u8]) -> Result<(), FormatError> {
         check_is_ours(self.path, head)?;
         if is_utf16(head) {
@@ -389,8 +405,8 @@ pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result
     Ok(filled)
 }
 
-/// Returns the number of points for which memory is reserved. It is estimated from `found`, the points in the first
-/// `bytes_so_far` bytes of a file of `length` bytes, and limited to a quarter of the maximum.
+/// Returns the number of points for which memory is reserved, at most a quarter of [`MAX_POINTS`]. It is extrapolated
+/// from `found`, the number of points in the first `bytes_so_far` bytes, to a file of `length` bytes.
 fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     let ratio = length.max(bytes_so_far) as f64 / bytes_so_far.max(1) as f64;
     // Without this bound, a batch of very short points would reserve many times the memory that a file with a long tail
@@ -398,7 +414,8 @@ fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     ((found as f64 * ratio * 1.02) as usize).min(MAX_POINTS as usize / 4)
 }
 
-/// Splits text into shares of whole lines, which threads parse in parallel.
+/// Splits `text` at line ends into parts of about 256 KiB, so that threads can parse them in parallel. Only the last
+/// part can end with an incomplete line.
 fn split_at_lines(text: &[u8]) -> Vec<&[u8]> {
     let mut shares = Vec::with_capacity(text.len() / SHARE + 1);
     let mut rest = text;
@@ -452,8 +469,9 @@ fn read_share(text: &[u8], layout: &Layout) -> Share {
     share
 }
 
-/// Parses the first line of `text` if its first three columns are plain numbers and it has a line end. Returns the
-/// point and the length of the line. Returns `None` for any other line, which [`careful_line`] then reads.
+/// Parses the first line of `text` if its first three columns are x, y and z as numbers with a decimal point. Returns
+/// the point, in the unit of the file, and the length of the line with its line end, in bytes. Returns `None` for any
+/// other line and for a line without a line end. [`careful_line`] then parses this line.
 #[inline]
 fn quick_line(text: &[u8], layout: &Layout) -> Option<(Point, usize)> {
     let separator = layout.separator;
@@ -493,8 +511,9 @@ fn skip_separator(text: &[u8], at: usize, separator: Separator) -> Option<usize>
     (text.get(end) == Some(&separator.byte())).then(|| skip_padding(text, end + 1, separator))
 }
 
-/// Returns the position after the last column of a line; `at` is the position after its third column. Returns `None` if
-/// the line has too few columns, or a column with quotes or control characters.
+/// Skips the columns after the third column of a line. `text` begins with the line, and `at` is the byte index after
+/// its third column. Returns the byte index after the last column and the blanks that follow. Returns `None` if the
+/// line has fewer columns than `layout`, or has a column with quotes or control characters.
 fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
     for _ in 3..layout.count {
         at = skip_separator(text, at, layout.separator)?;
@@ -520,12 +539,12 @@ fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> 
     Ok(())
 }
 
-/// Parses any line of data. Returns `None` for a blank line or a comment. `number` is its line number, and `ended` is
-/// true if it has a line end.
+/// Parses `line`, any line of data. Returns its point in the unit of the file, or `None` if `line` is blank or a
+/// comment. `number` is the line number. `ended` is true if the line has a line end in the file.
 ///
 /// # Errors
-/// Another number of columns than in `layout`; a coordinate that is not a number; a line that is cut at the end of the
-/// file.
+/// A number of columns other than in `layout`; a coordinate that is not a number; a line that is cut at the end of the
+/// file; a line that is too long or has a zero byte.
 fn careful_line(
     path: &Path,
     number: u64,

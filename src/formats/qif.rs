@@ -31,17 +31,18 @@ pub(super) fn is_xml(head: &[u8]) -> bool {
     head.starts_with(b"<?xml") || head.starts_with(b"<QIFDocument") || head.starts_with(b"<!--")
 }
 
-/// Reads what a QIF document states about its measurement in attributes named `regrind ...`, such as the plan and the
-/// cycle.
+/// Reads the properties of the measurement (such as the plan and the cycle) from the attributes of a QIF document whose
+/// names begin with `regrind`. `text` is the document, and `path` only names the file in messages.
 ///
 /// # Errors
-/// A file that is not a QIF 3 document; a statement with an impossible value.
+/// A file that is not a QIF 3 document; a property with an impossible value.
 pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     with_root(path, text, |root| Qif { path, root }.statements())
 }
 
-/// Reads the points of a QIF document. If the document does not state whether its coordinates are centres or contacts,
-/// `content` decides. `path` only names the file in messages.
+/// Reads the points of a QIF document, in millimetres. `text` is the document. The points are probe centres or contacts
+/// (points on the surface). If the document does not state which, `content` decides. `path` only names the file in
+/// messages.
 ///
 /// # Errors
 /// A file that is not a QIF 3 document; a document without a unit or without points; text in place of a number;
@@ -140,10 +141,10 @@ impl Qif<'_, '_, '_> {
         self.root.descendants().filter(move |node| node.has_tag_name((NAMESPACE, name)))
     }
 
-    /// Returns the unit of length of the document, in millimetres.
+    /// Returns the length of one unit of the document, in millimetres, such as 25.4 for inches.
     ///
     /// # Errors
-    /// A document without a unit of length, or with one that is not a multiple of the metre.
+    /// A document without a unit of length; a unit that is not the metre, with or without a factor.
     fn unit_mm(&self) -> Result<f64, FormatError> {
         let missing = || FormatError::Missing {
             path: self.path.to_owned(),
@@ -209,8 +210,9 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Stores, from `set`, whether its points are contacts or centres, and the radius of the probe. `unit_mm` is the
-    /// unit of the document in millimetres.
+    /// Reads from `set`, a set of measured points, whether its points are contacts (points on the surface) or centres
+    /// of the probe, and the radius of the probe. Stores both in `found`. A property that `set` does not state stays
+    /// unchanged. `unit_mm` is the length of one unit of the document, in millimetres.
     ///
     /// # Errors
     /// A set that differs from the sets before it; a value that is not valid.
@@ -240,8 +242,12 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Reads the points of all measured point features, and the name of the feature item of each. `unit_mm` is the unit
-    /// of the document in millimetres.
+    /// Reads the points of all `PointFeatureMeasurement` elements of the document, in millimetres. The name of each
+    /// point is that of its `PointFeatureItem`, or empty if there is none. `unit_mm` is the length of one unit of the
+    /// document, in millimetres.
+    ///
+    /// # Errors
+    /// An element with a location that is not one point of three numbers.
     fn features(&self, unit_mm: f64) -> Result<QifPoints, FormatError> {
         let name = |node: Node<'_, '_>| child(node, "FeatureName").and_then(|name| name.text()).map(str::to_owned);
         let items = self.named("PointFeatureItem");

@@ -38,8 +38,8 @@ pub struct References {
 }
 
 impl References {
-    /// Returns the name of the reference point with this index (from 0). Without a name, returns its number, such as
-    /// `number 1`.
+    /// Returns the name of the reference point with the index `index` (from 0). If the point has no name, returns its
+    /// number from 1, such as `number 1`.
     pub fn name(&self, index: usize) -> String {
         self.points.get(index).and_then(|p| p.name.clone()).unwrap_or_else(|| format!("number {}", index + 1))
     }
@@ -58,8 +58,9 @@ pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, F
     parse_references(path, &bytes, group)
 }
 
-/// Reads reference points from the `bytes` of a file. The extension of `path` shows whether they are YAML; `path` also
-/// names the file in messages.
+/// Reads reference points, in millimetres, from `bytes`, the content of a file. The file is YAML if the extension of
+/// `path` is `.yaml` or `.yml`; otherwise it is any point file. `group` names the list of points to read in a YAML
+/// file; if it is `None`, the file must have exactly one list. `path` also names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_references`].
@@ -118,11 +119,11 @@ fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Refer
     }
 }
 
-/// Returns the node of the list of points named `group`, or of the only list if `group` is `None`. A file without names
-/// is one list itself.
+/// Returns the list of points named `group` in `root`, the tree of a YAML file. If `group` is `None`, returns the only
+/// list. If `root` has no named lists, returns `root` itself.
 ///
 /// # Errors
-/// No list, or more than one, that fits.
+/// No list with this name; no list, or several lists, if `group` is `None`.
 fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, FormatError> {
     let Tree::Mapping(pairs) = &root.content else { return Ok(root) };
     let named: Vec<(&str, &Node)> = pairs
@@ -144,7 +145,11 @@ fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n 
     }
 }
 
-/// Returns the position that a node holds: a list of three numbers, or a list whose first entry is such a list.
+/// Returns the position, in millimetres, that a node of a YAML file contains. The node is a list of three numbers, or a
+/// list whose first entry is such a list: `[1, 2, 3]` or `[[1, 2, 3], [CODE14]]`.
+///
+/// # Errors
+/// A node without three finite numbers at this position.
 fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     let mut inner = node;
     while let Tree::List(nodes) = &inner.content

@@ -50,10 +50,12 @@ pub fn write_deviations(path: impl AsRef<Path>, rows: &[DeviationRow]) -> Result
     })
 }
 
-/// Reads a file that [`write_deviations`] wrote.
+/// Reads the deviations of all measured points from the file `path`, which [`write_deviations`] wrote. Returns one row
+/// per point, in the order of the file.
 ///
 /// # Errors
-/// A file that cannot be read, other columns, rows that are not finite numbers.
+/// A file that cannot be read, or that does not have the columns of [`write_deviations`]; a row that is not finite
+/// numbers.
 pub fn read_deviations(path: &Path) -> Result<Vec<DeviationRow>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let text = fs::read_to_string(path).map_err(unreadable)?;
@@ -88,25 +90,28 @@ fn deviation_row(row: &str) -> Option<DeviationRow> {
     cells.next().is_none().then_some(DeviationRow { point_mm: [x, y, z], normal: [nx, ny, nz], deviation_mm, used })
 }
 
-/// Writes a point cloud as comma-separated text, in millimetres, with the given header; an empty header is omitted.
+/// Writes `points` to `path` as comma-separated text, in millimetres, one point per line. `header` is written first; an
+/// empty `header` is omitted.
 ///
 /// # Errors
-/// The same as for [`write_deviations`].
+/// A coordinate that is NaN or infinite; a file that cannot be written. An existing file of that name is then
+/// unchanged.
 pub fn write_points(path: impl AsRef<Path>, header: &str, points: &[Point]) -> Result<(), FormatError> {
     write_rows(path.as_ref(), header, points, |point| ([point.x, point.y, point.z], None))
 }
 
-/// Writes one column of numbers with the given header.
+/// Writes `values` to `path` as text, one number per line. `header` is written first; an empty `header` is omitted.
 ///
 /// # Errors
-/// The same as for [`write_deviations`].
+/// A value that is NaN or infinite; a file that cannot be written. An existing file of that name is then unchanged.
 pub fn write_column(path: impl AsRef<Path>, header: &str, values: &[f64]) -> Result<(), FormatError> {
     write_rows(path.as_ref(), header, values, |value| ([*value], None))
 }
 
-/// Writes a value as indented JSON to `path`, completely or not at all.
+/// Writes `value` as indented JSON to `path`, completely or not at all.
 ///
-/// JSON has no NaN: a number that is NaN or infinite becomes `null`. The caller must make sure that there is none.
+/// JSON has no NaN. A number that is NaN or infinite is written as `null`, without an error. Therefore the caller must
+/// check the numbers.
 ///
 /// # Errors
 /// A value that JSON cannot express, such as a map whose keys are not text; a file that cannot be written.
@@ -128,7 +133,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     draft.publish()
 }
 
-/// Writes a file that only its owner can read, completely or not at all.
+/// Writes `bytes` to the file `path`, which only its owner can read, completely or not at all.
 ///
 /// # Errors
 /// The same as for [`write_atomic`].
@@ -208,7 +213,8 @@ impl<'p> Draft<'p> {
         Self::create_by(path, |temporary| OpenOptions::new().write(true).create_new(true).open(temporary))
     }
 
-    /// Creates a draft of the file `path` that only its owner can read.
+    /// Creates a temporary file that only its owner can read. It replaces the file `path` when it is published, and is
+    /// removed if it is not.
     fn create_private(path: &'p Path) -> Result<Self, FormatError> {
         Self::create_by(path, system::create_owners)
     }
@@ -242,7 +248,8 @@ impl<'p> Draft<'p> {
         self.file.write_all(bytes).map_err(failed)
     }
 
-    /// Flushes the bytes to the disk, renames the draft to the name of the file, then flushes the new name to the disk.
+    /// Flushes the bytes of this temporary file to the disk, and renames it to its final name, where it replaces an
+    /// existing file. Then flushes the folder, so that the new name is still present after a power failure.
     pub(super) fn publish(mut self) -> Result<(), FormatError> {
         let failed = self.failed("flushing it to the disk");
         self.file.flush().map_err(&failed)?;
@@ -262,7 +269,8 @@ impl Drop for Draft<'_> {
     }
 }
 
-/// Flushes the folder that contains `path` to the disk, so that a new name of the file lasts after a power failure.
+/// Flushes the folder that contains `path` to the disk. After this, a file that was created or renamed there keeps its
+/// name even after a power failure.
 ///
 /// # Errors
 /// A folder that cannot be flushed to the disk.

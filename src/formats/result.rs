@@ -124,9 +124,9 @@ pub struct ResultFile {
     pub statements: Statements,
 }
 
-/// Checks that the last line of `text`, a result file, has a line end. Without one, the file may be cut in its last
-/// number. Formats that have another end mark (PLY, maps, QIF, DMIS) are always accepted. `path` only names the file in
-/// messages.
+/// Checks that the last line of `text`, a result file, has a line end. If the line end is missing, the file may be cut
+/// within its last number. Formats that have another end mark (PLY, maps, QIF, DMIS) are always accepted. `path` only
+/// names the file in messages.
 ///
 /// # Errors
 /// A last line without a line end.
@@ -149,11 +149,11 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
     whole::open(path)?.read_all(path, MAX_BYTES)
 }
 
-/// Reads what a result file states about its measurement, such as the part and the cycle, without its points. `path`
-/// only names the file in messages.
+/// Reads the properties of the measurement that a result file states, such as the part and the cycle. Does not read the
+/// points. `text` is the content of the file. `path` only names the file in messages.
 ///
 /// # Errors
-/// A statement with an impossible value; a QIF or DMIS file that is not valid.
+/// A property with an impossible value; a QIF or DMIS file that is not valid.
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     if map_format(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
@@ -186,8 +186,8 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
 }
 
 impl Statements {
-    /// Stores the statement `value` of the property `key`, such as the cycle. Ignores any other key, because it is a
-    /// comment. `line` is the line number.
+    /// Stores `value`, the text that a result file gives for the property `key`, such as `cycle`. Does nothing if `key`
+    /// is not a known property, because the line is then a comment. `line` is the line number.
     ///
     /// # Errors
     /// A value that is impossible for this property.
@@ -240,11 +240,12 @@ impl Statements {
     }
 }
 
-/// Parses the `text` of a result file. `content` gives the properties that the cell states about its files. `path` only
-/// names the file in messages.
+/// Parses `text`, the content of a result file: the points in millimetres, and the properties of the measurement.
+/// `content` gives the properties that the configuration of the cell states for all its result files. `path` only names
+/// the file in messages.
 ///
 /// # Errors
-/// The same as for [`super::read_points`]; statements and columns that contradict `content` or each other.
+/// The same as for [`super::read_points`]; properties or columns of the file that contradict `content` or each other.
 pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
@@ -345,8 +346,9 @@ struct OtherColumns {
     probe_radius_mm: Option<f64>,
 }
 
-/// Returns the index in `names` of each column other than the coordinates: index, name, enabled, radius and diameter of
-/// the probe. `None` for a column that the header does not name.
+/// Returns the indices in `names` of the five columns other than the coordinates. Their order is: index, name, enabled,
+/// radius of the probe, diameter of the probe. An index is `None` if `names`, the names of the header, does not contain
+/// the column.
 fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
     let wanted: [&[&str]; 5] = [
         &["index", "target"],
@@ -359,7 +361,10 @@ fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
 }
 
 impl OtherColumns {
-    /// Reads the columns other than the coordinates from the `text` of a table. `points` is the number of its points.
+    /// Reads the columns other than the coordinates (such as index, name and probe radius) from `text`, the content of
+    /// a table. `points` is the number of points of the table. `decimal` is the decimal mark; if it is `None`, the mark
+    /// is detected. `table` gives the columns and units that the file does not state. All columns are missing in the
+    /// result if the header names none of them.
     ///
     /// # Errors
     /// An index that is not a whole number; more than one probe; a probe of an impossible size.
@@ -421,7 +426,8 @@ impl OtherColumns {
     }
 }
 
-/// Parses the size of a probe, in millimetres, with the decimal mark of the file, or else with a decimal point.
+/// Parses `text`, the radius or the diameter of a probe in millimetres. The number has the decimal mark in `layout`, or
+/// a decimal point.
 ///
 /// # Errors
 /// A text that is not a number above 0.
@@ -452,8 +458,8 @@ fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, FormatError
     })
 }
 
-/// Stores `field`, the text for the size of the probe in a row, if it is the first one. Rejects a text that differs
-/// from the first one.
+/// Checks that all rows of a table state the same size of the probe. `field` is the size as written in line number
+/// `line`. Stores `field` in `first` if `first` is `None`. Otherwise returns an error if `field` differs from `first`.
 fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), FormatError> {
     match first {
         Some(first) if first != field => {

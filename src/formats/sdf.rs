@@ -28,7 +28,7 @@ pub(super) const FORMAT: MapFormat = MapFormat {
     parse: |path, bytes| parse_sdf(path, bytes).map(Into::into),
 };
 
-/// Reads an SDF map of at most 1 GiB.
+/// Reads an SDF map of at most 1 GiB. Returns the heights on a grid, in millimetres.
 ///
 /// # Errors
 /// A file that is not readable, not SDF, malformed, compressed or cut; text in place of a number.
@@ -141,8 +141,8 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     header.map(path, raw.chunks_exact(size).map(|at| Ok(binary_value(kind, at))))
 }
 
-/// Parses a height as a number of steps; `at` holds its bytes, and `kind` is the data type of SDF, 0 to 7. Returns
-/// `None` if it was not measured.
+/// Parses a height from its bytes `at`. Returns it as a number of steps; the header gives the length of a step. `kind`
+/// is the data type of SDF, 0 to 7. Returns `None` if the value marks a sample that was not measured.
 fn binary_value(kind: u8, at: &[u8]) -> Option<f64> {
     let two = || at.first_chunk().copied().unwrap_or_default();
     let four = || at.first_chunk().copied().unwrap_or_default();

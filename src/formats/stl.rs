@@ -28,10 +28,10 @@ pub struct StlFile {
     pub degenerate: usize,
 }
 
-/// Reads an STL file of at most 1 GiB.
+/// Reads an STL file of at most 1 GiB. Returns its triangles with merged vertices, in millimetres.
 ///
-/// A file is binary if its length matches its facet count, whatever its first word is. Otherwise it is ascii if it
-/// begins with `solid` and its beginning is text.
+/// A file is binary if its length matches its facet count, even if it begins with `solid`. Otherwise it is ascii if it
+/// begins with `solid` and its first bytes are text.
 ///
 /// # Errors
 /// A file that is not readable, not STL, malformed or cut; no facet with an area; a vertex that is not finite or beyond
@@ -165,7 +165,7 @@ struct Words<'a> {
 }
 
 impl<'a> Words<'a> {
-    /// Returns the next word. `expected` names, in the message, what should be there.
+    /// Reads and returns the next word of the file. `expected` is the expected content, for the error message.
     ///
     /// # Errors
     /// The end of the file.
@@ -182,10 +182,10 @@ impl<'a> Words<'a> {
         Ok(&word[..end])
     }
 
-    /// Reads the next word, and returns its index in `wanted`. Capital and small letters are equal.
+    /// Reads the next word of the file, and returns its index in `wanted`. Upper and lower case are not distinguished.
     ///
     /// # Errors
-    /// A word that is not in `wanted`.
+    /// A word that is not in `wanted`; the end of the file.
     fn one_of(&mut self, wanted: [&str; 3]) -> Result<usize, FormatError> {
         let word = self.next(wanted[0])?;
         let found = wanted.iter().position(|w| word.eq_ignore_ascii_case(w.as_bytes()));
@@ -198,8 +198,9 @@ impl<'a> Words<'a> {
         if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
     }
 
-    /// Returns the error for `word`, which is not one of `wanted`. At the end of the file, the beginning of one of
-    /// these words means that the file is cut.
+    /// Returns the error for `word`, which is not one of the words in `wanted`. `expected` is the expected content, for
+    /// the message. If the file ends after `word`, and `word` is the beginning of a word in `wanted`, the error states
+    /// that the file is cut.
     fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
         let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));
@@ -215,7 +216,8 @@ impl<'a> Words<'a> {
         self.rest = &self.rest[end..];
     }
 
-    /// Reads the rest of a facet, after the word `facet`, and returns its corners.
+    /// Reads a facet from the word after `facet` to `endfacet`. Returns its three corners, in millimetres. The normal
+    /// is skipped. Returns an error if another word or an invalid coordinate is found.
     fn facet(&mut self) -> Result<[Point; 3], FormatError> {
         self.expect("normal")?;
         for _ in 0..3 {

@@ -63,8 +63,13 @@ impl Opened {
         if found > limit { Err(too_large(found)) } else { Ok(self.head) }
     }
 
-    /// Parses a file with the function `parse`. Calls it first with the first 64 KiB of a longer file. A fault found
-    /// there is returned at once, so that a gigabyte of invalid content costs neither time nor memory.
+    /// Parses a file with the function `parse`, and returns its result. If the file is longer than 64 KiB, `parse` is
+    /// called first with only the first 64 KiB. An error in this part is returned at once, so that a large file of
+    /// invalid content is not read. An error that states only that this part is cut is ignored. `path` only names the
+    /// file in messages.
+    ///
+    /// # Errors
+    /// The first error of `parse`; a file that cannot be read or is larger than 1 GiB.
     pub(super) fn parse<T>(
         self,
         path: &Path,

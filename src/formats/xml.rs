@@ -14,8 +14,9 @@ pub(super) struct Beyond {
     pub(super) found: String,
 }
 
-/// Returns the first limit for XML documents that `text` exceeds (attributes, namespaces or nested elements); `None` if
-/// it exceeds none. The text is scanned once and need not be valid XML.
+/// Checks the size limits for XML documents: the number of attributes of an element, the number of namespace
+/// declarations, and the depth of nested elements. Returns the first exceeded limit, with the line and the value found.
+/// Returns `None` if `text` exceeds no limit. `text` need not be valid XML.
 pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     let bytes = text.as_bytes();
     let (mut at, mut depth, mut namespaces) = (0, 0_usize, 0);

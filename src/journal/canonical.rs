@@ -66,8 +66,9 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Returns the hash of a record: the SHA-256 of [`DOMAIN`], the hash `prev_hash` of the record before, a line feed, and
-/// `text`, the text of this record without hashes. It has 64 lowercase hexadecimal digits.
+/// Returns the hash of a record as 64 lowercase hexadecimal digits. The hash is the SHA-256 of four texts in a row:
+/// [`DOMAIN`], `prev_hash`, a line feed, and `text`. `prev_hash` is the hash of the record before. `text` is the JSON
+/// text of this record without its hashes.
 pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     let mut digest = Sha256::new();
     for part in [DOMAIN, prev_hash, "\n", text] {

@@ -12,9 +12,11 @@ use super::verify::Anchor;
 use super::{ANCHOR, open, system};
 
 impl Record {
-    /// Parses a record from its hashed text ([`Record::text`]), and adds the given hashes: its own and that of the
-    /// record before it. Returns `None` if the text is not byte for byte a text that the journal writes. Does not check
-    /// that the hash matches the text: [`verify`](super::verify()) does.
+    /// Creates a record from `text`, the JSON text of all its fields except the hashes ([`Record::text`]). `prev_hash`
+    /// is the hash of the record before, and `hash` is the hash of this record. Returns `None` if `text` differs in any
+    /// byte from the text that the journal writes for this record.
+    ///
+    /// Does not check that `hash` matches `text`: [`verify`](super::verify()) does this.
     pub fn from_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
         let value: Value = serde_json::from_str(text).ok()?;
         let word = |key: &str| value[key].as_str().map(str::to_owned);
@@ -42,11 +44,12 @@ impl Record {
     }
 }
 
-/// Creates a run folder, and writes `records` and `anchor` into it as they are. [`verify`](super::verify()) checks
-/// whether they are authentic, and [`restore_file`] adds the recorded files.
+/// Creates a run folder with a journal of the given `records`. If there is an `anchor` (number of records and hash of
+/// the last one), also writes the anchor file. Records and anchor are written unchanged and unchecked:
+/// [`verify`](super::verify()) checks whether they are authentic. [`restore_file`] adds the other recorded files.
 ///
 /// # Errors
-/// The folder is not empty or cannot be written; the numbers of the records do not follow each other.
+/// The folder is not empty or cannot be written. The record numbers are not 1, 2, 3 and so on without a gap.
 pub fn restore(
     folder: &Path,
     records: impl IntoIterator<Item = Record>,
@@ -72,10 +75,12 @@ pub fn restore(
     }
 }
 
-/// Writes a recorded file with its `content` back into a run folder, under the name on record.
+/// Writes `content` to the file `name` in a run folder. `name` is the relative path of the file in the journal. An
+/// existing file is replaced. Does not compare `content` with the recorded hash.
 ///
 /// # Errors
-/// The name leads out of the folder or is a file of the journal itself, or the folder cannot be written.
+/// [`JournalError::Name`] if `name` leads out of the folder or is a file of the journal itself. The folder cannot be
+/// written.
 pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), JournalError> {
     write_file(&path_within(folder, name)?, content)
 }

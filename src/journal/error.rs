@@ -121,8 +121,9 @@ impl JournalError {
         matches!(self, Self::DiskFull { .. })
     }
 
-    /// Returns true if the same write can succeed later, because its cause can pass: the disk is full, busy or out of
-    /// reach, or a file of the journal is missing.
+    /// Returns true if a later attempt of the same write can succeed, because the cause of the error can be temporary.
+    /// Such causes are: the disk is full, a file cannot be written or read, the database reports an error, or a file of
+    /// the journal is missing.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. } | Self::Gone { .. })
     }

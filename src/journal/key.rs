@@ -35,8 +35,9 @@ impl PublicKey {
         (0..4).map(|k| &digits[4 * k..4 * k + 4]).collect::<Vec<_>>().join(" ")
     }
 
-    /// Returns true if `signature` is the signature of `message` by the owner of this key (Ed25519, RFC 8032). It must
-    /// have 128 lowercase hexadecimal digits; any other text gives false.
+    /// Returns true if `signature` is the Ed25519 signature (RFC 8032) of `message`, made with the secret key that
+    /// belongs to this public key. `signature` must have 128 lowercase hexadecimal digits. Returns false for any other
+    /// text.
     pub fn has_signed(&self, message: &[u8], signature: &str) -> bool {
         let Some(signature) = unhex::<64>(signature).map(Signature::new) else { return false };
         ed25519_compact::PublicKey::new(self.0).verify(message, &signature).is_ok()
@@ -112,9 +113,11 @@ impl AuditKey {
         PublicKey(*self.pair.pk)
     }
 
-    /// Returns the signature of a message (Ed25519) as 128 hexadecimal digits. The same message always gives the same
-    /// signature. The first line of `message` must state its purpose, so that a signature for one purpose is not valid
-    /// for another.
+    /// Returns the Ed25519 signature of `message` as 128 hexadecimal digits. The same message always gives the same
+    /// signature.
+    ///
+    /// The first line of `message` must state the purpose of the message. A signature for one purpose is then not valid
+    /// for another purpose.
     pub fn sign(&self, message: &[u8]) -> String {
         hex(self.pair.sk.sign(message, None).as_ref())
     }

@@ -69,8 +69,9 @@ pub const LOCK: &str = ".lock";
 /// record was added in between.
 pub type Stamp = [Option<(SystemTime, u64)>; 2];
 
-/// Returns the modification time and the length of the database of a run folder and of its log. They show whether a
-/// record was added since an earlier call. A file that does not exist gives `None`.
+/// Returns the modification time and the length in bytes of two files of a run folder: the database, and the
+/// write-ahead log of the database. If the result differs from that of an earlier call, a record was added in between.
+/// The item of a file that does not exist is `None`.
 pub fn stamp(folder: &Path) -> Stamp {
     [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
         let metadata = std::fs::metadata(folder.join(name)).ok()?;
@@ -119,8 +120,8 @@ impl Reader {
         }
     }
 
-    /// Returns the lowest record number below 1; `None` if there is none. Such a number shows that the journal was
-    /// changed.
+    /// Returns the lowest record number that is less than 1, or `None` if no record has such a number. The journal
+    /// numbers its records from 1, so a lower number proves that somebody changed the database.
     fn number_before_the_first(&self) -> Result<Option<i64>, JournalError> {
         let least = self.connection.query_row("SELECT min(seq) FROM record WHERE seq < 1", [], |row| row.get(0));
         least.map_err(JournalError::database(&self.folder))

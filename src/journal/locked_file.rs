@@ -14,10 +14,11 @@ const TRIES: usize = 20;
 const BETWEEN_TRIES: Duration = Duration::from_millis(5);
 
 impl LockedFile {
-    /// Locks a file until the value is dropped. If another process holds the lock, tries again for about 0.1 s.
+    /// Locks `file` for this process. The lock lasts until the returned value is dropped. If another process holds the
+    /// lock, tries again for about 0.1 s.
     ///
     /// # Errors
-    /// Another process holds the lock, or the file cannot be locked.
+    /// Another process still holds the lock, or the file cannot be locked.
     pub fn lock(file: File) -> Result<Self, TryLockError> {
         Self::lock_with_wait(file, || thread::sleep(BETWEEN_TRIES))
     }

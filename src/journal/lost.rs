@@ -21,12 +21,13 @@ const PAGES: std::ops::RangeInclusive<usize> = 512..=65_536;
 /// Maximum number of bytes of the log that are examined.
 const MAX_LOG_BYTES: u64 = 256 << 20;
 
-/// Returns the reason why acknowledged records of an unfinished run can be lost; `None` if there is no sign of a loss.
-/// A record is acknowledged if the program had seen that it was on the disk. Call this only while no process drives the
-/// run.
+/// Checks whether acknowledged records of an unfinished run can be lost. A record is acknowledged if the program has
+/// seen that the record was on the disk. Returns the reason as a text: the anchor file is missing, or the write-ahead
+/// log of the database is missing, empty or damaged. Returns `None` if there is no sign of a loss. Call this function
+/// only while no process drives the run.
 ///
 /// # Errors
-/// A file cannot be read, or the anchor is invalid.
+/// A file cannot be read, or the anchor (number of records and hash of the last one) is invalid.
 pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     if read_anchor(folder)?.is_none() {
         return Ok(Some(format!("{ANCHOR} is missing; every run writes it at its begin")));
@@ -44,16 +45,20 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }
 
-/// Returns the highest number of a cycle for which a run folder has an entry `cycle-N`; 0 if there is none.
+/// Returns the highest cycle number N for which the run folder contains a file or folder named `cycle-N`. Returns 0 if
+/// there is none, or if the folder cannot be read.
 pub fn newest_cycle(folder: &Path) -> u32 {
     let names = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
     let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix("cycle-")?.parse().ok();
     names.filter_map(number).max().unwrap_or(0)
 }
 
-/// Returns a message if the write-ahead log has an invalid part with committed changes after it: these changes are
-/// lost. Returns `None` if all frames are valid, or if only the end is invalid, as after a power failure. The end is
-/// harmless because a transaction is on the disk before the first frame of the next transaction is written.
+/// Checks `log`, the content of a write-ahead log of SQLite. Returns a message if the header of the log is invalid, or
+/// if changes that were already on the disk follow an invalid frame: SQLite cannot read these changes any more. Returns
+/// `None` if all frames are valid, or if only the end of the log is invalid, as after a power failure.
+///
+/// An invalid end is harmless, because SQLite flushes each transaction to the disk before it writes the first frame of
+/// the next transaction.
 fn damage(log: &[u8]) -> Option<String> {
     if log.len() <= LOG_HEADER {
         return None;

@@ -51,19 +51,19 @@ const PROCESS: &str = ", process ";
 type Opens = fn(&LockFolder, &str) -> Result<LockFile, String>;
 
 impl MachineLock {
-    /// Locks a machine for the run in the folder `run`, until the value is dropped. `address` identifies the machine,
-    /// and must be the same text in every run.
+    /// Locks a machine for the run in the folder `run`. The lock lasts until the returned value is dropped. `address`
+    /// identifies the machine. Every run must use the same text for the same machine.
     ///
     /// # Errors
-    /// Another run has the machine (the error names it), or no folder for locks can be used.
+    /// Another run uses the machine (the error names that run), or no folder for lock files can be used.
     pub fn acquire(address: &str, run: &Path) -> Result<Self, JournalError> {
         // If there is no place that all users share, the user's own place is better than no lock.
         Self::acquire_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
-    /// Returns a new epoch (a number that identifies a session of a client) for `machines`, and stores it in their lock
-    /// files. It is higher than every epoch that a client of this computer used for any of them, and at least `clock`,
-    /// the time in seconds.
+    /// Returns a new epoch for `machines`, and stores the epoch in the lock files of the machines. An epoch is a number
+    /// that identifies a session of a client with a machine. The new epoch is higher than every epoch that these files
+    /// contained when the machines were locked, and at least `clock`, the current time in seconds.
     pub fn epoch<'a>(machines: impl IntoIterator<Item = &'a Self> + Clone, clock: u32) -> u32 {
         let last = machines.clone().into_iter().map(|machine| machine.last_epoch).max().unwrap_or(0);
         let epoch = clock.max(last.saturating_add(1));
@@ -71,15 +71,15 @@ impl MachineLock {
         epoch
     }
 
-    /// Returns the path of the control socket next to the lock file. Through it, the cell that has this machine can be
-    /// reached even if its run folder is gone.
+    /// Returns the path of the control socket, which is next to the lock file of this user. The socket gives access to
+    /// the cell that has locked this machine, even if the run folder was deleted.
     pub fn control_socket(&self) -> &Path {
         &self.control_socket
     }
 
-    /// Returns the cells of this user that have locked machines on this computer. Each entry is the folder of the run,
-    /// and the path of the control socket next to the lock file. A cell that was killed can still be in the list;
-    /// nobody answers at its socket.
+    /// Lists the cells of this user that have locked machines on this computer. Each item has the path of the run
+    /// folder and the path of the control socket. The list can contain a cell whose process was killed; then no process
+    /// answers at the socket. The list is empty on Windows.
     pub fn control_sockets() -> Vec<(PathBuf, PathBuf)> {
         system::place_of_locks(FOLDER).map_or_else(Vec::new, |place| Self::doors_in(&place.join(FOLDER)))
     }
@@ -98,8 +98,8 @@ impl MachineLock {
         doors.filter_map(|door| Some((run_of(&door)?, door))).collect()
     }
 
-    /// Returns notes about unexpected files in the place of the lock files, such as links or files of other users.
-    /// These files are ignored.
+    /// Returns warnings about the lock files of this machine, one text per warning. Examples are a link or a file of
+    /// another user at the path of a lock file, or an impossible content. The lock ignores such files and contents.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -143,12 +143,13 @@ impl MachineLock {
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
-    /// Opens the lock file `name` in the folder `path` with `open`, locks it, and reads the last epoch from it.
-    /// `address` identifies the machine in messages. The inner `Err` is the reason why something in the place of the
-    /// file cannot be used as a lock.
+    /// Opens the lock file `name` in `folder` with the function `open`, locks it, and reads the last epoch (session
+    /// number) from it. `path` is the path of `folder`, and `address` identifies the machine; both are used for
+    /// messages. On success `self` keeps the lock. The inner `Err` is the reason why the entry `name` cannot be used as
+    /// a lock file.
     ///
     /// # Errors
-    /// Another process holds the lock; the file cannot be locked.
+    /// Another process holds the lock, or the file cannot be locked.
     fn lock_file(
         &mut self,
         folder: &LockFolder,
@@ -189,8 +190,8 @@ impl MachineLock {
         Ok(Err("it is removed repeatedly".to_owned()))
     }
 
-    /// Reads the last epoch from `kept`, the text of the lock file at `path`. An impossible value is ignored and
-    /// reported in a note.
+    /// Reads the epoch (session number) from `kept`, the content of the lock file at `path`. Raises the last epoch of
+    /// this lock if the epoch read is higher. Ignores a value that is not a number or is too large, and adds a warning.
     fn read_epoch(&mut self, kept: &str, path: &Path) {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
@@ -204,8 +205,9 @@ impl MachineLock {
         self.notes.push(format!("{}: {what}; it was ignored", path.display()));
     }
 
-    /// Writes the holder and the epoch into the lock files. Write errors are ignored: the holder is information for
-    /// people, the machine itself also reports its last epoch, and the lock is valid without them.
+    /// Writes the holder (run folder and process number) and `epoch` (the session number) into the lock files. Ignores
+    /// write errors, because the lock is valid without this content. The holder is only information for people, and the
+    /// machine also reports its last epoch.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
         for mut file in &self.holder_files {
@@ -218,7 +220,8 @@ impl MachineLock {
     }
 }
 
-/// Returns a second handle of an open file, which is then used for its lock. `path` only names the file in messages.
+/// Duplicates the handle of an open file. The duplicate is used to lock the file. `path` is the name of the file in
+/// error messages.
 fn again(file: &File, path: &Path) -> Result<File, JournalError> {
     file.try_clone().map_err(JournalError::file(path, "opening it"))
 }

@@ -44,7 +44,7 @@ CREATE TRIGGER record_follows_the_last BEFORE INSERT ON record
     BEGIN SELECT RAISE(ABORT, 'records follow the last'); END;
 ";
 
-/// Creates the database of a new run in its folder.
+/// Creates the database of a new journal in `folder`, and opens it for writing.
 pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     let failed = JournalError::database(&path);
@@ -62,7 +62,7 @@ pub(super) fn keep_the_log(connection: &Connection, keeps: bool) -> rusqlite::Re
     connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, keeps).map(drop)
 }
 
-/// Opens the database of a run for writing, and writes its log into it.
+/// Opens the database of a run for writing. Then writes the content of the write-ahead log into the database file.
 ///
 /// # Errors
 /// The folder has no journal; the file is not a journal, or was written by a later version; a setting cannot be
@@ -84,19 +84,21 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     Ok(connection)
 }
 
-/// Writes the whole write-ahead log into the database (checkpoint), so that the log begins anew. Does nothing while
-/// another process reads.
+/// Writes the whole write-ahead log into the database file (a checkpoint). The next record is then written at the
+/// beginning of the log. Does nothing while another process reads the database.
 ///
-/// This is needed because, after a failed flush, the operating system can drop a part of the log that is not yet on the
-/// disk, and still show it to readers. Records written after that part cannot be read after a power failure.
+/// The checkpoint protects against an earlier failed flush. After such a failure, the operating system can discard a
+/// part of the log that is not yet on the disk, and still show that part to readers. A power failure would then make
+/// all later records in the log unreadable.
 fn checkpoint_log(connection: &Connection) -> rusqlite::Result<()> {
     // RESTART keeps the length of the log file. A missing or empty log of an interrupted run therefore shows that
     // somebody removed it.
     run(connection, "PRAGMA wal_checkpoint(RESTART)")
 }
 
-/// Returns an error if the database has anything but the tables, indices and triggers of a journal. A view in the place
-/// of a table could return any content, without end.
+/// Returns an error if the database contains a table, view, index or trigger that a journal does not have, or if the
+/// table of records is missing. This protects the reader: a view with the name of the table could return any rows, even
+/// without end.
 fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     let failed = JournalError::database(path);
     let mut statement = connection.prepare("SELECT type, name, sql FROM sqlite_schema").map_err(&failed)?;
@@ -116,8 +118,8 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
     if has_table { Ok(()) } else { Err(foreign("it has no table of records")) }
 }
 
-/// Returns the SQL statements of the schema of a journal, with single blanks between words, for comparison with those
-/// in a database.
+/// Returns the SQL statements that create the tables, indices and triggers of a journal. Each run of white space is
+/// replaced by one blank, so that the statements can be compared with those of a database.
 fn statements() -> impl Iterator<Item = String> {
     // The statement of a trigger contains a semicolon, so the schema is not split at semicolons.
     SCHEMA
@@ -187,8 +189,11 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Checks the header of the database at `path` before SQLite opens it, and returns its layout version. A process that
-/// writes this journal must not call it: when a process closes a file, it releases all locks that it has on that file.
+/// Checks the header of the database file at `path` before SQLite opens the file. Returns the version of the table
+/// layout. `folder` is the run folder.
+///
+/// The process that writes this journal must not call this function. The function opens and closes the file, and a
+/// process that closes a file releases all its locks on that file.
 ///
 /// # Errors
 /// The file does not exist; it is not a journal; it was written by a later version.
@@ -246,8 +251,8 @@ fn set(connection: &Connection, path: &Path, setting: &'static str, wanted: &'st
     if found == wanted { Ok(()) } else { Err(JournalError::Setting { path: path.to_owned(), setting, wanted, found }) }
 }
 
-/// Runs an SQL statement to its end and ignores its rows. Reading all rows is necessary: a setting that is stored in
-/// the file returns its value first, and can fail after that.
+/// Executes an SQL statement, and reads and discards all result rows. Reading to the end is necessary, because a
+/// `PRAGMA` statement can return a row first and fail afterwards.
 fn run(connection: &Connection, sql: &str) -> rusqlite::Result<()> {
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;
@@ -278,8 +283,9 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     }
 }
 
-/// Returns true if every user of this computer can read or enter a run folder. This is a risk, because a reader can
-/// block the writing of the record.
+/// Returns true if every user of this computer can read or enter the run folder. This is a risk: a process that reads
+/// the database can block the process that writes records. Returns false if the folder does not exist, and always on
+/// Windows.
 pub fn is_open_to_all(folder: &Path) -> bool {
     system::is_open_to_all(folder)
 }

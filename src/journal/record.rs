@@ -52,7 +52,7 @@ impl RecordKind {
         Self::End,
     ];
 
-    /// Returns the word for this kind in the database, such as `begin`.
+    /// Returns the name of this record kind as the database stores it, such as `begin`.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Begin => "begin",
@@ -98,8 +98,9 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Creates an entry of the cell itself, with the actor `cell` and the station `regrind`. `mono_ns` is the time
-    /// since the run began.
+    /// Creates an entry (content of a record to be written) with the actor `cell`, the station `regrind`, no command
+    /// number and an empty reason. `mono_ns` is the time since the run began, in nanoseconds. `cycle` is the number of
+    /// the cycle, 0 before the first. `payload` is the content of the record.
     pub fn new(kind: RecordKind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
         let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
         Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
@@ -141,7 +142,8 @@ pub struct Record {
 }
 
 impl Record {
-    /// Returns true if this record was made from `entry`: kind, cycle, actor, station, time and payload are equal.
+    /// Returns true if this record has the same kind, cycle, actor, station, time and payload (content) as `entry`.
+    /// Does not compare the reason and the command number.
     pub(super) fn is_of(&self, entry: &Entry) -> bool {
         (self.kind, self.cycle, &self.actor, &self.station) == (entry.kind, entry.cycle, &entry.actor, &entry.station)
             && self.mono_ns == entry.mono_ns.min(i64::MAX as u64)
@@ -245,8 +247,10 @@ impl Record {
         fields.map(csv_field).join(",")
     }
 
-    /// Returns the fault of this record, if it should follow `records` records of which the last has the hash `head`: a
-    /// wrong number, or a wrong hash. Returns `None` if it has no fault.
+    /// Checks whether this record can follow the first `records` records of a journal. `head` is the hash of the last
+    /// of these records. Returns a description of the fault: the record number is not `records` + 1, the hash of the
+    /// record before is not `head`, or the hash of this record does not match its content. Returns `None` if there is
+    /// no fault.
     pub(super) fn successor_flaw(&self, records: u64, head: &str) -> Option<String> {
         let due = records + 1;
         if self.seq != due {
@@ -334,7 +338,8 @@ impl<'j> Records<'j> {
         Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from.max(1), size: 1, over: false }
     }
 
-    /// Reads the next page of records. An error ends the iteration, after the records that were read before it.
+    /// Reads the next group of records (at most 512) from the database into the buffer. If an error occurs, the
+    /// iterator returns the records read before the error, then the error, and then ends.
     fn turn(&mut self) {
         if let Err(error) = self.read() {
             self.page.push_back(Err(error));
@@ -379,8 +384,8 @@ impl Iterator for Records<'_> {
     }
 }
 
-/// Converts a number to the signed integer of the database; a larger one becomes the largest possible. Its range covers
-/// 292 years in nanoseconds.
+/// Converts `number` to a signed 64-bit integer, because the database has no unsigned integers. A number above the
+/// largest signed integer is replaced by that integer. As nanoseconds, the largest integer is 292 years.
 pub(super) fn signed(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }

@@ -32,15 +32,17 @@ impl Seal {
     }
 }
 
-/// Returns the message that a seal signs: the name of the run, the number of records and the hash `head` of the last
-/// one. The name makes a seal invalid in another run.
+/// Returns the message whose signature is a seal (the signed record that protects all records before it). The message
+/// contains the name of the run, the number of records, and `head`, the hash of the last record. Because the message
+/// contains the name of the run, a seal is not valid in another run.
 fn message(run: &str, records: u64, head: &str) -> Vec<u8> {
     let text = canonical_json(&json!({ "head": head, "records": records, "run": run }));
     [DOMAIN, &text].concat().into_bytes()
 }
 
-/// Returns true if `signature` is the signature of a seal by `key`: for the run named `run`, the number of records and
-/// the hash `head` of the last one.
+/// Returns true if `signature` is a valid seal (signature of the journal at one record), made with `key`. The seal must
+/// be for the run named `run`, for the number of records `records`, and for `head`, the hash of the last of these
+/// records.
 pub(super) fn is_signed(key: &PublicKey, run: &str, records: u64, head: &str, signature: &str) -> bool {
     key.has_signed(&message(run, records, head), signature)
 }

@@ -35,12 +35,15 @@ pub struct Anchor {
 }
 
 impl Anchor {
-    /// Creates an anchor without a signature. `head` is the hash of the last of `records` records.
+    /// Creates an anchor (length and last hash of a journal at some time) without a signature. `records` is the number
+    /// of records. `head` is the hash of the last of these records.
     pub fn new(records: u64, head: String) -> Self {
         Self { records, head, run: None, key: None, signature: None }
     }
 
-    /// Creates an anchor with the content and the signature of a seal of the run named `run`.
+    /// Creates a signed anchor (length and last hash of a journal at some time) from `seal`, a signature record of the
+    /// journal. `run` is the name of the run. The anchor gets the number of records, the hash, the public key and the
+    /// signature of the seal.
     pub(super) fn sealed(run: &str, seal: &Seal) -> Self {
         Self {
             records: seal.records,
@@ -89,28 +92,31 @@ pub struct Verified {
 }
 
 impl Verified {
-    /// Returns true if the run names a key and has its end record, but no seal follows the end. Somebody without the
-    /// key could then have written the end. While a process drives the run, the seal can still follow.
+    /// Returns true if the end of a signed run is not signed: the run names a key and has its end record, but no seal
+    /// (signature record) follows the end record. Somebody without the key could then have written the end record.
+    /// While a process drives the run, this process can still add the seal.
     pub fn lacks_last_seal(&self) -> bool {
         !self.keys.is_empty() && self.closed && self.signed + 1 != self.records
     }
 }
 
-/// Verifies the journal of a run folder: the hash chain, the signatures, the recorded files, and the anchor in the
-/// folder. Returns a summary of an intact journal.
+/// Verifies the journal of a run folder: the hash chain of the records, the signatures, and the content of the recorded
+/// files. Also compares the journal with the anchor file in the folder, which states the number of records and the hash
+/// of the last one. Returns a summary if the journal is intact.
 ///
 /// # Errors
-/// [`JournalError::Broken`] with the first record that fails; the journal cannot be read.
+/// [`JournalError::Broken`] with the number of the first record that fails. The journal cannot be read.
 pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
     verify_against(folder, &ExternalEvidence::default())
 }
 
-/// Verifies a journal as [`verify`] does, and also against `against`: an anchor that was kept elsewhere, and trusted
-/// keys.
+/// Verifies the journal of a run folder as [`verify`] does, and also compares the journal with the external evidence
+/// `against`. This evidence is an anchor (number of records and hash of the last one) that was kept elsewhere, and the
+/// keys that are trusted to sign. If no keys are given, the author is not checked.
 ///
 /// # Errors
-/// Those of [`verify`]; [`JournalError::NoAuthor`] if the journal is intact, but not signed with one of the trusted
-/// keys.
+/// Those of [`verify`]. [`JournalError::NoAuthor`] if the journal is intact, but the run was begun or resumed without
+/// one of the trusted keys.
 pub fn verify_against(folder: impl AsRef<Path>, against: &ExternalEvidence) -> Result<Verified, JournalError> {
     let folder = folder.as_ref();
     let beside = read_anchor(folder)?;
@@ -118,7 +124,8 @@ pub fn verify_against(folder: impl AsRef<Path>, against: &ExternalEvidence) -> R
     examine(folder, &anchors, &against.keys)
 }
 
-/// Returns the anchor in a run folder, or `None` if there is none.
+/// Reads the anchor file of a run folder. The anchor states the number of records and the hash of the last one. Returns
+/// `None` if the file does not exist.
 ///
 /// # Errors
 /// The file cannot be read, or it is not a valid anchor.
@@ -126,7 +133,8 @@ pub fn anchor_of(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     read_anchor(folder)
 }
 
-/// Returns the anchor in a run folder; `None` if there is none.
+/// Reads the anchor file of a run folder. The anchor states the number of records and the hash of the last one. Returns
+/// `None` if the file does not exist.
 ///
 /// # Errors
 /// The file cannot be read, or it is not a valid anchor.
@@ -144,10 +152,11 @@ pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError>
 /// Maximum length of an anchor file, in bytes.
 const MAX_ANCHOR_BYTES: u64 = 4096;
 
-/// Returns the first [`MAX_ANCHOR_BYTES`] bytes of a file, or all bytes of a shorter one.
+/// Reads at most the first [`MAX_ANCHOR_BYTES`] bytes of the file `path`.
 ///
 /// # Errors
-/// A path that is not a regular file, because it could have no end; a file that cannot be read.
+/// `path` is not a regular file: other kinds, such as devices, could deliver bytes without end. The file cannot be
+/// read.
 fn read_few(path: &Path) -> io::Result<Vec<u8>> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"));
@@ -229,8 +238,8 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     })
 }
 
-/// Returns true if a process drives the run in a folder: it holds the lock of the folder from the start of the run to
-/// its end.
+/// Returns true if a process drives the run in a folder. Such a process holds the lock file of the folder as long as it
+/// drives the run. Returns false if there is no lock file, or if the lock file cannot be opened.
 pub fn is_driven(folder: &Path) -> bool {
     let path = folder.join(LOCK);
     if !fs::metadata(&path).is_ok_and(|found| found.is_file()) {
@@ -250,8 +259,12 @@ fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>,
     Ok(names)
 }
 
-/// Adds to `found` the files in the subfolder `below` of a run folder and in all its subfolders, as paths relative to
-/// the run folder. The journal's own files, and everything that is not a regular file, are omitted.
+/// Adds the files of the subfolder `below` and of all its subfolders to `found`, as paths relative to `folder`, the run
+/// folder. `below` is empty for the run folder itself, otherwise a relative path that ends with `/`. Omits the
+/// journal's own files, and everything that is not a regular file.
+///
+/// # Errors
+/// A folder cannot be read.
 fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<(), JournalError> {
     let at = folder.join(below);
     for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "inspecting it"))? {
@@ -266,8 +279,8 @@ fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
-/// Returns true if `name` is one of the journal's own files in a run folder, or a temporary file that a crash left of
-/// one.
+/// Returns true if `name` is a file that the journal itself writes into the run folder: the database with its
+/// additional files, the anchor, the lock file, or the temporary file of the anchor, which a crash can leave.
 fn is_own(name: &str) -> bool {
     name.starts_with(DATABASE) || [ANCHOR, LOCK, &temporary_name(ANCHOR)].contains(&name)
 }
@@ -369,10 +382,12 @@ impl<'a> VerifierState<'a> {
         Ok(())
     }
 
-    /// Compares an anchor with the records read so far, whose number is that of the anchor.
+    /// Compares `anchor` (number of records and hash of the last one) with the records read so far. Call this function
+    /// when the number of records read is that of the anchor.
     ///
     /// # Errors
-    /// Another run, another hash of the last record, or a missing or wrong signature.
+    /// The anchor belongs to another run, its hash differs from that of the last record read, or its signature is
+    /// missing or wrong. The signature is checked only if the run names a key.
     fn check_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, self.records, what));
         if anchor.run.as_ref().is_some_and(|run| *run != self.run) {

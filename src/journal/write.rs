@@ -82,8 +82,8 @@ impl Tail {
 }
 
 impl Journal {
-    /// Creates the folder of a new run, with its parents, and its journal with the first record, made from `header`.
-    /// Nothing is signed.
+    /// Creates the folder of a new run and its missing parents. Then creates the journal in the folder, with a first
+    /// record from `header`. The journal is not signed.
     ///
     /// # Errors
     /// The folder is not empty or cannot be written, or the disk is full.
@@ -91,8 +91,8 @@ impl Journal {
         Self::create_with(folder, header, None)
     }
 
-    /// Creates a run as [`Journal::create`] does. With a `key`, the journal is signed: now, every [`SEALED_EVERY`]
-    /// records, and at the end.
+    /// Creates the folder and the journal of a new run as [`Journal::create`] does. With a `key`, the journal is signed
+    /// at its beginning, after every [`SEALED_EVERY`] records, and at its end. Without a `key`, nothing is signed.
     ///
     /// # Errors
     /// Those of [`Journal::create`].
@@ -132,17 +132,20 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Opens the journal of a run to continue it, and records this. Checks the hash chain from the anchor on, or all of
-    /// it if there is no anchor; [`super::verify()`] always checks all of it. Nothing is signed from here on.
+    /// Opens the journal of a run to continue the run, and adds a record of the opening. Before that, checks the hash
+    /// chain from the record that the anchor file names to the last record. Without an anchor file, checks the whole
+    /// chain; [`super::verify()`] always checks the whole chain. New records are not signed.
     ///
     /// # Errors
-    /// The folder has no journal; the journal is in use, closed, broken, or of another program.
+    /// The folder has no journal. The journal is in use by another process, ended, damaged or changed, or the database
+    /// belongs to another program.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         Self::open_with(folder, None)
     }
 
-    /// Opens a journal as [`Journal::open`] does. With a `key`, the journal is signed from here on. It can be another
-    /// key than that at the beginning: the record of the opening names it.
+    /// Opens the journal of a run to continue the run, as [`Journal::open`] does. With a `key`, the new records are
+    /// signed. The key can differ from the key at the beginning of the run, because the record of the opening names the
+    /// new key.
     ///
     /// # Errors
     /// Those of [`Journal::open`].
@@ -150,10 +153,11 @@ impl Journal {
         Self::open_locked(RunLock::acquire(folder)?, key)
     }
 
-    /// Opens a journal as [`Journal::open_with`] does, for a caller that already holds the lock of the run.
+    /// Opens the journal of a run to continue the run, as [`Journal::open_with`] does. The caller has already acquired
+    /// `lock`, the lock of the run.
     ///
     /// # Errors
-    /// Those of [`Journal::open_with`], except those of the lock.
+    /// Those of [`Journal::open_with`], except that the journal is in use.
     pub fn open_locked(lock: RunLock, key: Option<AuditKey>) -> Result<Self, JournalError> {
         let RunLock { file: lock, folder } = lock;
         let connection = open::read_write(&folder)?;
@@ -192,11 +196,12 @@ impl Journal {
         &self.part
     }
 
-    /// Checks that the files of the journal are still at the paths where they were opened. A file that was deleted
-    /// still accepts every write, but the written content is lost.
+    /// Checks that the database, its log and the lock file are still the same files as at the first call. The first
+    /// call only remembers the files. This check is necessary because a deleted file that is still open accepts every
+    /// write, but the written content is lost.
     ///
     /// # Errors
-    /// [`JournalError::Gone`] with the path of a file that is missing or was replaced.
+    /// [`JournalError::Gone`] with the path of a file that is missing or was replaced. A file cannot be inspected.
     pub fn is_in_place(&mut self) -> Result<(), JournalError> {
         for name in [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()] {
             let path = self.folder.join(name);
@@ -225,11 +230,12 @@ impl Journal {
     }
 
     /// Appends a record and returns its number. On return the record is on the disk. Idempotent: after an error the
-    /// same entry can be given again, and it is written once, whether or not the first attempt succeeded.
+    /// caller can give the same entry again, and the record is written only once.
     ///
     /// # Errors
-    /// The disk is full or not writable: then no action that needs this record may be performed. The journal is closed,
-    /// or the entry is not allowed.
+    /// The disk is full or not writable: then no action that needs this record may be performed. A file of the journal
+    /// was removed. The run has ended. The entry is not allowed: a seal, a second begin record, an outcome without a
+    /// command number, or an intent (use [`Journal::intend`]).
     pub fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
         let wrong = |what| Err(JournalError::Entry { kind: entry.kind.as_str(), what });
         match (entry.kind, entry.command_id) {
@@ -241,11 +247,12 @@ impl Journal {
         }
     }
 
-    /// Records a command before it is executed, and returns its new command number. Idempotent: after an error the same
-    /// entry can be given again, and gets only one number.
+    /// Records a command before the command is executed. Returns the new number of the command. The record always has
+    /// the kind `intent`, whatever the kind of `entry` is. Idempotent: after an error the caller can give the same
+    /// entry again, and the command gets only one number.
     ///
     /// # Errors
-    /// Those of [`Journal::append`]: then the command must not be executed.
+    /// Those of [`Journal::append`], or all command numbers are used. The command must then not be executed.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
         let entry = Entry { kind: RecordKind::Intent, ..entry };
         let stands = self.reread_tail()?.filter(|record| record.is_of(&entry));
@@ -260,8 +267,8 @@ impl Journal {
         Ok(id)
     }
 
-    /// Returns the recorded commands that have no recorded outcome, in order. After a crash it must be found out what
-    /// became of each of them, before any other action.
+    /// Returns the records of all commands without a recorded outcome, in the order of their command numbers. After a
+    /// crash, the result of each of these commands must be determined before any other action.
     ///
     /// # Errors
     /// The journal cannot be read.
@@ -269,12 +276,13 @@ impl Journal {
         open_intents(&self.connection, &self.folder)
     }
 
-    /// Writes `bytes` to the file `name` in the run folder, and then records the file. `mono_ns` is the time since the
-    /// run began. Idempotent: the same content again is no error and adds no second record.
+    /// Writes `bytes` to the file `name` in the run folder, and then adds a record with the name, length and hash of
+    /// the file. `mono_ns` is the time since the run began, in nanoseconds. `cycle` is the number of the cycle, 0
+    /// before the first. Idempotent: a second call with the same content is not an error and adds no second record.
     ///
     /// # Errors
-    /// The name is not a plain relative path, the name is on record with another content, or the disk is full or not
-    /// writable.
+    /// The name is not a plain relative path. A file with this name and another content is already recorded. The disk
+    /// is full or not writable.
     pub fn store(&mut self, name: &str, bytes: &[u8], mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         let path = artefact::path_within(&self.folder, name)?;
         let sha256 = super::sha256_hex(bytes);
@@ -285,17 +293,19 @@ impl Journal {
         self.register(Artefact { name: name.to_owned(), bytes: bytes.len() as u64, sha256 }, mono_ns, cycle)
     }
 
-    /// Flushes the file `name`, which another part of the program wrote into the run folder, to the disk, and then
-    /// records it. `mono_ns` is the time since the run began.
+    /// Adds a record of the file `name`, which another part of the program wrote into the run folder. The record has
+    /// the name, length and hash of the file. Before that, flushes the file to the disk. `mono_ns` is the time since
+    /// the run began, in nanoseconds. `cycle` is the number of the cycle, 0 before the first.
     ///
     /// # Errors
-    /// Those of [`Journal::store`].
+    /// Those of [`Journal::store`]. The file cannot be read.
     pub fn adopt(&mut self, name: &str, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         self.adopt_known(Artefact::from_file(&self.folder, name)?, mono_ns, cycle)
     }
 
-    /// Records `found`, a file that [`Artefact::from_file`] has already flushed to the disk and read. `mono_ns` is the
-    /// time since the run began.
+    /// Adds a record of the file that `found` describes (name, length and hash). The caller got `found` from
+    /// [`Artefact::from_file`], which has already flushed the file to the disk. Does not read the file again. `mono_ns`
+    /// is the time since the run began, in nanoseconds. `cycle` is the number of the cycle, 0 before the first.
     ///
     /// # Errors
     /// Those of [`Journal::store`].
@@ -307,8 +317,9 @@ impl Journal {
         self.register(found, mono_ns, cycle)
     }
 
-    /// Signs the journal if it has a key, and writes the anchor file: the number of records, the hash of the last one,
-    /// and the signature. Returns the anchor, so that a copy can be kept elsewhere.
+    /// Writes the anchor file: the number of records, the hash of the last of these records, and, if the journal has a
+    /// key, the signature of both. With a key, first adds a signature record if records were added since the last one.
+    /// Returns the anchor, so that the caller can store a copy elsewhere.
     ///
     /// # Errors
     /// The disk is full or not writable.
@@ -318,8 +329,10 @@ impl Journal {
         self.write_anchor()
     }
 
-    /// Writes the end record of the run with the content `ending`, signs it if there is a key, and writes the anchor.
-    /// Returns the anchor. No other record can follow. `mono_ns` is the time since the run began.
+    /// Ends the run: writes the end record with the content `ending`, signs the journal if it has a key, and writes the
+    /// anchor file. Returns the anchor (number of records, hash of the last one, and signature). No further record can
+    /// be appended. `mono_ns` is the time since the run began, in nanoseconds. `cycle` is the number of the cycle, 0
+    /// before the first.
     ///
     /// # Errors
     /// Those of [`Journal::append`].
@@ -327,8 +340,9 @@ impl Journal {
         self.end(mono_ns, cycle, ending)
     }
 
-    /// Ends the run as [`Journal::close`] does, but leaves the journal to the caller, who can call it again after an
-    /// error.
+    /// Ends the run as [`Journal::close`] does, but does not consume the journal. After an error the caller can
+    /// therefore call this function again; the end record is written only once. Returns the anchor (number of records,
+    /// hash of the last one, and signature).
     ///
     /// # Errors
     /// Those of [`Journal::append`].
@@ -353,7 +367,8 @@ impl Journal {
         Ok(artefact)
     }
 
-    /// Adds a seal (a signature of the last record), unless there is no key or no record since the last seal.
+    /// Adds a seal: a record with the signature of the number of records and the hash of the last record. Does nothing
+    /// if the journal has no key, or if no record was added since the last seal.
     fn seal(&mut self) -> Result<(), JournalError> {
         let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
         let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
@@ -362,13 +377,15 @@ impl Journal {
         Ok(())
     }
 
-    /// Returns the record number of the newest seal since the journal was opened; 0 if there is none.
+    /// Returns the record number of the newest seal (signature record) that was written since the journal was opened.
+    /// Returns 0 if there is none.
     fn sealed(&self) -> u64 {
         self.seal.as_ref().map_or(0, |seal| seal.records + 1)
     }
 
-    /// Writes the anchor file and returns the anchor: that of the newest seal, or that of the last record if nothing is
-    /// signed.
+    /// Writes the anchor file (number of records and hash of the last one), and returns the anchor. The anchor is that
+    /// of the newest seal (signature record) since the journal was opened. If there is no seal, the anchor is that of
+    /// the last record, without a signature.
     fn write_anchor(&mut self) -> Result<Anchor, JournalError> {
         let anchor = match &self.seal {
             Some(seal) => Anchor::sealed(&self.run, seal),
@@ -381,9 +398,12 @@ impl Journal {
         Ok(anchor)
     }
 
-    /// Signs the journal and writes the anchor, if [`SEALED_EVERY`] records were added since the last time. A failure
-    /// does not affect the record just written: this is tried again after the next record, and at the latest at the end
-    /// of the run.
+    /// Adds a seal (signature record) if the journal has a key and the last [`SEALED_EVERY`] records have no seal.
+    /// Writes the anchor file if [`SEALED_EVERY`] records were added since the last anchor. Does nothing after the end
+    /// record.
+    ///
+    /// Ignores errors, because they do not affect the records already written. The next append tries again, and the end
+    /// of the run at the latest.
     fn seal_when_due(&mut self) {
         if self.tail.closed {
             return;
@@ -452,8 +472,9 @@ impl Journal {
         r.put_into(&self.connection).map_err(JournalError::database(&self.folder))
     }
 
-    /// Reads the last record again if the last write failed, because only the database knows whether it was stored.
-    /// Returns that record if it was stored, otherwise `None`.
+    /// Finds out whether the last write was stored, if that write reported an error. For this, reads the last record of
+    /// the database again. Returns the record of the failed write if it was stored. Returns `None` if it was not
+    /// stored, or if the last write did not fail.
     fn reread_tail(&mut self) -> Result<Option<Record>, JournalError> {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;
@@ -465,8 +486,12 @@ impl Journal {
         Ok(stands)
     }
 
-    /// Checks that no record was cut off or changed since the anchor was written. A journal that fails this check is
-    /// not continued, because its next seal would sign the changed records.
+    /// Checks that no record was removed or changed since the anchor file (number of records and hash of the last one)
+    /// was written. Without an anchor file, checks the hash chain of all records. A journal that fails this check must
+    /// not be continued, because the next signature would cover the changed records.
+    ///
+    /// # Errors
+    /// [`JournalError::Broken`] with the number of the first wrong record. A record or the anchor cannot be read.
     fn is_whole(&self) -> Result<(), JournalError> {
         let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
         let (mut records, mut head) = (0, Tail::empty().hash);
@@ -503,7 +528,7 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    /// Locks the run in a folder until the value is dropped.
+    /// Locks the run in a folder. The lock lasts until the returned value is dropped.
     ///
     /// # Errors
     /// The folder has no journal, or another process drives the run.
@@ -577,8 +602,8 @@ fn read_tail(connection: &Connection, folder: &Path) -> Result<Tail, JournalErro
     Ok(Tail { last_command_id, closed: ends > 0, ..tail })
 }
 
-/// Returns the recorded commands that have no recorded outcome, in order. Reads the records themselves and not the
-/// index, because the hash chain does not protect the index.
+/// Returns the records of all commands without a recorded outcome, in the order of their command numbers. Reads the
+/// table of records and does not use the database index, because the hash chain does not protect the index.
 pub(super) fn open_intents(connection: &Connection, folder: &Path) -> Result<Vec<Record>, JournalError> {
     let failed = JournalError::database(folder);
     let sql = "SELECT seq, command_id, kind = 'intent' FROM record NOT INDEXED

@@ -44,8 +44,8 @@ pub struct EndedRun {
 }
 
 impl CellStatus {
-    /// Returns the name of the run that the status is about: one that is active, does not answer, or has lost its
-    /// program. Returns `None` if there is no such run.
+    /// Returns the name of the current run. This is a run that is active, a run whose program does not answer, or a run
+    /// without an end record whose program is gone. Returns `None` if there is no such run.
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.run_status {
             RunStatus::NoRun => None,

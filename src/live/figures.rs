@@ -42,7 +42,8 @@ pub enum FigureValue {
 }
 
 impl Figure {
-    /// Returns the value of the figure; `None` if it is unknown.
+    /// Returns the value of this figure (a published quantity of a cell) for the cell status `told`. Returns `None` if
+    /// the value is unknown or not finite.
     pub fn value(&self, told: &CellStatus) -> Option<FigureValue> {
         (self.read)(told).filter(|value| !matches!(value, FigureValue::Number(number) if !number.is_finite()))
     }

@@ -32,7 +32,8 @@ pub struct EventSender {
     missed: Arc<AtomicU32>,
 }
 
-/// Creates the queue of events; returns its sender and its receiver.
+/// Creates a queue for the events that a publisher reports, for example a lost connection or a refused request. Returns
+/// the sender and the receiver of the queue. The queue has a maximum length. The sender never blocks.
 pub fn event_queue() -> (EventSender, mpsc::Receiver<PublisherEvent>) {
     let (to, heard) = mpsc::channel(WAITING);
     (EventSender { to, missed: Arc::default() }, heard)
@@ -59,7 +60,9 @@ impl EventSender {
     }
 }
 
-/// Returns a text from outside as one line without invisible characters, cut after a maximum length.
+/// Returns `text` as one line. `text` comes from outside the program, so it can contain anything. A text longer than
+/// `LONGEST` characters is cut and ends with " ...". Line feeds and tabs become spaces. Every other invisible or
+/// misleading character becomes its code, such as `<U+202E>`.
 fn in_a_line(text: &str) -> String {
     let mut line: String = text.chars().take(LONGEST).collect();
     if line.len() < text.len() {

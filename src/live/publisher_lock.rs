@@ -46,7 +46,10 @@ impl BdSeqCounter {
         Ok(Self { counter: kept, folder: turn.folder.clone() })
     }
 
-    /// Increments the number of the connection (bdSeq), writes it to the disk, and returns it. After 255 follows 0.
+    /// Increments the number of the connection (bdSeq), writes the new number to the disk, and returns it. The first
+    /// number is 0. The number after 255 is 0 again.
+    ///
+    /// Returns an error if the number cannot be read from the disk or written to the disk.
     pub(crate) fn next(&mut self) -> Result<u8, LiveError> {
         let unwritable = unwritable(&self.folder);
         let before = self.counter.get().map_err(&unwritable)?;

@@ -16,8 +16,8 @@ pub(crate) struct AlarmTexts<'a> {
     pub(crate) remedy: Vec<&'a str>,
 }
 
-/// Returns the cause, the consequence and the remedy of an alarm in `language`. The values in the cause stay in the
-/// wording of the cell.
+/// Returns the cause, the consequence and the remedy of `alarm` in `language`. The values at the end of the cause, such
+/// as a name or a measured number, are not translated.
 pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     let Some((head, consequence, remedy)) = translated(alarm.id, language) else {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
@@ -27,9 +27,12 @@ pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     AlarmTexts { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
 }
 
-/// Returns the end of `what`, the cause of an alarm: the colon and the values of this alarm after the general text, or
-/// "." if there are no values. The end of the general text is found by the number of colons in `head`, its present
-/// wording, because an older record can have other words.
+/// Returns the specific end of `what`, the cause of an alarm. A cause consists of a general text, a colon and the
+/// values of this alarm. The result begins with this colon. It is "." if there are no values.
+///
+/// `head` is the general text that this version of the program uses. An older record can have another general text.
+/// Therefore the function does not compare the two texts. It only uses the number of colons in `head` to find the end
+/// of the general text in `what`.
 fn case<'a>(what: &'a str, head: &str) -> &'a str {
     let colons = head.matches(": ").count();
     what.match_indices(": ").nth(colons).map_or(".", |(at, _)| &what[at..])

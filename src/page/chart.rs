@@ -42,8 +42,9 @@ impl Line {
     }
 }
 
-/// Returns the chart of PV and RMS over the cycles, as SVG. Returns a sentence instead if nothing was measured. If
-/// `ahead` is true, the chart contains the forecast for the next cycle.
+/// Returns a chart as SVG: the error of the part after each cycle, in micrometres, as peak-to-valley (PV) and root mean
+/// square (RMS). `tolerance` adds the limits. If `ahead` is true, the chart also contains the forecast for the next
+/// cycle, if there is one. If nothing was measured, returns a sentence instead of the chart.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
     let lines = [
         Line::new(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
@@ -145,8 +146,9 @@ impl Scale {
         HEIGHT - BOTTOM - share.clamp(0.0, 1.0) * (HEIGHT - TOP - BOTTOM)
     }
 
-    /// Returns the values, in micrometres, at which the vertical axis has lines: 1, 2 and 5 times each power of ten, or
-    /// only the powers of ten if the range is large.
+    /// Returns the values, in micrometres, at which the vertical axis has horizontal grid lines. Only values within the
+    /// range of the axis are returned. They are 1, 2 and 5 times each power of ten. If the range extends over more than
+    /// three powers of ten, only the powers of ten are returned.
     fn ticks(&self) -> Vec<f64> {
         let (from, to) = (self.low.log10().floor() as i32, self.high.log10().ceil() as i32);
         let steps: &[f64] = if to - from > 3 { &[1.0] } else { &[1.0, 2.0, 5.0] };

@@ -65,7 +65,10 @@ impl Entrance {
         if self.tls.is_some() { "https" } else { "http" }
     }
 
-    /// Returns true if `named`, the host of a request with its port, is a name or an address of this page.
+    /// Returns true if a request is addressed to this page. `named` is the host of the request: a name or an address,
+    /// followed by the port. Without a port, the default port is assumed: 443 with TLS and 80 without. The port must be
+    /// the port of this page. With TLS the certificate must be valid for the host. Without TLS the host must be the
+    /// loopback address or the address of this page.
     fn is_host(&self, named: &str) -> bool {
         let port = self.address.port();
         let (host, at) = match named.rsplit_once(':') {
@@ -126,12 +129,14 @@ impl Rate {
         self.began.elapsed() > MINUTE
     }
 
-    /// Returns the time since the current minute of counting began.
+    /// Returns the time since the current counting interval began. An interval lasts at least one minute; the next
+    /// interval begins with the first event after this minute.
     pub(crate) fn age(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// Returns the number of events since the current minute of counting began.
+    /// Returns the number of events in the current counting interval. An interval lasts at least one minute; the next
+    /// interval begins with the first event after this minute.
     pub(crate) fn current_count(&self) -> u32 {
         self.count
     }
@@ -171,8 +176,9 @@ impl Guard {
         if self.entrance.users.is_some() { base } else { format!("{base}?key={}", self.key) }
     }
 
-    /// Returns the value of the cookie `name` that this page set, without the port in its full name; `None` if the
-    /// browser sent none.
+    /// Returns the value of a cookie that this page has set. `name` is the short name; the full name of the cookie also
+    /// contains the port. `headers` are the headers of the request. Returns `None` if the browser has not sent this
+    /// cookie.
     fn cookie<'h>(&self, headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
         let name = self.cookie_name(name);
         let pairs = text(headers, COOKIE)?.split(';').filter_map(|pair| pair.trim().split_once('='));
@@ -198,9 +204,11 @@ impl Guard {
         self.set_cookie(response.headers_mut(), SESSION_COOKIE, session);
     }
 
-    /// Returns true if `key` is the key of the page and false if it is not. Returns `None` in place of false after more
-    /// than [`WRONG_KEYS`] wrong keys within a minute. A correct key is always accepted: it cannot be found by
-    /// guessing, and wrong guesses of others must not lock out an operator.
+    /// Compares `key` with the key of the page. Returns true if they are equal and false if they are not. After more
+    /// than [`WRONG_KEYS`] wrong keys within a minute, returns `None` for each further wrong key.
+    ///
+    /// A correct key is always accepted, so that the wrong attempts of another client cannot lock out an operator. This
+    /// is safe: the key is too long to be guessed.
     fn is_key(&self, key: &str) -> Option<bool> {
         if same(key, &self.key) {
             return Some(true);
@@ -223,8 +231,9 @@ impl Guard {
         Ok(token)
     }
 
-    /// Uses up a token. Returns true if it was given to the browser of `session`, has not expired and was not used
-    /// before. An order that an attacker recorded and sends again is therefore refused.
+    /// Checks `token` and makes it invalid for further use. Returns true if the token was created for the browser of
+    /// `session`, has not expired, and was not used before. This check prevents a replay attack: an order that is
+    /// recorded and sent again is refused.
     fn takes_token(&self, session: &Session, token: &str) -> bool {
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
         let found = tokens
@@ -240,8 +249,9 @@ impl Guard {
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }
 
-    /// Counts a refused request, and logs it if it is one of the first [`MAX_LOGGED_REFUSALS`] within a minute. Returns
-    /// true in this case; the caller should then also put it on record. `what` describes the request.
+    /// Counts a refused request. `what` describes the request for the log. Logs the first [`MAX_LOGGED_REFUSALS`]
+    /// refused requests of each minute, and returns true for them. Returns false for the later ones, which are only
+    /// counted. If the result is true, the caller should also record the refusal in the run.
     pub(crate) fn refused(&self, what: &str) -> bool {
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
@@ -267,21 +277,22 @@ impl Guard {
         (self.log)(what);
     }
 
-    /// Logs a refused request and puts it on record, unless too many were logged within a minute. `what` describes the
-    /// request.
+    /// Logs a refused request and records it in each run concerned. `what` describes the request. Only the first
+    /// [`MAX_LOGGED_REFUSALS`] refusals within a minute are logged and recorded; the later ones are only counted.
     pub(crate) fn record_refusal(&self, what: &str) {
         if self.refused(what) {
             self.record(format!("the page refused {what}"));
         }
     }
 
-    /// Puts the message `what` on record in each run that it concerns.
+    /// Writes the message `what` to the record of each run that the message concerns. The function given to
+    /// [`Self::new`] decides which runs these are.
     pub(crate) fn record(&self, what: String) {
         (self.on_record)(what);
     }
 
-    /// Returns true if the browser of `session` has control of the cell, or if no browser has it. In the second case,
-    /// this browser gets control if `asks` is true.
+    /// Returns true if the browser of `session` has control of the cell, or if no browser has control. If no browser
+    /// has control and `asks` is true, this browser gets control. Returns false if another browser has control.
     pub(crate) fn has_control(&self, session: &Session, asks: bool) -> bool {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         match &*holder {
@@ -299,8 +310,8 @@ impl Guard {
         *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = Some(session.id.clone());
     }
 
-    /// Releases control of the cell if the browser of `session`, which has signed out, has it. The next browser that
-    /// asks gets it.
+    /// Releases control of the cell if the browser of `session` has control. Otherwise does nothing. The caller calls
+    /// this when the browser signs out. Afterwards the next browser that requests control gets it.
     pub(crate) fn leave_control(&self, session: &Session) {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         holder.take_if(|holder| *holder == session.id);
@@ -327,8 +338,9 @@ impl Session {
     }
 }
 
-/// Passes on a request that names this page as its host, and refuses any other request. Adds the security headers to
-/// each response.
+/// Middleware that checks the host of a request. Passes the request to `next` if it has exactly one `Host` header and
+/// this header names this page. Refuses every other request with the status 421 (misdirected request). Adds the
+/// security headers to each response.
 pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut hosts = request.headers().get_all(HOST).iter();
     let host = hosts.next().and_then(|host| host.to_str().ok()).unwrap_or_default();
@@ -360,8 +372,10 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     response
 }
 
-/// Passes on the request of a client that has the key or has signed in. Any other client gets the page that asks for
-/// the key or the sign-in page. A key in the address is replaced by a cookie.
+/// Middleware that checks the access of a client. Passes the request to `next` if the client has signed in or, on a
+/// page without a list of users, if the client has the key. Any other client gets the sign-in page, or the page that
+/// asks for the key. If the address contains the correct key, redirects the browser to the address without the key and
+/// stores the key in a cookie.
 pub(crate) async fn let_in(
     State(guard): State<Arc<Guard>>,
     Extension(Peer(from, is_known)): Extension<Peer>,
@@ -398,8 +412,8 @@ pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): E
     }
 }
 
-/// Returns the reason to refuse a request that changes something. Returns `None` if its header `Origin` shows that it
-/// comes from this page.
+/// Checks the header `Origin` of a request that changes something. Returns `None` if the header shows that the request
+/// comes from this page. Otherwise returns the reason to refuse the request, also if the header is missing.
 pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<String> {
     let origin = text(headers, ORIGIN).unwrap_or_default();
     let host = origin.strip_prefix(guard.entrance.scheme()).and_then(|rest| rest.strip_prefix("://"));
@@ -407,8 +421,8 @@ pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<Strin
         .then(|| format!("an order from the origin {}", printable(origin)))
 }
 
-/// Returns the reason to refuse an order. Returns `None` if it comes from this page, and if its token is valid and is
-/// used for the first time.
+/// Checks an order for its origin and its token. Returns `None` if the order comes from this page and its token is
+/// valid and was not used before. The check uses up the token. Otherwise returns the reason to refuse the order.
 pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> Option<String> {
     foreign_origin(guard, headers).or_else(|| {
         let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
@@ -417,8 +431,9 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     })
 }
 
-/// Sends the key cookie and a session cookie to a browser that gave the correct key, and redirects it to the address
-/// without the key. A browser that has a session already keeps it in all its tabs.
+/// Responds to a browser that gave the correct key in the address. Sets a cookie with the key and a cookie with the
+/// browser session. Redirects the browser to the same address without the key. If the browser already has a valid key
+/// cookie and a session, this session stays valid, so that all tabs of the browser share one session.
 fn welcome(guard: &Guard, request: &Request) -> Response {
     let headers = request.headers();
     let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));

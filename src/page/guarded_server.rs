@@ -44,8 +44,9 @@ pub struct GuardedServer {
 }
 
 impl GuardedServer {
-    /// Prepares access to the page `of`, which belongs to no run. `log` gets a message for each refusal and each
-    /// sign-in.
+    /// Creates the access control for a page that belongs to no run. Refused requests are therefore only logged, and
+    /// not recorded in a run. `entrance` contains the address and the access rules of the page. `of` says whether the
+    /// page shows one cell or the plant. `log` gets a message for each refused request and each sign-in.
     ///
     /// # Errors
     /// The operating system has no random numbers for the key.
@@ -124,8 +125,9 @@ impl Connections {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Moves the connection with this number to the list of authorised clients. If this list is full, its oldest
-    /// connection ends.
+    /// Marks the connection with the number `number` as a connection of an authorised client. If there are then too
+    /// many connections of authorised clients, ends the oldest of them. Does nothing if the connection is unknown or
+    /// already marked.
     fn know(&self, number: u64) {
         let mut open = self.open();
         if let Some(at) = open.strangers.iter().position(|(of, ..)| *of == number) {
@@ -206,8 +208,9 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .layer(from_fn(in_time))
 }
 
-/// Passes on a request. A request that changes something gets the status 408 if its answer does not begin before the
-/// timeout, for example because its body does not arrive.
+/// Middleware with a timeout for requests that change something, such as POST. If the response to such a request does
+/// not begin within `ANSWERS_WITHIN`, for example because its body does not arrive, the client gets the status 408
+/// (request timeout). A request that only reads has no timeout.
 async fn in_time(request: Request, next: Next) -> Response {
     // A request that only reads has no body to wait for, and the verification of a large record takes time.
     if request.method().is_safe() {

@@ -59,8 +59,8 @@ impl History {
         all
     }
 
-    /// Returns the summary of the run in a folder, from the cache if its record has not changed. Returns `None` if the
-    /// record cannot be read. Blocks while it reads the disk.
+    /// Returns the summary of the run in `folder`. If the record of the run has not changed since the last call, takes
+    /// the summary from the cache. Returns `None` if the record cannot be read. Blocks while it reads the disk.
     pub(crate) fn summary(&self, folder: &Path) -> Option<Arc<RunSummary>> {
         let stamp = stamp(folder);
         let kept = |read: &HashMap<PathBuf, (Stamp, Arc<RunSummary>)>| {

@@ -59,8 +59,8 @@ pub struct Page {
 type Shared = Arc<Page>;
 
 impl Page {
-    /// Creates the page for the runs in the folder `runs`. `entrance` holds its address and access rules. `planned`
-    /// returns the planned points of a run. `log` gets messages that are recorded nowhere else.
+    /// Creates the page for the runs in the folder `runs`. `entrance` contains the address and the access rules of the
+    /// page. `planned` returns the planned touch points of a run. `log` gets the messages that are in no other record.
     ///
     /// # Errors
     /// The operating system has no random numbers for the key.

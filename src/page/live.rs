@@ -26,8 +26,8 @@ pub(crate) struct ObservedRun {
 }
 
 impl ObservedRun {
-    /// Returns true if no program answers for the run and its record has no end. The state of its machines is then
-    /// unknown.
+    /// Returns true if the run is lost: its record has no end, and no program answers for it. The state of the machines
+    /// is then unknown.
     pub(crate) fn is_lost(&self) -> bool {
         !self.answers && self.summary.ended.is_none()
     }
@@ -58,7 +58,9 @@ impl RunWatcher {
     }
 }
 
-/// Sends the status of the run in `folder` to `seen` at each change, until no browser receives it.
+/// Sends the status of the run in `folder` to `seen` whenever it changes. `history` gives access to the records of the
+/// runs. If the program of the run does not answer, reads the record and tries again after a short time. Ends when no
+/// receiver of `seen` is left.
 async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<ObservedRun>) {
     let watching = async {
         loop {
@@ -79,7 +81,8 @@ async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Obse
     }
 }
 
-/// Sends each snapshot from the program of the run to `seen`, until the program ends the connection.
+/// Connects to the program of the run in `folder` and waits for its snapshots. Sends each changed status to `seen`.
+/// `history` supplies the summary of the record. Returns `Ok` when the program ends the connection.
 ///
 /// # Errors
 /// The program cannot be reached, or the connection fails.

@@ -30,8 +30,14 @@ struct Answer {
     message: String,
 }
 
-/// Gives the order in `body` to the running cell of the run, and answers with its reply. Refuses an order from another
-/// page, of a person without the right to give it, or of a browser without control if the order needs control.
+/// Sends the order in `body` to the cell of the active run named `run`, and responds with the reply of the cell.
+/// Refuses the order in these cases:
+///
+/// - The order does not come from this page or has no valid token.
+/// - `body` does not contain an order that the page can give.
+/// - The person does not have the right to give this order.
+/// - Another browser has control, and the order is not `hold`, `stop` or `abort`.
+/// - The order is `resume`, and it would clear an alarm that only a process engineer can clear.
 pub(crate) async fn order(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -88,8 +94,9 @@ fn not_for(session: &Session, order: &str) -> Option<String> {
     Some(format!("the order {order} of {person}: the role of this person does not allow this order"))
 }
 
-/// Returns the reason to refuse a resume. There is one if an alarm is active that only a process engineer can clear,
-/// and if the person at the browser is not one. Otherwise returns `None`.
+/// Checks whether the person at the browser of `session` may give a resume order for the run in `folder`. Returns the
+/// reason to refuse the order if an alarm is active that only a process engineer can clear, and the person has another
+/// role. Otherwise returns `None`. Also returns `None` if there is no list of users, or if the cell does not answer.
 async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
@@ -97,8 +104,10 @@ async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) ->
     Some(format!("the order resume of {person}: only an engineer can clear the alarm \"{}\"", theirs.what))
 }
 
-/// Gives control of the cell to the browser of this session, if its person can have it and if the change is put on
-/// record.
+/// Gives control of the cell of the run named `run` to the browser of `session`. Refuses this if the order does not
+/// come from this page or has no valid token, or if the person does not have the right to take control. Then sends a
+/// remark about the change to the cell, for the record of the run. If the cell does not answer, control does not
+/// change.
 pub(crate) async fn take_control(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -136,8 +145,9 @@ async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> R
     (status, Json(Answer { accepted: false, message: what })).into_response()
 }
 
-/// Puts the message `what` on record in the run named `run`, or in every active run if `run` is `None`. The program of
-/// the run writes it. A run that has ended accepts no message.
+/// Writes the message `what` to the record of the run named `run`. If `run` is `None`, writes it to the records of all
+/// active runs. The message is sent to the program of the run, which writes it. A run that has ended gets no message.
+/// Returns the task that sends the messages.
 pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: String) -> JoinHandle<()> {
     let history = Arc::clone(history);
     spawn_blocking(move || {

@@ -47,8 +47,9 @@ pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>)
     .await
 }
 
-/// Returns the path of a file of a cycle. `named` returns its name from the record. Returns `None` if the run, the
-/// cycle or the file is not on record.
+/// Returns the path of a file that belongs to the cycle `cycle` of the run named `run`. `named` selects which file: it
+/// returns the name of the file from the record of the cycle. Returns `None` if the run or the cycle is unknown, or if
+/// the cycle has no such file.
 fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option<&String>) -> Option<PathBuf> {
     let folder = page.history.folder(run)?;
     let summary = page.history.summary(&folder)?;
@@ -56,8 +57,8 @@ fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option
     Some(folder.join(named(of)?))
 }
 
-/// Answers with the bytes that `make` returns, with the status 404 if it returns no bytes, or 422 for its error. `make`
-/// runs on a blocking thread, so that no other request waits.
+/// Responds with the bytes that `make` returns. Responds with the status 404 if `make` returns no bytes, and 422 if it
+/// returns an error. `make` runs in a separate thread, because it can block.
 async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatError>> + Send + 'static) -> Response {
     match spawn_blocking(make).await {
         Ok(Some(Ok(Some(bytes)))) => {
@@ -70,9 +71,17 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
     }
 }
 
-/// Returns the map as bytes (little-endian): the number of columns and rows, the first position and the spacing along x
-/// and y in millimetres, then all errors and all standard uncertainties in micrometres, NaN where nothing was measured.
-/// Returns `None` if the nodes do not lie on a regular grid, or if the grid is too large.
+/// Encodes `nodes`, the measured nodes of an error map, as bytes (little-endian). The nodes must lie on a regular grid.
+/// The bytes contain, in this order:
+///
+/// - the number of columns and the number of rows (`u32`)
+/// - the first position along x and along y, in millimetres (`f64`)
+/// - the spacing along x and along y, in millimetres (`f64`)
+/// - the error of each grid position, in micrometres (`f32`), row by row
+/// - the standard uncertainty of each grid position, in micrometres (`f32`), row by row
+///
+/// A grid position without a measured node is NaN. Returns `None` if the nodes do not lie on a regular grid, or if the
+/// grid has more than `MAX_NODES` positions.
 fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
     let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
@@ -94,16 +103,17 @@ fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns the index of the position `value` on an axis that begins at `first` with the spacing `step`; `None` if it
-/// lies between two positions.
+/// Returns the index of a position on a regular axis. The axis begins at `first` and has the spacing `step`. `value`,
+/// `first` and `step` have the same unit. Returns `None` if `value` lies between two grid positions.
 fn place(value: f64, first: f64, step: f64) -> Option<usize> {
     const ROUNDING: f64 = 0.01;
     let steps = (value - first) / step;
     ((steps - steps.round()).abs() < ROUNDING).then_some(steps.round() as usize)
 }
 
-/// Returns three numbers for the positions along an axis: the first position, the spacing and the number of positions.
-/// Returns `None` if all positions are equal.
+/// Determines the regular axis of a grid from the positions in `places`. `places` need not be sorted. Returns three
+/// numbers: the first position, the spacing (the smallest distance between two different positions), and the number of
+/// positions. Returns `None` if there are no two different positions.
 fn axis(mut places: Vec<f64>) -> Option<[f64; 3]> {
     places.sort_by(f64::total_cmp);
     let (first, last) = (*places.first()?, *places.last()?);

@@ -62,8 +62,9 @@ impl Default for SignedIn {
 }
 
 impl SignedIn {
-    /// Returns the person who has signed in with the browser `session`. Returns `None` if nobody has, if the session
-    /// has expired, or if the entry of this person in `users` has changed since the sign-in.
+    /// Returns the person who signed in with the browser session `session`. Returns `None` if nobody signed in, or if
+    /// the session is older than `SESSION_LIFETIME`. Also returns `None` if the entry of the person in `users` has
+    /// changed since the sign-in.
     pub(crate) fn person(&self, session: &str, users: &UsersFile) -> Option<Person> {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.retain(|(.., since)| since.elapsed() < SESSION_LIFETIME);
@@ -83,8 +84,8 @@ impl SignedIn {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner).retain(|(id, ..)| id != session);
     }
 
-    /// Counts an attempt to sign in as `name` from the address `from`. Returns false if there were too many attempts
-    /// within a minute; the password is then not checked.
+    /// Counts an attempt to sign in with the user name `name` from the address `from`. Returns true if the password may
+    /// be checked. Returns false if there were more than `TRIES` attempts with this name and address within a minute.
     fn may_try(&self, from: IpAddr, name: &str) -> bool {
         let mut tries = self.tries.lock().unwrap_or_else(PoisonError::into_inner);
         tries.retain(|_, rate| !rate.is_over());
@@ -108,7 +109,8 @@ impl SignedIn {
         tries.entry(this).or_insert_with(Rate::new).count() <= TRIES
     }
 
-    /// Deletes the count of attempts as `name` from the address `from`, because the password was correct.
+    /// Resets the count of sign-in attempts with the user name `name` from the address `from`. The caller calls this
+    /// after a correct password.
     fn forget_tries(&self, from: IpAddr, name: &str) {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }

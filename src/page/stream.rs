@@ -51,8 +51,10 @@ pub(crate) async fn events(
 }
 
 impl RunEventStream {
-    /// Waits for a change of the run, at most one second, and returns the next message for the browser. Returns `None`
-    /// if the watcher of the run has ended or the browser has no access any more.
+    /// Waits until the run changes, at most one second, and returns the next message for the browser. The first message
+    /// comes at once if the status of the run is known. A message contains the changed pieces of the page as HTML and
+    /// the state of the run as JSON. Returns `None` if the watcher of the run has ended, or if the browser no longer
+    /// has access.
     async fn next(&mut self) -> Option<Event> {
         if !self.is_first {
             if let Ok(Err(_)) = tokio::time::timeout(MAX_SILENCE, self.run.changed()).await {

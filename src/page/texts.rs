@@ -29,8 +29,9 @@ impl Language {
         ["English", "Deutsch", "中文"][self as usize]
     }
 
-    /// Returns the first language in `tags`, a list such as that in the header `Accept-Language`, that the page
-    /// supports; `None` if it supports none. The order of the list decides, not its weights.
+    /// Returns the first language in `tags` that the page supports. `tags` is a list separated by commas, such as the
+    /// value of the header `Accept-Language`. The order of the list decides; weights such as `q=0.5` are ignored.
+    /// Returns `None` if the page supports none of the languages.
     pub(crate) fn first_of(tags: &str) -> Option<Self> {
         tags.split(',').find_map(|tag| {
             let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
@@ -396,8 +397,8 @@ pub(crate) fn next(next: &NextStep, language: Language) -> (String, Option<Devic
     (text.to(language).to_owned(), device)
 }
 
-/// Returns the sentence for what the cell does first after a resume, if it is held in `phase`, and the machine that
-/// this concerns, if any.
+/// Returns the sentence that tells what the cell does first when a run that is held in `phase` is resumed. Also returns
+/// the machine that the sentence concerns, if there is one.
 pub(crate) fn on_resume(phase: Phase) -> (Text, Option<Device>) {
     let Some((device, step)) = phase.job() else {
         let text = match phase {

@@ -206,8 +206,9 @@ impl Users {
         self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
     }
 
-    /// Returns the user with this name and password; `None` if one of them is wrong. Takes some hundredths of a second
-    /// also for an unknown name, so that an attacker cannot find by the time which names exist.
+    /// Returns the user with the name `name` if `password` is correct. Returns `None` if the name or the password is
+    /// wrong. For an unknown name, the function also checks a password hash, so that it takes about the same time (some
+    /// hundredths of a second). An attacker therefore cannot measure which names exist.
     fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         let user = self.users.iter().find(|user| user.name == name);
         let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;
@@ -268,7 +269,8 @@ impl UsersFile {
         self.now().signs_in(name, password)
     }
 
-    /// Returns true if the entry of this user (name, role and password) is unchanged in the list.
+    /// Returns true if the current list of users contains this user with the same name, role and password hash as at
+    /// the sign-in.
     pub(crate) fn has(&self, AuthenticatedUser(was): &AuthenticatedUser) -> bool {
         self.now().users.contains(was)
     }

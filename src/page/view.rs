@@ -52,8 +52,9 @@ impl Piece {
     }
 }
 
-/// Returns the HTML of all pieces of the page of a run. `has_control` is true if the page must not offer to take over
-/// control.
+/// Returns the HTML of each piece of the page of a run. A piece is a part of the page that is updated on its own.
+/// `seen` is the current status of the run. If `has_control` is false and the program of the run answers, one piece
+/// offers to take control of the cell.
 pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) -> [(Piece, String); 8] {
     let ObservedRun { snapshot, summary, .. } = seen;
     let snapshot = snapshot.as_deref();
@@ -72,8 +73,9 @@ pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) 
     .map(|(piece, markup)| (piece, markup.into_string()))
 }
 
-/// Returns the state of a run as JSON for the scripts of the page. `has_control` is true if the browser has control, or
-/// can get it without taking it over.
+/// Returns the state of a run as JSON for the scripts of the page. `seen` is the current status of the run. `session`
+/// decides which orders are allowed. `has_control` is true if the browser has control of the cell, or if no browser has
+/// control.
 pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) -> Value {
     let live = seen.snapshot.as_deref().filter(|_| seen.answers);
     let cycles: Vec<_> = seen
@@ -104,8 +106,9 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
     })
 }
 
-/// Returns the names of the orders that the browser can give now. They depend on the state of the cell, the role of the
-/// person, and `has_control`: true if the browser has control, or can get it without taking it over.
+/// Returns the names of the orders that the browser can give now, such as `hold`. `live` is the current state of the
+/// cell, and the role of the person of `session` limits the orders. `has_control` is true if the browser has control of
+/// the cell, or if no browser has control. Without control, only `hold`, `stop` and `abort` are possible.
 fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
@@ -215,7 +218,9 @@ fn when(utc: &str) -> String {
     if second.is_empty() { second } else { format!("{} UTC", second.replacen('T', " ", 1)) }
 }
 
-/// Returns the HTML of what a person must do next, with the buttons for it.
+/// Returns the HTML that tells a person what to do next, with the buttons for this. If the program of the run no longer
+/// answers, there are no buttons. Then the text says to read the report if the run has ended, and otherwise the HTML is
+/// empty.
 fn next(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
@@ -245,7 +250,8 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
     }
 }
 
-/// Returns the HTML of the progress of the current job of a machine; empty if there is none.
+/// Returns the HTML of the progress of the current job (work of one machine, such as grinding or measuring). The HTML
+/// is empty if no job runs.
 fn job(live: &Snapshot, language: Language) -> Markup {
     let Some(JobProgress { device, done, total, left_s }) = live.progress else { return Markup::default() };
     let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
@@ -266,7 +272,9 @@ fn job(live: &Snapshot, language: Language) -> Markup {
     }
 }
 
-/// Returns a range of seconds as text in seconds, minutes or hours.
+/// Formats a range of durations as text, such as `5 – 8 min`. The input is the minimum and the maximum in seconds. The
+/// maximum decides the unit: seconds below 90 s, minutes below 90 min, otherwise hours. If both numbers look the same,
+/// the text contains only one.
 fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -328,7 +336,9 @@ fn standing(alarm: &Alarm, language: Language) -> Markup {
     }
 }
 
-/// Returns the HTML table of the judged figures: a row for each cycle, and a row with the limits.
+/// Returns the HTML table of the measured form errors. Each cycle has one row with its PV and RMS, their uncertainties
+/// U (all in micrometres), and its verdict. A cycle without a measurement shows dashes. If `tolerance` is given, one
+/// more row contains the limits.
 fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let limit = |mm: f64| if mm.is_finite() { format!("{:.2}", 1e3 * mm) } else { "–".to_owned() };
@@ -412,8 +422,9 @@ pub(crate) async fn run(
     document(&title, &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// Returns the HTML of the page of the run named `id`: the cell while the run is active, and the result afterwards.
-/// `has_control` is true if the browser has control, or can get it without taking it over.
+/// Returns the HTML of the page of the run named `id`. While the run is active, the page shows the cell and its
+/// controls. Afterwards it shows the result. `seen` is the current status of the run. `has_control` is true if the
+/// browser has control of the cell, or if no browser has control.
 fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let made = pieces(seen, has_control || !session.may("control"), language);
@@ -638,7 +649,9 @@ pub(crate) async fn compare(
     document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// Serves the report of a run: the file in its folder, or else a report computed from its record.
+/// Serves the report of the run named `id`. Uses the report file in the folder of the run. If there is no such file,
+/// creates the report from the record. Responds with the status 404 if the run does not exist, and 422 if the report
+/// cannot be created.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let read = spawn_blocking(move || {

@@ -33,8 +33,8 @@ pub struct PlantRun {
 }
 
 impl PlantRun {
-    /// Finds a run in the plant by its name. `cell` is the name of its cell; it is required only if several cells have
-    /// a run with this name.
+    /// Finds a run in the database of the plant by its name. `cell` is the name of the cell of the run. Without `cell`,
+    /// all cells are searched. If several runs are found, the run that was registered last is returned.
     ///
     /// # Errors
     /// There is no such run, or the plant cannot be reached.
@@ -56,8 +56,9 @@ impl PlantRun {
         })
     }
 
-    /// Checks the journal at the cell against the plant's copy: the journal must contain at least `self.records`
-    /// records, and the record of that number must have the hash `self.head`.
+    /// Checks the journal in `folder`, the run folder at the cell, against the copy at the plant. The journal must
+    /// contain at least `self.records` records. Its record with this number must have the hash `self.head`. Later
+    /// records are not compared. If the plant has no record yet, returns `Ok` without a check.
     ///
     /// # Errors
     /// The journal was cut or rewritten after it was replicated, or cannot be read.
@@ -80,12 +81,13 @@ impl PlantRun {
         Err(PlantError::Differs { run: self.name.clone(), what })
     }
 
-    /// Fetches the records and files of the run from the plant into a new folder. Verifies nothing:
-    /// [`regrind_journal::verify`] does this.
+    /// Fetches the records and files of the run from the plant into the new folder `folder`. `artefacts` names the
+    /// folder with the large files. Skips each file that the plant does not have. Does not verify the records: call
+    /// [`regrind_journal::verify`] for this.
     ///
     /// # Errors
-    /// The folder is in use, the text of a record does not have the form that a journal writes, or the plant cannot be
-    /// reached.
+    /// The folder is in use, a record is missing, the text of a record does not have the form that a journal writes, or
+    /// the plant cannot be reached.
     pub async fn fetch(
         &self,
         link: &DatabaseLink,
@@ -106,7 +108,10 @@ impl PlantRun {
         Ok(())
     }
 
-    /// Returns the records of the run from the plant, in the order of their numbers. `folder` is named in errors.
+    /// Returns all records of the run from the plant, in the order of their numbers. `folder` is only used in error
+    /// messages.
+    ///
+    /// Returns an error if a record is missing or invalid, or if the plant cannot be reached.
     async fn records(&self, link: &DatabaseLink, folder: &Path) -> Result<Vec<Record>, PlantError> {
         const PAGE: i32 = 5000;
         let mut records: Vec<Record> = Vec::new();
@@ -137,11 +142,14 @@ impl PlantRun {
         }
     }
 
-    /// Verifies the plant's copy: records, order, files and signatures. If `keys` is empty, the keys that the plant has
-    /// for the cell are used.
+    /// Verifies the copy of the run that was fetched into `folder`: the records, their order, the files and the
+    /// signatures. `keys` are the public keys that may have signed. If `keys` is empty, uses the keys that the plant
+    /// has for the cell.
     ///
     /// # Errors
-    /// [`JournalError::Broken`] with the first record that fails the verification.
+    /// - [`JournalError::Broken`] for the first record that fails the verification.
+    /// - [`PlantError::Differs`] if the number of records, or the hash of the last one, differs from the values that
+    ///   the plant stored.
     pub fn prove(&self, folder: &Path, keys: &[PublicKey]) -> Result<Verified, PlantError> {
         let keys = if keys.is_empty() { self.keys.clone() } else { keys.to_vec() };
         let verified = verify_against(folder, &ExternalEvidence { anchor: None, keys })?;
@@ -158,8 +166,9 @@ impl PlantRun {
     }
 }
 
-/// Returns the state of `journal.anchor` after the newest seal among `records`. If there is no seal, returns an anchor
-/// of the last record. Returns `None` if there is no record, or if the seal is invalid.
+/// Returns the anchor (the number of records of the journal and the hash of the last one) from the newest seal among
+/// `records`. A seal is a record that signs the records before it. If there is no seal, returns an unsigned anchor of
+/// the last record. Returns `None` if `records` is empty, or if the seal lacks the number or the hash.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
     let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal).map(Record::value) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));
@@ -174,11 +183,12 @@ fn last_sealed(records: &[Record]) -> Option<Anchor> {
     })
 }
 
-/// Reads the content of a file by its SHA-256, from the database or from the folder of large files; `None` if the plant
-/// does not have it.
+/// Returns the content of the file with the SHA-256 hash `sha256`. Reads the content from the database or from the
+/// folder of large files, which `artefacts` names. Returns `None` if the content is not there, or if it is in the
+/// folder of large files and `artefacts` is `None`.
 ///
 /// # Errors
-/// The plant cannot be reached, or the folder of large files does not exist.
+/// The plant cannot be reached, or a file in the folder of large files exists but cannot be read.
 pub async fn content(
     link: &DatabaseLink,
     artefacts: Option<&ArtefactSettings>,

@@ -51,15 +51,16 @@ pub enum PlantError {
 }
 
 impl PlantError {
-    /// Returns true if the cause can disappear without a change by a person, so that a retry makes sense: the plant
-    /// cannot be reached.
+    /// Returns true if a retry makes sense: the plant cannot be reached now, and this can change without a person.
+    /// Returns false for every other error.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::Unreachable { .. })
     }
 }
 
-/// Returns a function that converts an error of the database into a [`PlantError`]. `what` names the refused request in
-/// the message.
+/// Returns a function that converts an error of the database into a [`PlantError`]. `what` names the request in the
+/// message, if the database refuses it. An error that a retry can solve, for example a restarting server, becomes
+/// [`PlantError::Unreachable`].
 pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
     move |error| {
         let Some(said) = error.as_db_error() else {

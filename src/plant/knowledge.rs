@@ -46,12 +46,14 @@ struct Head {
 }
 
 impl Knowledge {
-    /// Queries the plant for what other cells have learned about parts of this `kind`. Also queries the pairs of
-    /// results that show how similar machines are. `simulation` selects results of simulated cells.
+    /// Reads from the plant the results that other cells have learned for parts of this `kind`. If there are such
+    /// results, also reads pairs of results of two cells for the same kind; they show how similar the machines are. If
+    /// `simulation` is true, reads only results of simulated cells, otherwise only results of real cells. `artefacts`
+    /// names the folder with the large files.
     ///
     /// # Errors
-    /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: it
-    /// is listed in `left_alone` and reported to the plant.
+    /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: its
+    /// reason is added to `left_alone` and reported to the plant.
     pub async fn query(
         link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
@@ -78,8 +80,11 @@ impl Knowledge {
         Ok(knowledge)
     }
 
-    /// Verifies the content of the results in `rows`, and returns the valid ones. Reports the others to the plant, and
-    /// adds them to `left_alone`.
+    /// Checks the results in `rows` and returns the valid ones. The flag is true for results of a simulation.
+    /// `artefacts` names the folder with the large files. For each invalid result, reports the reason to the plant and
+    /// adds it to `left_alone`.
+    ///
+    /// Returns an error if the plant cannot be reached.
     async fn verify_results(
         &mut self,
         link: &DatabaseLink,
@@ -104,9 +109,11 @@ impl Knowledge {
     }
 }
 
-/// Reads a result of another cell from a row of the database or from the folder of large files. Checks that its content
-/// has the recorded hash. Returns the reason if the result cannot be used. `simulation` is true if the own run is
-/// simulated.
+/// Reads a result of another cell. `row` is the row of the database. If the row has no content, reads the content from
+/// the folder of large files, which `artefacts` names. `simulation` is true if the run of this cell is simulated.
+/// Checks that the content has the hash in `row` and that the result fits the kind of part.
+///
+/// Returns a text with the reason as error if the result cannot be used.
 fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<DeliveredResult, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
@@ -137,9 +144,10 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Registers in the plant what a finished run of this cell has learned, so that other cells can use it. All files of
-/// the run, whose id in the plant is `id`, must have arrived there. Returns the reason if the plant refuses the result.
-/// Returns `None` if the result is registered, or if the run has no usable one.
+/// Registers the learned result of a finished run in the plant, so that other cells can use it. `folder` is the folder
+/// of the run. `id` is the id of the run in the plant. All files of the run must have arrived at the plant before.
+/// Returns the reason if the plant refuses the result. Returns `None` if the result is registered, or if the run has no
+/// usable result.
 pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";

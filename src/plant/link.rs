@@ -25,11 +25,11 @@ pub struct DatabaseLink {
 }
 
 impl DatabaseLink {
-    /// Signs in to the database with the settings.
+    /// Connects to the database of the plant and signs in with the values in `settings`.
     ///
     /// # Errors
-    /// A password or a certificate cannot be read, the database is on another computer and no certificates are given,
-    /// or it cannot be reached.
+    /// A password or a certificate cannot be read. The database is on another computer and no certificates are given.
+    /// The database refuses the sign-in, or cannot be reached.
     pub async fn open(settings: &DatabaseSettings) -> Result<Self, PlantError> {
         let place = format!("{}:{}/{}", settings.host, settings.port, settings.name);
         let proof = regrind_trust::tls_config(&settings.host, settings.certificates.as_deref(), "[database]")?;
@@ -55,17 +55,17 @@ impl DatabaseLink {
         Ok(Self { client, place })
     }
 
-    /// Returns the client, for queries.
+    /// Returns the database client, for queries.
     pub fn client(&self) -> &Client {
         &self.client
     }
 
-    /// Returns the client, for transactions.
+    /// Returns the database client as a mutable reference. A transaction needs one.
     pub fn client_mut(&mut self) -> &mut Client {
         &mut self.client
     }
 
-    /// Runs a query; returns its rows.
+    /// Runs the SQL query `text` and returns the rows. `values` are the values of its parameters `$1`, `$2` and so on.
     ///
     /// # Errors
     /// The database cannot be reached, or refuses the query.
@@ -82,19 +82,20 @@ impl DatabaseLink {
         told.map(drop).map_err(refused("the state of the cell"))
     }
 
-    /// Returns true if the connection is closed.
+    /// Returns true if the connection to the database is closed.
     pub fn is_closed(&self) -> bool {
         self.client.is_closed()
     }
 
-    /// Returns the address, for messages.
+    /// Returns the address of the database for messages, as `host:port/database`.
     pub fn place(&self) -> &str {
         &self.place
     }
 }
 
-/// Converts an error of the login to the database. A refused login and a missing database are reported as refused;
-/// every other error as an unreachable database. `place` is the address of the database.
+/// Converts `error`, an error of the connection to the database, into a [`PlantError`]. A wrong password or user name
+/// and a missing database become [`PlantError::Refused`]. Every other error becomes [`PlantError::Unreachable`] with
+/// the address `place`.
 fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
     match error.as_db_error() {
         // Classes 28 (invalid authorisation), 3D and 42 (no such database or role).

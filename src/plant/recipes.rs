@@ -42,9 +42,14 @@ pub struct Approval {
 }
 
 impl PlantRecipe {
-    /// Returns the SHA-256, in hexadecimal digits, that identifies the recipe and that people sign. It is the hash of
-    /// these lines: the format, the name, the version, the hash of the recipe's text, and the hash and name of each
-    /// file.
+    /// Returns the SHA-256 of the recipe in hexadecimal digits. This hash identifies the recipe, and people sign it. It
+    /// is computed from these lines:
+    ///
+    /// - the text `regrind recipe 1`, which names the format;
+    /// - the name of the recipe;
+    /// - the version;
+    /// - the SHA-256 of the recipe's text;
+    /// - for each file, the SHA-256 of its content and its name.
     pub fn sha256(&self) -> String {
         let mut lines =
             format!("regrind recipe 1\n{}\n{}\n{}\n", self.name, self.version, sha256_hex(self.text.as_bytes()));
@@ -54,11 +59,13 @@ impl PlantRecipe {
         sha256_hex(lines.as_bytes())
     }
 
-    /// Stores the recipe as the next version of its name; returns its hash.
+    /// Stores the recipe in the plant as the next version of its name. Also sets `self.version`. Returns the SHA-256 of
+    /// the recipe in hexadecimal digits.
     ///
     /// # Errors
-    /// The recipe exists already under this or another name, the database role has no right to store recipes, or the
-    /// plant cannot be reached.
+    /// Fails if a recipe with the same text and files is already stored, under this or another name. Fails if another
+    /// person stored a version at the same time, if the database role has no right to store recipes, or if the plant
+    /// cannot be reached.
     pub async fn propose(&mut self, link: &DatabaseLink) -> Result<String, PlantError> {
         let failed = refused("the recipe");
         let newest = "SELECT coalesce(max(version), 0) FROM recipe WHERE name = $1";
@@ -75,11 +82,11 @@ impl PlantRecipe {
         Ok(digits(row.get(0)))
     }
 
-    /// Finds the given version of a recipe. Without `version`, finds the newest one that is not withdrawn. The database
-    /// role must be that of a planner or a reader.
+    /// Reads the recipe with this `name` and `version` from the plant. If `version` is `None`, reads the newest version
+    /// that is not withdrawn. The database role must be that of a planner or a reader.
     ///
     /// # Errors
-    /// There is no such recipe, or the plant cannot be reached.
+    /// Fails if there is no such recipe, or if the plant cannot be reached or refuses the query.
     pub async fn find(link: &DatabaseLink, name: &str, version: Option<i32>) -> Result<Self, PlantError> {
         let text = "SELECT name, version, text, array(SELECT f.name FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY 1),
                 array(SELECT f.content FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name)
@@ -99,11 +106,11 @@ impl PlantRecipe {
         })
     }
 
-    /// Adds a person's signature to the recipe.
+    /// Signs the recipe with `key` in the name of `person`, and stores the signature in the plant.
     ///
     /// # Errors
-    /// The person or the key has signed the recipe already, the database role has no right to sign, or the plant cannot
-    /// be reached.
+    /// Fails if this person has signed the recipe already, or if somebody has signed it with this key. Also fails if
+    /// the database role has no right to sign, or if the plant cannot be reached.
     pub async fn approve(&self, link: &DatabaseLink, person: &str, key: &AuditKey) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
@@ -123,13 +130,15 @@ impl PlantRecipe {
         }
     }
 
-    /// Fetches the recipe with the hash `sha256` from the plant and verifies it. It must have this hash. At least two
-    /// people with different keys must have signed it, and both must be in `approvers`, the list in the plant file of
-    /// the cell. Returns the recipe and the names of these people.
+    /// Fetches the recipe with the hash `sha256` from the plant and verifies it. `approvers` is the list of people and
+    /// their public keys in the plant file of the cell. The recipe must have the hash `sha256`. At least two people
+    /// from `approvers`, with different names and keys, must have signed it. Returns the recipe and the names of the
+    /// people in `approvers` who signed it.
     ///
     /// # Errors
-    /// The recipe does not match its hash, too few people have signed it, or it was withdrawn; the plant receives a
-    /// report of this. Or the plant cannot be reached.
+    /// Fails if there is no such recipe, if it was withdrawn, if it does not have the hash `sha256`, or if too few
+    /// people have signed it. The plant receives a report of each of these faults. Also fails if the plant cannot be
+    /// reached.
     pub async fn pull(
         link: &DatabaseLink,
         sha256: &str,
@@ -172,8 +181,9 @@ fn words(sha256: &str, person: &str) -> String {
     format!("regrind recipe approval 1\n{sha256}\n{person}\n")
 }
 
-/// Verifies a recipe from the plant: its hash must be `sha256`, and enough `approvers` must have signed it in
-/// `approvals`. Returns the recipe and the names of those who signed, or the fault as a text.
+/// Verifies a recipe from the plant. Its hash must be `sha256`. At least two people from `approvers`, with different
+/// names and keys, must have a valid signature in `approvals`. Returns the recipe and the names of these people. If the
+/// verification fails, returns the reason as a text.
 fn proven(
     recipe: PlantRecipe,
     sha256: &str,

@@ -67,7 +67,9 @@ struct PlantRunState {
 }
 
 impl Replicator {
-    /// Creates a replicator for a folder of runs.
+    /// Creates a replicator for `runs`, the folder that contains the run folders of a cell. `artefacts` names the
+    /// folder for files that are too large for the plant's database; it is `None` if there is no such folder. Sends
+    /// nothing yet.
     pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
         Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), reported: HashSet::new() }
     }
@@ -77,11 +79,13 @@ impl Replicator {
         self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
     }
 
-    /// Sends everything that the plant does not have, the newest run first.
+    /// Sends the records and files that the plant does not have yet, the run with the newest change first. Returns the
+    /// numbers of records, files and runs that were sent, and the faults of single runs.
     ///
     /// # Errors
-    /// The plant cannot be reached, or refuses a request. A run that differs from its copy is not an error: it is
-    /// listed in the result, and the other runs continue.
+    /// Fails if the plant cannot be reached or refuses a request. A run that differs from the plant's copy is not an
+    /// error: the result lists this run, and the other runs are still sent. A run whose journal cannot be read now is
+    /// tried again in a later round.
     pub async fn round(&mut self, link: &DatabaseLink) -> Result<ReplicationResult, PlantError> {
         let mut shipped = ReplicationResult::default();
         for (name, stamp) in self.unsettled() {
@@ -100,8 +104,9 @@ impl Replicator {
         Ok(shipped)
     }
 
-    /// Returns the runs whose files have changed since they were last replicated completely, the newest change first.
-    /// Each has the modification times of its files.
+    /// Returns the runs whose journal has changed since the run was last replicated completely, the newest change
+    /// first. Omits runs that are skipped because they differ from the plant's copy. The stamp of a run contains the
+    /// modification times and lengths of its journal files.
     fn unsettled(&self) -> Vec<(String, Stamp)> {
         let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
         let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
@@ -115,8 +120,12 @@ impl Replicator {
         open
     }
 
-    /// Sends the new records and files of the run `name` to the plant, and counts them in `shipped`. Returns true if
-    /// the plant then has the complete run.
+    /// Sends the new records and files of the run `name` to the plant, and adds their numbers to `shipped`. Returns
+    /// true if the plant then has all records and files that the run had at the beginning of the call. Returns false if
+    /// the journal is still empty.
+    ///
+    /// Returns an error if the journal cannot be read, if it differs from the plant's copy, or if the plant cannot be
+    /// reached.
     async fn replicate_run(
         &mut self,
         link: &DatabaseLink,
@@ -150,8 +159,10 @@ impl Replicator {
         Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
     }
 
-    /// Registers in the plant what a finished run has learned. If the plant refuses it, adds the reason to `shipped`,
-    /// once per run.
+    /// Registers the file `learned.json` of a finished run in the plant, so that other cells can use what this cell has
+    /// learned. `folder` is the run folder, `run` the name of the run, and `id` its id in the plant. If the plant
+    /// refuses the file, adds the reason to `shipped`, but only once for each run. Does nothing if the run has no
+    /// usable file of this kind. Returns an error if the plant cannot be reached.
     async fn teach(
         &mut self,
         link: &DatabaseLink,
@@ -168,9 +179,9 @@ impl Replicator {
         Ok(())
     }
 
-    /// Sends the contents of recorded files that the plant does not have. `id` is the id of the run in the plant.
-    /// Returns two numbers of files: those sent, and those that cannot be sent. The latter are reported to the plant
-    /// and added to `shipped`.
+    /// Sends the files of a run whose contents the plant does not have. `folder` is the run folder, `run` the name of
+    /// the run, and `id` its id in the plant. Returns two numbers: of the files that were sent, and of the files that
+    /// cannot be sent. Reports each file that cannot be sent to the plant once, and adds the reason to `shipped`.
     async fn give_files(
         &mut self,
         link: &DatabaseLink,
@@ -198,8 +209,12 @@ impl Replicator {
         Ok(files)
     }
 
-    /// Sends the content of the file at `path`. Returns the reason if it cannot be sent: it cannot be read, or it does
-    /// not have the recorded length `bytes` and hash `sha256`.
+    /// Sends the content of the file at `path` to the plant. `sha256` and `bytes` are the hash and the length that the
+    /// journal recorded. Puts a large file into the folder for large files, if there is one.
+    ///
+    /// Returns `None` if the file was sent. Returns the reason if the file cannot be sent: it cannot be read, its
+    /// length or hash differs from the record, or it is too large for the database. Returns an error if the plant
+    /// cannot be reached, or if the folder for large files cannot be written.
     async fn give_file(
         &self,
         link: &DatabaseLink,
@@ -240,8 +255,9 @@ impl Replicator {
     }
 }
 
-/// Writes the content of a file to the folder of large files, under its SHA-256. Replaces an existing file that has
-/// another content.
+/// Writes `content` to a file in `folder`, the folder for large files. The name of the file is `sha256` in hexadecimal
+/// digits, in a subfolder that is named by its first two digits. Does nothing if the file already has this content, and
+/// otherwise replaces it.
 fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
     let name = digits(sha256);
     let path = folder.join(&name[..2]).join(&name);
@@ -259,8 +275,11 @@ async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, Plan
     Ok(PlantRunState { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
-/// Checks that the journal of a run contains the records that the plant has (`there`). If it does not, reports this to
-/// the plant and returns an error.
+/// Checks that the journal of a run at the cell agrees with the plant's copy. `there` is the number of records that the
+/// plant has, and the hash of the last of them. The journal must contain a record of this number with this hash, unless
+/// the plant has no records yet.
+///
+/// If it does not, the journal was cut or rewritten. The function then reports this to the plant and returns an error.
 async fn compare_with_plant(
     link: &DatabaseLink,
     folder: &Path,
@@ -284,8 +303,9 @@ async fn compare_with_plant(
     }
 }
 
-/// Reads the records after number `records` from the journal of a run, up to the maximum number or size for one
-/// request.
+/// Reads the next records to send from the journal in `folder`, beginning with record number `records` + 1. Stops after
+/// 1000 records, or after the record with which the size exceeds 1 MiB. Returns an empty list if there are no more
+/// records.
 fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     let mut batch = Vec::new();
     let mut bytes = 0;
@@ -301,8 +321,11 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     Ok(batch)
 }
 
-/// Sends `batch` to the plant, and returns how many records the plant has then, and the hash of the last one. If the
-/// answer is lost, the next round queries this state.
+/// Sends the records `batch` of the run `run` to the plant. `there` is the state of the run in the plant before.
+/// Returns the new state: the number of records that the plant has, and the hash of the last of them.
+///
+/// Returns an error if the plant refuses the records or cannot be reached. If only the answer is lost, the next round
+/// queries the state again.
 async fn send_records(
     link: &DatabaseLink,
     run: &str,
@@ -321,8 +344,9 @@ async fn send_records(
     }
 }
 
-/// Returns true if the journal of a run contains the record of its end. `last` is its last record: the end itself, or
-/// the seal after it.
+/// Returns true if the journal of a run contains the record of the end of the run. `last` is the last record of the
+/// journal. Checks `last` and the record before it, because one seal (a record with a signature) follows the end of a
+/// signed run.
 fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
     if last.kind == RecordKind::End {
         return Ok(true);
@@ -342,10 +366,11 @@ async fn report_run(link: &DatabaseLink, id: i32, told: &Value) -> Result<(), Pl
     asked.map(drop).map_err(refused("the status of a run"))
 }
 
-/// Returns the summary of a run from its record: result, limits, machines, and the figures of each cycle in µm.
+/// Returns a summary of the run in `folder` as JSON: result, verdict, limits, machines, number of alarms, and the
+/// figures of each cycle. PV and RMS and their limits are in µm. A value that is not on record is `null`.
 ///
 /// # Errors
-/// The record cannot be read.
+/// Fails if the journal of the run cannot be read.
 pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
     let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
     // A missing limit is infinite, which JSON cannot represent.
@@ -367,7 +392,8 @@ pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
     }))
 }
 
-/// Returns the radius of the probe in mm from the recipe of a run; `None` if it cannot be read.
+/// Returns the radius of the probe in mm, from the file `recipe.toml` in the run folder `folder`. Returns `None` if the
+/// file cannot be read or contains no radius.
 fn probe_of(folder: &Path) -> Option<f64> {
     let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
     recipe.get("measure")?.get("probe_radius_mm")?.as_float()

@@ -21,12 +21,13 @@ const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", 
 /// Key of the advisory lock that stops two programs from changing the layout at once.
 const LOCK: i64 = 0x5267_7264_506c_616e;
 
-/// Updates the tables and functions of a database to the version of this program. Must be called as the owner of the
-/// database. Returns the version before and the version after.
+/// Updates the layout of a database (its tables and functions) to the version of this program. The database role must
+/// be the owner of the database. Returns the version of the layout before and after the update; the version is 0 for a
+/// new database.
 ///
 /// # Errors
-/// The database role has no right to change the layout, a later version of Regrind made the layout, or a person changed
-/// it.
+/// Fails if the database role has no right to change the layout, if a later version of Regrind made the layout, if the
+/// recorded hash of a migration differs from this program's, or if the database cannot be reached.
 pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
     let failed = refused("its layout");
     let client = link.client_mut();
@@ -65,7 +66,8 @@ pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
 /// Checks that the layout of a database (its tables and functions) is the one that this program uses.
 ///
 /// # Errors
-/// The layout is older, later or different.
+/// Fails if the version of the layout is older or later than that of this program, if the hash of a migration differs,
+/// or if the database cannot be reached.
 pub async fn check_layout(client: &Client) -> Result<(), PlantError> {
     let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
     let older = "update it as its owner: regrind plant init";
@@ -88,11 +90,12 @@ fn known() -> i32 {
     MIGRATIONS.last().map_or(0, |(version, _)| *version)
 }
 
-/// Compares the migrations that a database has `applied`, as versions with hashes, with those of this program. Returns
-/// the newest applied version, or 0 if there is none.
+/// Compares the migrations (update scripts) of a database with those of this program. `applied` contains the version
+/// and the SHA-256 of each migration that the database has, in ascending order of version. Returns the newest applied
+/// version, or 0 if there is none.
 ///
 /// # Errors
-/// The database has a migration that this program does not have, or one with another text.
+/// Fails if the database has a migration that this program does not have, or a migration with another version or text.
 fn compare_migrations(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
@@ -128,11 +131,13 @@ impl PlantRole {
     }
 }
 
-/// Registers the cell `name` in the plant: creates its database role with a password, and stores the public keys that
-/// may sign its records. For a registered cell, sets the new password and adds the keys.
+/// Registers the cell `name` in the plant. Creates the database role `role` with this `password`, and stores the public
+/// `keys` that may sign the records of the cell. If the cell is registered already, sets its role and password, adds
+/// the new keys, and ends its retirement.
 ///
 /// # Errors
-/// The database role has no right to create roles, or another cell has a role of this name.
+/// Fails if the database role of the caller has no right to create roles, if another cell has the role `role`, or if
+/// the database cannot be reached.
 pub async fn enrol_cell(
     link: &mut DatabaseLink,
     name: &str,
@@ -160,10 +165,11 @@ pub async fn enrol_cell(
     step.commit().await.map_err(&failed)
 }
 
-/// Creates a role for a person or a program, or gives an existing role a new password.
+/// Creates the database role `role` for a person or a program, or gives an existing role a new `password`. `of` is the
+/// purpose of the role, which determines its rights.
 ///
 /// # Errors
-/// The database role has no right to create roles.
+/// Fails if the database role of the caller has no right to create roles, or if the database cannot be reached.
 pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
     let failed = refused("to enrol the role");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
@@ -171,8 +177,11 @@ pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: Plan
     step.commit().await.map_err(&failed)
 }
 
-/// Creates a role in a group, or gives an existing role a new password. SQL commands for roles take no parameters, so
-/// the server itself quotes the name and the password in their text.
+/// Creates the database role `role` as a member of `group`. If the role exists, sets its password and adds it to the
+/// group. `step` is the open transaction.
+///
+/// SQL commands for roles accept no query parameters. Therefore the server first builds the commands with quoted names
+/// and password, and then executes them.
 async fn make_role(
     step: &tokio_postgres::Transaction<'_>,
     role: &str,

@@ -40,10 +40,12 @@ pub struct LeasedRun {
 }
 
 impl Study {
-    /// Stores the study with one job for each combination of values and seed. Returns the number of jobs.
+    /// Stores the study in the plant, with one job for each combination of an entry of `variations` and a seed of
+    /// `seeds`. An entry of `variations` contains keys of the recipe with their values. Returns the number of jobs.
     ///
     /// # Errors
-    /// A study of that name exists, the database role has no right to create studies, or the plant cannot be reached.
+    /// Fails if a study of that name exists, if the database role has no right to create studies, or if the plant
+    /// cannot be reached.
     pub async fn begin(&self, link: &DatabaseLink, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
         let seeds: Vec<i64> = seeds.iter().map(|seed| seed.cast_signed()).collect();
         let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
@@ -61,10 +63,11 @@ impl Study {
         }
     }
 
-    /// Reads the recipe of a job.
+    /// Reads the recipe of the study to which `job` belongs, with the files that the recipe names. The field `name` of
+    /// the result is the id of the study.
     ///
     /// # Errors
-    /// This computer did not sign in as a worker, or the plant cannot be reached.
+    /// Fails if this computer did not sign in as a worker, or if the plant cannot be reached.
     pub async fn read(link: &DatabaseLink, job: &LeasedRun) -> Result<Self, PlantError> {
         let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
         let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
@@ -79,10 +82,11 @@ impl Study {
 }
 
 impl LeasedRun {
-    /// Leases the next job; `None` if there is none.
+    /// Leases the next free job, from the oldest study first, for 30 minutes. A job whose lease has ended without a
+    /// result is free again, up to three leases in total. Returns `None` if no job is free.
     ///
     /// # Errors
-    /// This computer did not sign in as a worker, or the plant cannot be reached.
+    /// Fails if this computer did not sign in as a worker, or if the plant cannot be reached.
     pub async fn lease_next(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
@@ -96,11 +100,12 @@ impl LeasedRun {
         }))
     }
 
-    /// Stores the result of this job in the plant, or the reason why there is none. Returns false if the plant does not
-    /// accept it, because the lease has ended and another worker may have the job.
+    /// Stores the result of this job in the plant. `result` is the result of the simulated run, or the reason why there
+    /// is none. Returns true if the plant accepts the result. Returns false if this lease of the job is no longer
+    /// valid, for example because another worker has leased the job.
     ///
     /// # Errors
-    /// The plant cannot be reached.
+    /// Fails if the plant cannot be reached.
     pub async fn finish(&self, link: &DatabaseLink, result: &Result<Value, String>) -> Result<bool, PlantError> {
         let told = match result {
             Ok(told) => told.to_string(),

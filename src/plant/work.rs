@@ -45,10 +45,11 @@ pub struct StartedPart {
 }
 
 impl Lease {
-    /// Leases the part that is due first, for the duration [`LEASE`]. Returns `None` if there is no part for this cell.
+    /// Leases the part of the queue with the earliest due date, for the duration [`LEASE`]. Considers only parts that
+    /// are free, that this cell may make, and whose recipe is approved. Returns `None` if there is no such part.
     ///
     /// # Errors
-    /// This computer did not sign in as a cell, or the plant cannot be reached.
+    /// Fails if this computer did not sign in as a cell, or if the plant cannot be reached.
     pub async fn acquire(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
         let text = "SELECT id, serial, recipe, due::text, lease FROM take_work($1)";
         let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a part"))?;
@@ -61,26 +62,32 @@ impl Lease {
         }))
     }
 
-    /// Renews the lease: it then ends [`LEASE`] from now.
+    /// Extends the lease, so that it ends after the duration [`LEASE`] from now.
     ///
     /// # Errors
-    /// The lease has ended, or the plant cannot be reached.
+    /// Fails if this lease of the part is no longer valid, for example because another cell has leased the part. Also
+    /// fails if the plant cannot be reached.
     pub async fn renew(&self, link: &DatabaseLink) -> Result<(), PlantError> {
         self.ask(link, "SELECT renew_work($1, $2, $3)", &[&self.work, &self.number, &seconds()]).await
     }
 
-    /// Begins the part in a run of this name. Idempotent: a retry after a lost answer returns the same answer.
+    /// Registers in the plant that the run with the name `run` begins to make the leased part. From then on the part
+    /// belongs to this run. Idempotent: a retry after a lost answer succeeds again.
     ///
     /// # Errors
-    /// The lease has ended, another run has the part, or the recipe was withdrawn; or the plant cannot be reached.
+    /// Fails if the lease has ended, if another run has the part, if the part was withdrawn, or if its recipe is no
+    /// longer approved. Also fails if this cell already has another run with the name `run`, or if the plant cannot be
+    /// reached.
     pub async fn begin(&self, link: &DatabaseLink, run: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT begin_work($1, $2, $3)", &[&self.work, &self.number, &run]).await
     }
 
-    /// Returns the leased part to the queue, before a run was begun. `why` is the reason, for the plant.
+    /// Returns the leased part to the queue before a run has begun to make it. `why` is the reason, which the plant
+    /// stores.
     ///
     /// # Errors
-    /// The lease has ended, or the plant cannot be reached.
+    /// Fails if this lease of the part is no longer valid, for example because another cell has leased the part. Also
+    /// fails if the plant cannot be reached.
     pub async fn hand_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &why]).await
     }
@@ -91,10 +98,11 @@ impl Lease {
 }
 
 impl StartedPart {
-    /// Returns the parts whose runs this cell has started, and whose end has not arrived at the plant yet.
+    /// Returns the parts that this cell has begun to make, and whose end of run the plant has not received yet. The
+    /// part that was begun first comes first.
     ///
     /// # Errors
-    /// This computer did not sign in as a cell, or the plant cannot be reached.
+    /// Fails if the plant cannot be reached or refuses the query.
     pub async fn all(link: &DatabaseLink) -> Result<Vec<Self>, PlantError> {
         let text =
             "SELECT id, serial, recipe, due::text, lease, run FROM work WHERE state = 'begun' ORDER BY begun_at, id";
@@ -112,27 +120,29 @@ impl StartedPart {
         Ok(begun.collect())
     }
 
-    /// Returns the part to the queue after its run did nothing, which the caller has checked. `why` is the reason, for
-    /// the plant.
+    /// Returns the part to the queue because its run has commanded no machine. The caller must have checked this in the
+    /// journal of the run. `why` is the reason, which the plant stores.
     ///
     /// # Errors
-    /// The run has commanded a machine, or the plant cannot be reached.
+    /// Fails if the plant's copy shows that the run has commanded a machine or has ended. Fails if this cell has not
+    /// begun the part in this run, or if the plant cannot be reached.
     pub async fn give_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 
-    /// Gives the part up, because its run does not continue. The part gets no other run, unless a planner queues it
-    /// again. `why` is the reason, for the plant.
+    /// Marks the part as ended in the plant, because its run does not continue. The part gets no other run, unless a
+    /// planner puts it into the queue again. `why` is the reason, which the plant stores.
     ///
     /// # Errors
-    /// This cell has not started the part in the run [`StartedPart::run`], or the plant cannot be reached.
+    /// Fails if this cell has not begun the part in the run [`StartedPart::run`], or if the plant cannot be reached.
     pub async fn give_up(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 }
 
-/// Runs a query of the database that changes the state of the part `work`. If the answer contains a reason, the
-/// database has refused, and this reason is returned as an error.
+/// Runs the SQL query `text` with the parameters `values`. The query changes the state of the part with the number
+/// `work` in the queue. Returns an error if the database answers with a reason why it refuses the change, or if the
+/// plant cannot be reached.
 async fn answered(
     link: &DatabaseLink,
     work: i64,

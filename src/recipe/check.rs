@@ -21,8 +21,9 @@ use crate::surface::{DefinedSurface, SurfaceDefinition};
 /// Maximum number of points: more than any part is measured with.
 const MAX_POINTS: f64 = 1e6;
 
-/// Checks the values of a recipe. Reports each error to `document`. Returns the source of the nominal surface and the
-/// measuring pattern, which several keys define together; `None` for each that is invalid.
+/// Checks the values of the recipe `written`, and reports each error to `document`. `path` is the path of the recipe
+/// file. Returns the source of the nominal surface and the measuring pattern, each of which is defined by several keys.
+/// Returns `None` for each of the two that is missing or invalid.
 pub(super) fn check(
     written: &RecipeFile,
     path: &Path,
@@ -42,7 +43,8 @@ pub(super) fn check(
     (nominal, pattern(&written.measure, folder, document))
 }
 
-/// Returns a path of a recipe relative to `folder`, the folder of the recipe. An absolute path stays unchanged.
+/// Joins `folder`, the folder of the recipe, and `path`, a path that the recipe contains. Returns an absolute `path`
+/// unchanged.
 fn resolve_path(folder: &Path, path: &str) -> PathBuf {
     folder.join(path)
 }
@@ -102,8 +104,10 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
     None
 }
 
-/// Parses the tables `[nominal.surface]`, `[nominal.aperture]` and `[nominal.sampling]` as the definition of a surface
-/// by a formula. Returns `None` if a table is missing or invalid; this is then reported to `document`.
+/// Parses the tables `[nominal.surface]`, `[nominal.aperture]` and `[nominal.sampling]`, which define the nominal
+/// surface by a formula. The table `[nominal.sampling]` is optional.
+///
+/// Returns `None` if a required table is missing or if a table is invalid, and reports the fault to `document`.
 fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSource> {
     let tables = [("surface", &written.surface), ("aperture", &written.aperture), ("sampling", &written.sampling)];
     let missing = tables[..2].iter().filter(|(_, table)| table.is_none());
@@ -137,8 +141,9 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
     None
 }
 
-/// Removes the key from the beginning of a sentence such as "`key` must be positive", so that the sentence can follow
-/// the complete key. If it begins otherwise, puts "is refused: " in front.
+/// Removes the name of a key from the beginning of an error message, such as "`radius_mm` must be positive". The rest
+/// can then follow the full name of the key, such as `nominal.surface.radius_mm`. `key` is the name without backticks.
+/// If `sentence` does not begin with this key in backticks, returns "is refused: " and the whole sentence.
 fn without_key(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),
@@ -363,7 +368,9 @@ fn compensation(written: &Compensation, document: &mut Document) {
     }
 }
 
-/// Checks the values that the estimation of machine parameters requires, if the recipe compensates parameters.
+/// Checks the values that the estimation of machine parameters requires, such as a wheel above the part and locked
+/// directions of the registration. Reports each error to `document`. Does nothing if the recipe has no table
+/// `[compensation.parameters]`.
 fn parameters(written: &RecipeFile, document: &mut Document) {
     const KEY: &str = "compensation.parameters";
     let Some(parameters) = written.compensation.parameters else { return };
@@ -479,7 +486,8 @@ fn grinding(written: &Grinding, document: &mut Document) {
     }
 }
 
-/// Checks values that depend on a value in another table of the recipe.
+/// Checks values of the recipe against values in other tables of the recipe, such as the allowance against the number
+/// of cycles. Reports each error to `document`.
 fn check_tables(written: &RecipeFile, document: &mut Document) {
     if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
         && most < rms
@@ -512,8 +520,10 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
     }
 }
 
-/// Checks lengths in the recipe against the size and the curvature of the part, if the recipe defines the part by an
-/// outline or a formula.
+/// Checks lengths in the recipe against the part, and reports each error to `document`. `nominal` is the source of the
+/// nominal surface. If the recipe defines an outline of the part, checks against the size of this outline. If the
+/// recipe defines the surface by a formula, also checks against the curvature of the surface. Does nothing if `nominal`
+/// is `None`.
 fn check_against_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
     let (surface, aperture) = match nominal {
         Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
@@ -588,8 +598,9 @@ fn check_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
     }
 }
 
-/// Checks that the wheel and the ball of the probe fit into the concave regions of the surface, on the side where they
-/// touch it.
+/// Checks that the ball of the probe and a spherical wheel fit into the concave regions of `surface`, on the side that
+/// is measured. If the recipe does not state this side, uses the side with the larger minimum concave radius. Reports
+/// each error to `document`.
 fn check_against_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
     let hollows = curvature::min_concave_radii_mm(surface);
     let (radius_mm, place) = match written.measure.side {

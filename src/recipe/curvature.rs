@@ -5,11 +5,13 @@ use crate::surface::DefinedSurface;
 /// Number of evaluated positions along each axis of the aperture's box.
 const POSITIONS_PER_AXIS: usize = 61;
 
-/// Returns the smallest concave radius in mm, and its position (x, y), for each of two views: of the side towards +z,
-/// and of the side towards -z. The radius is infinite if this side has no concave region.
+/// Returns the smallest concave radius of the surface in mm, and its position (x, y) in mm. The first entry is for the
+/// side of the surface towards +z, the second for the side towards -z. The radius is infinite if the surface is not
+/// concave on this side.
 ///
-/// Curvature is computed from finite differences of the exact gradient on a grid. It is accurate to a few percent,
-/// which is enough to check a recipe. The registration checks the offset surface itself.
+/// Computes the curvature on a grid within the aperture, from finite differences of the exact gradient. The radius is
+/// accurate to a few percent, which is sufficient to check a recipe. The registration checks the offset surface (the
+/// surface on which the probe centres are) itself.
 pub(super) fn min_concave_radii_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
     let [[x0, y0], [x1, y1]] = surface.aperture().bounds();
     let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (POSITIONS_PER_AXIS - 1) as f64;
@@ -33,7 +35,9 @@ pub(super) fn min_concave_radii_mm(surface: &DefinedSurface) -> [(f64, [f64; 2])
     sharpest
 }
 
-/// Returns the minimum and the maximum principal curvature, in 1/mm. Returns `None` where the formula has no value.
+/// Returns the minimum and the maximum principal curvature of the surface at (`x`, `y`), in 1/mm. The curvature is
+/// positive if the surface is concave towards +z. `step_mm` is the step of the finite differences. Returns `None` if
+/// the formula has no value at this position or at a distance of one step from it, or if the curvature is not finite.
 fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64) -> Option<[f64; 2]> {
     let gradient = |x: f64, y: f64| surface.formula().sag_and_gradient(x, y).map(|(_, gradient)| gradient);
     let [p, q] = gradient(x, y)?;

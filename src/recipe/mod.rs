@@ -154,10 +154,11 @@ impl Recipe {
         nominal.into_iter().chain(pattern).collect()
     }
 
-    /// Parses a recipe from its text. `path` is used in messages; relative paths are relative to its folder.
+    /// Parses and checks a recipe from its `text`. `path` is the path of the recipe file. It is used in messages, and
+    /// relative paths in the recipe are relative to its folder. Does not read the file.
     ///
     /// # Errors
-    /// Returns all errors of the text.
+    /// Fails if the text has errors. The result contains all errors that were found.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         let notes = document.rename_keys(RENAMED);
@@ -189,19 +190,23 @@ impl Recipe {
         })
     }
 
-    /// Returns a problem with the value of `key` that another module has found, with the position of the key in the
-    /// file. `found` describes the value, `allowed` the permitted values, and `remedy` what to do.
+    /// Returns an error that reports a problem with the value of the recipe key `key`. The error contains the position
+    /// of this key in the recipe file. Other modules use this for problems that they find themselves. `found` describes
+    /// the value, `allowed` the permitted values, and `remedy` the action that solves the problem.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
 
-    /// Returns a note for each key that has a new name, with its line. The old names of earlier recipes are read.
+    /// Returns a note for each key that the recipe has under an old name. The note states the line, the old name and
+    /// the new name. An old name is not an error: its value is used.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Returns the options of a registration. `fixture_cmm_from_model` is the pose of the part in the fixture of the
-    /// cell; it is the start if the recipe demands this.
+    /// Returns the options of the registration as the recipe defines them. `fixture_cmm_from_model` is the pose of the
+    /// part in the fixture of the cell; it maps the model frame to the CMM frame. If the recipe sets
+    /// `registration.start` to the fixture, the registration begins with this pose. Otherwise the registration searches
+    /// for a start pose.
     pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::RegistrationOptions {
         let settings = &self.registration;
         registration::RegistrationOptions {
@@ -219,9 +224,9 @@ impl Recipe {
         }
     }
 
-    /// Returns the minimum probability that a figure is within its limit, for a part to be accepted. It is
-    /// `acceptance.probability`, or by default 0.975. In mode adaptive, the default is 1 - `accepted_risk` if that is
-    /// higher.
+    /// Returns the probability, from 0 to 1, with which a figure must be within its limit for the part to be accepted.
+    /// This is `acceptance.probability` if the recipe contains this key. Otherwise it is 0.975. In mode adaptive, it is
+    /// 1 - `measure.accepted_risk` instead if this is higher than 0.975.
     pub fn required_probability(&self) -> f64 {
         let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == SelectionMode::Adaptive);
         let usual = risk

@@ -361,8 +361,9 @@ pub struct ParameterTolerances {
 }
 
 impl ParameterTolerances {
-    /// Returns the tolerances of the machine parameters in mm and rad, in the order of
-    /// [`crate::compensation::ParameterKind::ALL`]. `None` for a parameter that is not compensated.
+    /// Returns the tolerance of each machine parameter, lengths in mm and angles in rad, in the order of
+    /// [`crate::compensation::ParameterKind::ALL`]. An entry is `None` if the recipe does not compensate this
+    /// parameter. The entry of the wear is always `None`.
     pub fn tolerances(&self) -> [Option<f64>; crate::compensation::ParameterKind::COUNT] {
         let [radius, x, y, z] =
             [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Micrometres::mm));
@@ -512,7 +513,8 @@ impl WheelDimensions {
     }
 }
 
-/// Default of a required number: NaN, which the check of the recipe reports as missing.
+/// Returns NaN, the default of a required number. NaN marks the number as missing, and the check of the recipe then
+/// reports it.
 fn missing() -> f64 {
     f64::NAN
 }
@@ -585,7 +587,9 @@ impl Default for RegistrationSettings {
 }
 
 impl Compensation {
-    /// Returns the rule that selects the gain: the share of the deviation that one correction removes.
+    /// Returns the rule that selects the gain, the share of the deviation that one correction removes. This is the
+    /// fixed value of the key `gain`, or else the rule in `gain_by`. If the recipe contains neither key, returns the
+    /// default rule.
     pub fn gain(&self) -> GainRule {
         self.gain.map_or(self.gain_by.unwrap_or_default(), GainRule::Fixed)
     }

@@ -38,8 +38,8 @@ impl Ruler {
         Self { scale, range, pixels }
     }
 
-    /// Returns the same mapping with a range that is widened to begin and end at a tick. `most` is the intended maximum
-    /// number of ticks.
+    /// Returns the same mapping with a wider range that begins and ends at a tick. `most` is the intended maximum
+    /// number of ticks on a linear axis. On a logarithmic axis the range begins and ends at a power of ten.
     pub(super) fn rounded(self, most: usize) -> Self {
         let [low, high] = self.range;
         let step = match self.scale {
@@ -60,7 +60,8 @@ impl Ruler {
         self.pixels[0] + t * (self.pixels[1] - self.pixels[0])
     }
 
-    /// Returns ticks at round numbers within the range. `most` is the maximum number of steps between them.
+    /// Returns the ticks at round numbers within the range of the axis. On a logarithmic axis these are powers of ten.
+    /// `most` is the maximum number of intervals into which the ticks divide the range.
     pub(super) fn ticks(&self, most: usize) -> Vec<Tick> {
         let [low, high] = self.range;
         match self.scale {

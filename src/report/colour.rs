@@ -74,8 +74,9 @@ const STEP: f64 = 0.4;
 const BEYOND: f64 = 1.25;
 
 impl Tones {
-    /// Returns a diverging colour scale from `-limit` to `limit`. `tolerance` is half the width of the band of values
-    /// that get only a tint. If `limit` is less than 1.25 times the tolerance, it is raised to this value.
+    /// Returns a diverging colour scale from `-limit` to `limit`. If `tolerance` is given, values from `-tolerance` to
+    /// `tolerance` get only a tint (a very light colour). If `limit` is less than 1.25 times `tolerance`, uses 1.25
+    /// times `tolerance` instead. If the limit is then not above 0, uses 1.
     pub(super) fn symmetric(limit: f64, tolerance: Option<f64>) -> Self {
         let limit = limit.max(tolerance.map_or(0.0, |t| BEYOND * t));
         // If all values are zero, they have no range of their own.
@@ -96,8 +97,9 @@ impl Tones {
         self.colours.at(0.5 + 0.5 * arm.copysign(value))
     }
 
-    /// Returns the gradient of the colour bar: pairs of a position, from 0 at the bottom to 1 at the top, and the
-    /// colour there. Between two positions the colour changes linearly.
+    /// Returns the colours of the colour bar as pairs of a position and a colour (red, green, blue). Position 0 is the
+    /// bottom of the bar, and 1 is the top. The colour changes linearly between two positions. At each end of a
+    /// tolerance band, two colours have the same position, so that the colour changes abruptly.
     pub(super) fn stops(&self) -> Vec<(f64, [u8; 3])> {
         let [low, high] = self.range;
         let place = |value: f64| (value - low) / (high - low);

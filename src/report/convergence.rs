@@ -7,8 +7,12 @@ use super::plot::{Axis, Plot, Series};
 use super::run_history::RunHistory;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 
-/// Returns an SVG plot of PV and RMS of each measured cycle, with their limits. Returns `None` if the record contains
-/// no tolerance, if fewer than two cycles were measured, or if a figure is 0: the axis is logarithmic.
+/// Returns an SVG plot of PV and RMS in µm for each measured cycle of the run, with the limits of both. The vertical
+/// axis is logarithmic. Returns `None` in these cases:
+///
+/// - the record of the run contains no tolerance;
+/// - fewer than two cycles have figures;
+/// - a number to draw is not finite or not above 0.
 pub(super) fn convergence(story: &RunHistory) -> Option<String> {
     let tolerance = story.tolerance()?;
     let measured = story.cycles.iter().filter_map(|(cycle, of)| {
@@ -39,8 +43,9 @@ const BARS: usize = 41;
 const CORNER: [f64; 2] = [70.0, 58.0];
 const SIZE: [f64; 2] = [460.0, 180.0];
 
-/// Returns the histogram, as SVG, of the errors at the nodes of a map. `samples_um` holds x, y and the error of each
-/// node. The axis extends from minus to plus the largest magnitude, and the bars have the colours of the map.
+/// Returns a histogram of the errors of a map as SVG. `samples_um` contains x, y and the error in µm of each node of
+/// the map; x and y are not used. The axis of the error is symmetric about zero, and its limit is the largest absolute
+/// error. Each bar has the colour that the diverging colour map gives its error. `title` is the title of the figure.
 pub(super) fn histogram(title: &str, samples_um: &[[f64; 3]]) -> Result<String, ReportError> {
     let largest = samples_um.iter().fold(0.0_f64, |largest, [.., error]| largest.max(error.abs()));
     let limit = if largest > 0.0 { largest } else { 1.0 };

@@ -46,8 +46,9 @@ pub struct DfqPart {
     pub limits_mm: [Option<f64>; 2],
 }
 
-/// Returns the Q-DAS ASCII file (DFQ) of several parts with the same name: PV and RMS, one value for each part, in the
-/// given order. `name` is the name of the part, `remark` a remark about the file. A limit is written only if it is the
+/// Returns the text of a Q-DAS ASCII file (DFQ) with PV and RMS in mm of several parts of the same kind. Each part
+/// gives one value of each figure, in the order of `parts`. A figure that is missing or not finite is omitted. `name`
+/// is the name of the parts, and `remark` a remark about the file. The limit of a figure is written only if it is the
 /// same for all parts.
 pub fn dfq_of_parts(name: &str, remark: &str, parts: &[DfqPart]) -> String {
     let mut file = Fields::default();
@@ -164,8 +165,9 @@ impl Fields {
         if self.text.is_ascii() { self.text } else { format!("\u{feff}{}", self.text) }
     }
 
-    /// Appends a line with the K-field `key` and its value, unless the value is empty. Control characters and ¤, which
-    /// separate values, become spaces. µ becomes u and ± becomes +-, for readers that support ASCII only.
+    /// Appends a line with the K-field `key` (a field of the Q-DAS format) and its `value`. Does nothing if the value
+    /// is empty. Replaces control characters and the separator ¤ in the value by spaces. Also replaces µ by u and ± by
+    /// +-, because some programs read only ASCII.
     fn field(&mut self, key: &str, value: &str) {
         let value = value
             .replace(|c: char| c.is_control() || c == '\u{a4}', " ")

@@ -12,8 +12,9 @@ use super::run_history::RunHistory;
 use regrind_cell::Device;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns the HTML table of the machines, the wheel and the probe of a run. `registration` is the content of the last
-/// `registration.json`. A value that is not on record is shown as "not reported".
+/// Returns the HTML table of the machines, the wheel and the probe of a run. `story` is the history of the run from its
+/// record. `registration` is the content of the newest file `registration.json`, or `None` if there is no such file. A
+/// value that is not on record is shown as "not reported".
 pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> String {
     let not_told = || "not reported".to_owned();
     let machine = |device: Device| {
@@ -39,16 +40,18 @@ pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> Str
     format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
 }
 
-/// Reads `model.json` of the last cycle that was registered. `folder` is the run folder. Returns `None` if the file
-/// does not exist or cannot be read.
+/// Reads the file `model.json` of the last cycle whose measurement was registered. `story` is the history of the run
+/// from its record, and `folder` the run folder. Returns `None` if no measurement was registered, or if the file cannot
+/// be read or is not JSON.
 pub(super) fn last_model(story: &RunHistory, folder: &Path) -> Option<Value> {
     let registration = story.cycles.values().rev().find_map(|of| of.registration.as_ref())?;
     let bytes = fs::read(folder.join(registration).with_file_name("model.json")).ok()?;
     serde_json::from_slice(&bytes).ok()
 }
 
-/// Reads `registration.json` of the last cycle that was registered, and returns it with the number of the cycle.
-/// `folder` is the run folder. Returns `Ok(None)` if no measurement was registered.
+/// Reads the file `registration.json` of the last cycle whose measurement was registered. Returns the number of this
+/// cycle and the content of the file. `story` is the history of the run from its record, and `folder` the run folder.
+/// Returns `Ok(None)` if no measurement was registered.
 ///
 /// # Errors
 /// Fails if the file cannot be read or is not JSON.
@@ -62,8 +65,9 @@ pub(super) fn last_registration(story: &RunHistory, folder: &Path) -> Result<Opt
     Ok(Some((cycle, found)))
 }
 
-/// Returns the HTML table of the registration of a cycle, with the uncertainty of the pose, and the table of the
-/// uncertainty budget. `found` is the content of `registration.json`, `model` that of `model.json`.
+/// Returns two HTML tables about the registration of a cycle: the quality of the fit with the uncertainty of the pose,
+/// and the uncertainty budget. `found` is the content of `registration.json`, and `model` the content of `model.json`.
+/// If `model` is `None` or contains no budget, the second table is omitted.
 pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
     let number = |key: &str| found[key].as_f64();
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);

@@ -12,11 +12,12 @@ use super::axis::three_digits;
 use super::run_history::RunHistory;
 use regrind_formats::{FormatError, escaped};
 
-/// Returns the HTML section about the form of the surface: a row for each figure, a column for each cycle with figures.
-/// `folder` is the run folder. Returns an empty text if no cycle has figures.
+/// Returns the HTML section about the form of the surface. Its tables have a row for each figure, such as PV, and a
+/// column for each cycle that has figures. `story` is the history of the run from its record, and `folder` the run
+/// folder. Returns an empty text if no cycle has figures.
 ///
 /// # Errors
-/// Fails if a file of figures cannot be read.
+/// Fails if a file of figures cannot be read or is not JSON.
 pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
     for (number, cycle) in &story.cycles {
@@ -50,9 +51,10 @@ fn heads(cycles: &[(u32, Value)]) -> String {
     cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect()
 }
 
-/// Returns the HTML table of the figures of the form that the model estimates, with their credible intervals. `cycles`
-/// holds the number and the figures of each cycle, `last` the figures of the last cycle. Returns an empty text for
-/// files of earlier versions, which do not contain these figures.
+/// Returns the HTML table of the figures of the form that the model estimates without the noise of the probe. Each
+/// figure has its median and its 95 % credible interval. `cycles` contains the number and the figures of each cycle.
+/// `last` contains the figures of the last cycle, which determine the rows of the table. Returns an empty text if
+/// `last` has no estimated figures, as in files of earlier versions.
 fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
     let list = listed(last, "form");
     if list.is_empty() {
@@ -92,8 +94,9 @@ fn interval(row: &Value) -> Option<[String; 3]> {
     Some([number("median")?, number("low")?, number("high")?])
 }
 
-/// Returns the HTML table of the figures that were computed directly from the measured points and from the map.
-/// `cycles` holds the number and the figures of each cycle, `last` the figures of the last cycle.
+/// Returns the HTML table of the figures that were computed directly from the measured points and from the map. These
+/// figures include the noise of the probe. `cycles` contains the number and the figures of each cycle. `last` contains
+/// the figures of the last cycle, which determine the rows of the table.
 fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
     let mut html = format!(
@@ -120,8 +123,9 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     html + "</table>\n"
 }
 
-/// Returns an HTML list with the tolerance indication by ISO 10110-5 that the form of the part meets in each cycle.
-/// `cycles` holds the number and the figures of each cycle.
+/// Returns an HTML list with the tolerance indications by ISO 10110-5 for each cycle: the one that the form of the part
+/// meets with a probability of 97.5 %, and the one that the measured points just meet. Omits the first for files that
+/// do not contain it. `cycles` contains the number and the figures of each cycle.
 fn notations(cycles: &[(u32, Value)]) -> String {
     let mut html = "<p>The descriptions of the figures are those of the last cycle. All figures are along the outward normal, positive where material is proud; \
                     they are figures of the surface, not of a wavefront. Indication of ISO 10110-5, in nanometres, that the form meets in each value with \

@@ -38,12 +38,14 @@ pub struct HeatMap {
 }
 
 impl HeatMap {
-    /// Creates a heat map of samples of any quantity. The quantity is named `quantity` and given in `unit`.
+    /// Creates a heat map of samples of any quantity. `title` is the title of the figure. `quantity` is the name of the
+    /// quantity, and `unit` its unit; both label the colour bar.
     ///
     /// Shapes: two or more samples (x, y, value) in any order. Units: x and y in millimetres, the value in `unit`.
     ///
     /// # Errors
-    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples are at one place.
+    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples have the same position
+    /// (x, y).
     pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         let raster = Raster::new(title, samples)?;
         let [low, high] = range(samples.iter().map(|s| s[2]));
@@ -78,8 +80,10 @@ impl HeatMap {
         Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
     }
 
-    /// Creates a heat map of the deviations of a registration, at their contact points. Only the points that the
-    /// registration used are shown, without outliers. Red is above the nominal surface, blue is below it.
+    /// Creates a heat map of the deviations of measured points from the nominal surface, after a registration. Each
+    /// deviation is drawn at the x and y of its contact point. Omits outliers and other points that are not inliers.
+    /// Red is above the nominal surface, blue is below it. The map shows micrometres, or nanometres if the peak to
+    /// valley is below 0.1 µm.
     ///
     /// Frame: model.
     ///
@@ -91,8 +95,9 @@ impl HeatMap {
         Self::of_lengths(title, "deviation", &samples)
     }
 
-    /// Sets the colour map and its range: symmetric about zero for [`ColourMap::Diverging`], from the minimum to the
-    /// maximum for [`ColourMap::Sequential`]. Removes a tolerance that was set before.
+    /// Sets the colour map and its range. For [`ColourMap::Diverging`], the range is symmetric about zero. For
+    /// [`ColourMap::Sequential`], it goes from the minimum to the maximum of the map. Removes a tolerance that was set
+    /// before.
     pub fn with_colours(self, colours: ColourMap) -> Self {
         let [low, high] = range(self.raster.values.iter().copied());
         let range = match colours {
@@ -104,8 +109,9 @@ impl HeatMap {
         Self { tones: Tones { colours, range, tolerance: None }, ..self }
     }
 
-    /// Sets a tolerance: values from `-tolerance` to `tolerance` get only a tint, and the colour bar marks this band.
-    /// The colour bar is extended if it would end within the band.
+    /// Sets a tolerance. Values from `-tolerance` to `tolerance` get only a tint (a very light colour), and the colour
+    /// bar marks this band. Always uses the diverging colour map with a range that is symmetric about zero. If the
+    /// range of the colours ends less than 25 % beyond the tolerance, extends the range.
     ///
     /// Units: millimetres for a map of lengths, otherwise the unit of the map.
     ///
@@ -120,8 +126,9 @@ impl HeatMap {
         Ok(Self { tones, ..self })
     }
 
-    /// Sets the range of the colours from `-limit` to `limit`, so that maps with the same limit can be compared. Values
-    /// beyond the limit get the colour of the nearer end. Removes a tolerance that was set before.
+    /// Sets the range of the colours from `-limit` to `limit`, so that maps with the same limit can be compared. Always
+    /// uses the diverging colour map. A value beyond the limit gets the colour of the nearer end. A limit of 0 gives
+    /// the range from -1 to 1. Removes a tolerance that was set before.
     ///
     /// Units: the unit of the map.
     ///
@@ -134,13 +141,14 @@ impl HeatMap {
         Ok(Self { tones: Tones::symmetric(limit, None), ..self })
     }
 
-    /// Sets the lines of text below the title.
+    /// Sets the lines of text between the title and the summary line with PV and RMS. Replaces lines that were set
+    /// before.
     pub fn with_lines(self, lines: Vec<String>) -> Self {
         Self { lines, ..self }
     }
 
-    /// Marks the samples as nodes of a map. The summary below the title then says that PV and RMS are those of the map,
-    /// not those of measured points.
+    /// Declares that the samples are nodes of a grid map and not measured points. The summary line below the title then
+    /// names PV and RMS as figures of the map, and counts nodes instead of points.
     pub fn of_nodes(self) -> Self {
         Self { figures_of: [" of the map", "nodes"], ..self }
     }
@@ -150,7 +158,9 @@ impl HeatMap {
         Self { max_size: largest, ..self }
     }
 
-    /// Makes the pixels outside `aperture` transparent, also those that were filled between samples.
+    /// Makes the pixels outside `aperture` transparent, also pixels that were filled in between samples. A pixel whose
+    /// centre is outside by at most half of its diagonal remains visible, because a sample on the rim fills such a
+    /// pixel.
     ///
     /// Units: millimetres. Frame: that of the samples.
     pub fn within(mut self, aperture: &Aperture) -> Self {
@@ -180,11 +190,12 @@ impl HeatMap {
         self.rms
     }
 
-    /// Returns the map alone, without axes and text, as a PNG of 255 colours. A pixel of the PNG is a cell of the grid
-    /// into which the samples were collected. y is upwards; places without samples are transparent.
+    /// Returns the map alone, without axes and text, as a PNG image with 255 colours. Each pixel of the image is one
+    /// cell of the grid on which the map averages its samples. The y axis points upwards. Pixels without a value are
+    /// transparent.
     ///
     /// # Errors
-    /// Fails if the pixels cannot be encoded.
+    /// Fails if the PNG encoder returns an error.
     pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
         let mut palette = vec![0; 3];
         let [low, high] = self.tones.range;
@@ -243,8 +254,8 @@ impl HeatMap {
         Ok(svg.finish())
     }
 
-    /// Returns the lines of text below the title, the summary last. A line that is wider than `width` pixels is broken
-    /// into several lines.
+    /// Returns the lines of text below the title. The last line is the summary, which contains the figures of the map
+    /// and the number of samples. A line that is wider than `width` pixels is broken into several lines.
     fn lines_within(&self, width: f64) -> Vec<String> {
         let summary = self.summary();
         self.lines.iter().chain([&summary]).flat_map(|line| broken(line, (width / LETTER) as usize)).collect()
@@ -331,11 +342,11 @@ impl HeatMap {
         Ok(write_atomic(path, &self.to_png()?)?)
     }
 
-    /// Saves the map alone, as PNG, with the word SIMULATION in a band above it. A map with too few pixels for the word
-    /// is enlarged.
+    /// Saves the map alone, without axes and text, as a PNG file at `path`. Adds a strip above the map with the word
+    /// SIMULATION. If the map has too few pixels for the word, enlarges the map.
     ///
     /// # Errors
-    /// Fails if the pixels cannot be encoded or if the file cannot be written.
+    /// Fails if the image cannot be encoded or if the file cannot be written.
     pub fn save_simulated_png(&self, path: &Path) -> Result<(), ReportError> {
         let columns = self.raster.grid.columns;
         let tone = |value: &f64| {
@@ -376,8 +387,8 @@ const LINE: f64 = 18.0;
 /// Average width of a letter in those lines. It is also sufficient if a wider typeface replaces the intended one.
 const LETTER: f64 = 6.8;
 
-/// Breaks a line into lines of at most `most` characters: after the last comma that fits, otherwise after the last word
-/// that fits. A word that is longer than `most` stays in one line with the rest.
+/// Breaks `line` into lines of at most `most` characters. Breaks after the last comma that fits, or else at the last
+/// space that fits. If neither fits, the rest of the text stays in one line, which is then longer than `most`.
 fn broken(line: &str, most: usize) -> Vec<String> {
     let (mut lines, mut rest) = (Vec::new(), line);
     while let Some((end, _)) = rest.char_indices().nth(most) {

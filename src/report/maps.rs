@@ -33,12 +33,13 @@ impl CycleMap {
         low.abs().max(high.abs())
     }
 
-    /// Returns the HTML figure of the map, with colours from `-limit_um` to `limit_um`. `largest` is the maximum width
-    /// and height of the map in pixels, `caption` the text below it. If the map cannot be drawn, the figure contains
-    /// the reason instead.
+    /// Returns an HTML figure with the coloured map of this cycle and a caption below the map. The colour scale runs
+    /// from `-limit_um` to `limit_um`, in micrometres. `largest` is the maximum width and height of the map in pixels.
+    /// The caption is the number of the cycle, followed by `caption`. If the map cannot be drawn, the figure contains
+    /// the reason as text.
     ///
     /// # Errors
-    /// Fails if a file cannot be read or written.
+    /// Fails if the drawing returns a file error.
     fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
         let width = largest[0] + BESIDE;
         let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
@@ -68,11 +69,13 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
     text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
 }
 
-/// Returns the HTML section with the error maps of the first and the last cycle and the histogram of the last. `folder`
-/// is the run folder, `begin` the content of the first record. Returns an empty text if no map is on record.
+/// Returns the HTML section of the filtered error maps. It contains the maps of the first and the last cycle on one
+/// colour scale, the map of the last cycle on its own scale, and the histogram of that map. If only one cycle has a
+/// map, the pair on one scale is omitted. `folder` is the run folder. `begin` is the content of the first record of the
+/// run. Returns an empty text if no cycle has an error map.
 ///
 /// # Errors
-/// Fails if an error map cannot be read.
+/// Fails if the file of an error map cannot be read, or if the histogram cannot be drawn.
 pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };

@@ -83,8 +83,8 @@ impl Plot {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Returns the maximum number of ticks of the x axis: at most 10. If all x are whole numbers, there are no more
-    /// ticks than whole numbers in the range.
+    /// Returns the maximum number of ticks of the x axis. The number is 10, or less if all x values of the plot are
+    /// integers. In that case it is the difference between the largest and the smallest x, limited to 1 to 10.
     fn max_x_ticks(&self) -> usize {
         const MAX: usize = 10;
         let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
@@ -92,8 +92,8 @@ impl Plot {
         if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MAX) } else { MAX }
     }
 
-    /// Returns the mapping from coordinates to pixels for one axis: x for `k` = 0, y for `k` = 1. Its range covers all
-    /// points.
+    /// Returns the mapping from plot coordinates to pixels for one axis: the x axis for `k` = 0, the y axis for `k` =
+    /// 1. The range of the axis contains the points of all series. It is widened to begin and end at a tick.
     ///
     /// # Errors
     /// Fails if there are no points, if a number is not finite, or if a number on a logarithmic axis is not above 0.

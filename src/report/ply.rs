@@ -6,17 +6,19 @@ use super::ReportError;
 use super::colour::Tones;
 use regrind_formats::write_atomic;
 
-/// Returns points, and optional triangles between them, as a binary PLY file with the colour and the deviation of each
-/// point.
+/// Returns a binary PLY file with points, their colours and their deviations, and optional triangles between the
+/// points.
 ///
-/// Shapes: a row (x, y, z, deviation) for each point; a triangle has three indices of rows, counted from 0. Units:
-/// millimetres; the property `scalar_deviation_um` is in micrometres. Colours: those of [`HeatMap`](crate::HeatMap),
-/// symmetric about zero. Values from `-tolerance_mm` to `tolerance_mm` get only a tint. `title` and each of the
-/// `remarks` become a comment in the file.
+/// `rows_mm` has one row for each point: x, y, z and the deviation, all in millimetres. Each of the `triangles` has
+/// three indices into `rows_mm`, counted from 0. `title` and each of the `remarks` become a comment in the file.
+///
+/// The file gives the deviation of each point in micrometres, as the PLY property `scalar_deviation_um`. The colours
+/// are those of [`HeatMap`](crate::HeatMap), symmetric about zero. With a `tolerance_mm`, points with a deviation from
+/// `-tolerance_mm` to `tolerance_mm` get only pale colours.
 ///
 /// # Errors
-/// Fails if there is no point, if a number is not finite, if the tolerance is not above 0, or if a triangle refers to a
-/// point that does not exist.
+/// Fails if there is no point, if a number is not finite, if the tolerance is not finite and above 0, or if a triangle
+/// refers to a point that does not exist.
 pub fn coloured_ply(
     title: &str,
     rows_mm: &[[f64; 4]],
@@ -55,7 +57,8 @@ pub fn coloured_ply(
     Ok(bytes)
 }
 
-/// Saves the result of [`coloured_ply`].
+/// Writes points with their colours and deviations as a binary PLY file to `path`. The other parameters are those of
+/// [`coloured_ply`], which makes the content of the file.
 ///
 /// # Errors
 /// Fails as [`coloured_ply`] does, or if the file cannot be written.

@@ -127,8 +127,9 @@ fn attributes(xml: &mut Xml, list: &[(&str, &str)]) {
     });
 }
 
-/// Writes the definition, the nominal and the item of each figure. Their identifiers are `FIRST_FIGURE + 3 k`, and the
-/// two numbers after it, for the figure with the index k.
+/// Writes the QIF element `Characteristics`. Each figure of the results (such as PV or RMS) gets three child elements:
+/// its definition with name and limit, its nominal, and its item. For the figure with the index k, counted from 0, the
+/// definition has the identifier n = `FIRST_FIGURE + 3 k`, the nominal n + 1, and the item n + 2.
 fn characteristics(xml: &mut Xml, results: &Results) {
     let kinds: Vec<_> = (FIRST_FIGURE..).step_by(3).zip(results.kinds()).collect();
     let n = kinds.len().to_string();
@@ -259,13 +260,15 @@ fn inspection_status(of: &Measured) -> &'static str {
     }
 }
 
-/// Formats a length in millimetres with nine decimals (a picometre). An `xs:decimal` must not have an exponent.
+/// Formats a length in millimetres with nine decimals and without an exponent. The XML type `xs:decimal` does not allow
+/// an exponent. The last decimal is a picometre.
 fn mm(value: f64) -> String {
     format!("{value:.9}")
 }
 
-/// Returns a UUID (version 8) that is derived from `head`, the hash of the last record. `number` distinguishes the
-/// document (0) from its parts (from 1), so that the same record always gives the same identifiers.
+/// Returns a UUID (version 8) that is computed from `head` and `number`. `head` is the hash of the last record, in
+/// hexadecimal digits. `number` is 0 for the document and at least 1 for its parts, so that each of them gets its own
+/// UUID. The same arguments always give the same UUID.
 fn identity(head: &str, number: u32) -> String {
     let hex: String = head.chars().filter(char::is_ascii_hexdigit).take(24).collect();
     let hex = format!("{hex:0<24}{number:08x}");

@@ -25,14 +25,15 @@ const LINES_REACH: usize = 8;
 const MIN_WEIGHT: f64 = 1e-3;
 
 impl Raster {
-    /// Collects samples (x, y, value) into pixels. Each sample is shared between the four pixels around it, and a pixel
-    /// gets the weighted mean of its samples. `title` names the figure in errors.
+    /// Creates a grid of pixels from `samples`, each with the position x and y and a value. Each sample contributes to
+    /// the four pixels around it, with bilinear weights. The value of a pixel is the weighted mean of these
+    /// contributions. `title` is the name of the figure in error messages.
     ///
-    /// The width of a pixel is about the distance between samples. Small gaps within the cloud of samples are filled
-    /// from their neighbours.
+    /// The width of a pixel is about the distance between samples. Small gaps between the samples are filled with the
+    /// mean of neighbouring pixels. Other pixels without a sample are NaN.
     ///
     /// # Errors
-    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples are at one place.
+    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples have the same x and y.
     pub(super) fn new(title: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         check(title, samples)?;
         let (low, size) = extent(samples);
@@ -69,8 +70,10 @@ impl Raster {
         sums.into_iter().map(|[sum, total]| if total >= MIN_WEIGHT { sum / total } else { f64::NAN }).collect()
     }
 
-    /// Fills gaps that are narrower than twice the reach, from their sides inwards, with the mean of neighbouring
-    /// pixels. The reach is [`REACH`], or [`LINES_REACH`] if the samples are scan lines.
+    /// Fills narrow gaps between the pixels that have a value. A filled pixel gets the mean of its neighbours that have
+    /// a value. The filling starts at the border of a gap and proceeds to its middle. Gaps of up to twice the reach (in
+    /// pixels) are filled. The reach is [`REACH`], or [`LINES_REACH`] if the samples are scan lines: dense along each
+    /// line and sparse across the lines.
     fn fill(&mut self) {
         let known: Vec<bool> = self.values.iter().map(|v| !v.is_nan()).collect();
         let count = |mask: &[bool]| mask.iter().filter(|&&m| m).count();
@@ -105,8 +108,9 @@ impl Raster {
         sum / total
     }
 
-    /// Returns the morphological closing of `mask` by a square: the true area is dilated by `reach` pixels, then eroded
-    /// by `reach` pixels. This fills gaps of up to twice this width.
+    /// Returns the morphological closing of `mask` with a square. The area of the pixels that are true is dilated by
+    /// `reach` pixels, then eroded by `reach` pixels. Thus gaps of up to 2 * `reach` pixels become true. `mask` and the
+    /// result have one entry for each pixel, row by row.
     fn closed(&self, mask: &[bool], reach: usize) -> Vec<bool> {
         let (columns, rows) = (self.grid.columns + 2 * reach, self.grid.rows + 2 * reach);
         let mut wide = vec![false; columns * rows];
@@ -121,8 +125,10 @@ impl Raster {
     }
 }
 
-/// Dilates the pixels of `mask` that have this `value`: returns a mask in which each pixel has the value if a pixel at
-/// most `reach` columns and `reach` rows away has it.
+/// Returns a mask in which the area of the pixels with the value `value` has grown by `reach` pixels. A pixel of the
+/// result is `value` if `mask` has this value within `reach` columns and `reach` rows of the pixel. Thus `value` = true
+/// dilates the true area, and `value` = false erodes it. `mask` and the result have `columns` by `rows` pixels, row by
+/// row.
 fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool) -> Vec<bool> {
     let mut along = vec![!value; mask.len()];
     let mut out = vec![!value; mask.len()];
@@ -139,8 +145,9 @@ fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool)
     out
 }
 
-/// Returns the spacing of a square grid of `points` nodes over a rectangle of `width` by `height`. With n points and
-/// the size w by h, the spacing s solves (n - 1) s^2 = (w + h) s + w h.
+/// Returns the spacing of a square grid that covers a rectangle of `width` by `height` with about `points` nodes. The
+/// spacing has the unit of `width` and `height`. With n points and the size w by h, the spacing s solves (n - 1) s^2 =
+/// (w + h) s + w h. `points` must be at least 2.
 fn spacing([width, height]: [f64; 2], points: usize) -> f64 {
     let (sum, n) = (width + height, (points - 1) as f64);
     (sum + (sum * sum + 4.0 * n * width * height).sqrt()) / (2.0 * n)

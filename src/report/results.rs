@@ -43,11 +43,11 @@ pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Pat
 }
 
 /// Verifies the record in the run folder `folder` and returns the results of the run as text in `format`. The same
-/// record always gives the same bytes.
+/// record always gives the same text, byte for byte.
 ///
 /// # Errors
-/// Fails if the record is missing or does not pass verification, if a file of figures cannot be read, or if nothing was
-/// measured.
+/// Fails if the record is missing or does not pass verification, if a file `figures.json` of a cycle cannot be read, or
+/// if no measurement of the run has figures.
 pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
     let results = Results::from_history(&story, verified.head.to_string()).with_areas(&story, folder)?;
@@ -159,18 +159,20 @@ impl Results {
         }
     }
 
-    /// Returns name, meaning and limit of each figure that the file of results contains. They are those of the
-    /// measurement with the most figures, in its order.
+    /// Returns the name, the meaning and the limit of each figure that the file of results lists. The list is that of
+    /// the measurement with the most figures, in the order of that measurement. Returns nothing if there is no
+    /// measurement.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
         let most = self.measured.iter().max_by_key(|of| of.figures.len());
         most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
     }
 
-    /// Adds the figures of ISO 10110-5 to the last measurement of each cycle. They are read from `figures.json` of the
-    /// cycle in the run folder `folder`.
+    /// Adds the figures of ISO 10110-5 to the last usable measurement of each cycle. They are read from the file
+    /// `figures.json` of the cycle in the run folder `folder`. Nothing is added for a cycle without this file, or if
+    /// one of the six figures is missing in it.
     ///
     /// # Errors
-    /// Fails if a file of figures cannot be read.
+    /// Fails if a `figures.json` on record cannot be read.
     fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
@@ -219,11 +221,14 @@ fn decision_rule(tolerance: &Tolerance) -> String {
     }
 }
 
-/// Returns the figures of a measurement for the file of results: first the figures that the tolerance selects, with
-/// their limits. If these do not include the peak to valley of all measured points, it follows for information.
+/// Returns the figures of a measurement for the file of results.
 ///
-/// `judged` is true if the measurement was judged; otherwise the status of each figure is [`LimitStatus::NotJudged`].
-/// Without a tolerance, returns PV and RMS of the points without limits.
+/// With a `tolerance`, the judged figures come first, with their limits. After them comes the peak to valley (PV) of
+/// the measured points, without a limit and for information only. It is omitted if the judged PV already is that of all
+/// measured points. Without a `tolerance`, returns the PV and the RMS of the measured points, without limits.
+///
+/// `judged` is true if the cell judged the measurement. If it is false, the status of each figure is
+/// [`LimitStatus::NotJudged`]. A figure without a limit has the same status.
 fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
     let compared = tolerance.map(|tolerance| tolerance.compare(figures));
     // The form is judged. The figure of the points, which contains the noise of the probe, is added for information.
@@ -306,8 +311,9 @@ const AREAS: [(&str, &str, &str); 6] = [
     ),
 ];
 
-/// Returns the figures of ISO 10110-5 with their uncertainty. `told` is the content of `figures.json`. Returns `None`
-/// if one of the six figures is missing.
+/// Returns the six figures of ISO 10110-5 in millimetres, each with its expanded uncertainty and without a limit.
+/// `told` is the JSON content of `figures.json`, which gives the figures in nanometres. The expanded uncertainty is
+/// half the width of the interval in the file. Returns `None` if one of the figures is missing.
 fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     const MM_OF_NM: f64 = 1e-6;
     let rows = told["form"].as_array()?;

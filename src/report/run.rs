@@ -109,8 +109,8 @@ fn verdict(story: &RunHistory) -> String {
     format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
 }
 
-/// Returns an HTML paragraph that says how the last pass ended and which share of its path was ground. Returns an empty
-/// text if the last pass is complete or no pass was started.
+/// Returns an HTML paragraph about an incomplete last pass: how the pass ended, and which percentage of its path was
+/// ground, if the grinder reported this. Returns an empty text if the last pass is complete, or if no pass was started.
 fn broken_off_pass(story: &RunHistory) -> String {
     let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
     let how = match result {
@@ -166,8 +166,9 @@ fn um(mm: f64) -> String {
     format!("{:.2}", 1e3 * mm)
 }
 
-/// Returns in words if a figure is within its limit, with the compared numbers. `with_uncertainty` is true if the
-/// decision rule uses the uncertainty. Returns an empty text if the figure has no limit.
+/// Returns a text that says if a figure is within its limit, beyond it, or not decided. The text includes the compared
+/// values in micrometres, such as "within the limit: at most 3.10 ≤ 7.00". `with_uncertainty` is true if the decision
+/// rule uses the uncertainty of the figure. Returns an empty text if the figure has no limit.
 fn comparison(compared: &ComparedFigure, with_uncertainty: bool) -> String {
     let ComparedFigure { median_mm: found_mm, compared_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
@@ -237,7 +238,8 @@ fn facts(story: &RunHistory, begin: &Value) -> String {
     format!("<h2>Run</h2>\n<table>\n{}</table>\n", rows.collect::<String>())
 }
 
-/// Formats a time of the record (RFC 3339 in UTC) for people, to the second.
+/// Formats a time from a record in a readable form, without fractions of a second, such as "2026-01-31 09:15:00 UTC".
+/// `utc` is a time in UTC in the format RFC 3339.
 pub(super) fn when(utc: &str) -> String {
     let second: String = utc.chars().take(19).collect();
     format!("{} UTC", second.replacen('T', " ", 1))
@@ -275,8 +277,11 @@ fn cycles(story: &RunHistory) -> String {
             (k = 2). The level is the height of the target surface above the nominal surface.</p>\n"
 }
 
-/// Returns the HTML table of the estimated machine parameters of each cycle, with the values that were compensated, and
-/// the rms of the error that was left for the map. Returns an empty text if the record contains no parameters.
+/// Returns the HTML table of the estimated machine parameters, such as the radius error of the wheel, for each cycle. A
+/// row shows the estimated deviation with its expanded uncertainty (k = 2), the compensated part of it, the correction
+/// of the next pass, and the reduction of the rms error in micrometres. Below the table is the rms of the residual
+/// error of each cycle, which the correction map must correct. Returns an empty text if the record contains no
+/// parameters.
 fn parameters(story: &RunHistory) -> String {
     let row = |number: u32, of: &RecordedParameter| {
         let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
@@ -319,8 +324,10 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
     )
 }
 
-/// Returns the table cells, as HTML, with the figures of a measurement. With a tolerance they are the judged figures,
-/// otherwise the figures of all points. `level` is the text of the last cell.
+/// Returns the HTML table cells for the figures `f` of a measurement: PV and RMS with their expanded uncertainties in
+/// micrometres, the number of points, the number of outliers, the coverage in percent, and `level`. With a `tolerance`,
+/// PV and RMS are the judged figures. Without a `tolerance`, they are those of all measured points. `level` is the
+/// complete text of the last cell.
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
     // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
@@ -339,8 +346,10 @@ fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> Strin
     )
 }
 
-/// Returns two texts: the verdict of a measurement, and its reason with any earlier judgements. If the measurement was
-/// not judged, the verdict is "not judged", or "no figures" if it has none.
+/// Returns two texts about a measurement: the verdict of its last judgement, and the reason for it. The earlier
+/// judgements of the same measurement follow after the reason. If the measurement was not judged, the verdict is "not
+/// judged", or "no figures" if the measurement has no figures. The second text is then the reason why the measurement
+/// is not usable, or empty.
 fn judgement_of(measurement: &Measurement) -> (String, String) {
     let unusable = || measurement.unusable.clone().unwrap_or_default();
     let Some((last, earlier)) = measurement.judgements.split_last() else {

@@ -91,8 +91,8 @@ pub(super) struct Measurement {
 }
 
 impl Measurement {
-    /// Returns true if this measurement is not complete: the figures say which places to touch next, and these touches
-    /// belong to the same measurement.
+    /// Returns true if this measurement is not complete, because its figures request further touches of the probe.
+    /// These touches belong to the same measurement. Returns false if the measurement has no figures.
     fn expects_more_touches(&self) -> bool {
         self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
     }
@@ -119,7 +119,7 @@ pub(super) struct Order {
 
 impl RunHistory {
     /// Verifies the record in the run folder `folder`. Returns the history of the run and the result of the
-    /// verification. Records after the verified part are not read.
+    /// verification. Records that were written after the verification are not read.
     ///
     /// # Errors
     /// Fails if the record cannot be read or does not pass verification.
@@ -300,8 +300,9 @@ impl Order {
         words(&self.record)
     }
 
-    /// Returns in words what became of the order: accepted, or refused with the reason. For an order that went directly
-    /// to a machine it is "on record", because later records show the result.
+    /// Returns the answer to this order of a person, as text: "accepted", or "refused: " and the reason. The text is
+    /// "on record" if the order went directly to a machine and not to the cell, because then later records show the
+    /// result.
     pub(super) fn answer(&self) -> String {
         match (&self.refused, &self.event) {
             (Some(why), _) => format!("refused: {why}"),

@@ -29,9 +29,9 @@ pub(super) struct MarkedPicture {
     pub rgba: Vec<u8>,
 }
 
-/// Puts the word SIMULATION in a band above a picture. `pixels` (red, green, blue, opacity) are given row by row from
-/// the top, `columns` in each row. A small picture is enlarged, so that the word has room: each pixel becomes a square
-/// of several pixels.
+/// Returns a copy of a picture with the word SIMULATION in a band above it. `pixels` are the pixels of the picture
+/// (red, green, blue, opacity), row by row from the top. `columns` is the number of pixels in a row. If the picture is
+/// too narrow for the word, the copy is enlarged: each pixel becomes a square of several pixels.
 pub(super) fn mark_simulation(pixels: &[[u8; 4]], columns: usize) -> MarkedPicture {
     let rows = pixels.len() / columns;
     let enlarged = MIN_WIDTH.div_ceil(columns);
@@ -53,8 +53,9 @@ pub(super) fn mark_simulation(pixels: &[[u8; 4]], columns: usize) -> MarkedPictu
     MarkedPicture { width, height: band + rows * enlarged, rgba }
 }
 
-/// Returns true if a pixel of the band belongs to a letter of the word. `x` counts from the left of the first letter,
-/// `y` from the top of the band; both are in pixels of the letters.
+/// Returns true if a point of the band above a picture belongs to a letter of the word SIMULATION. The letters are
+/// drawn on a grid of 5 by 7 cells each. `x` and `y` are cell indices: `x` counts from the left edge of the first
+/// letter, `y` from the top of the band.
 fn is_inked(x: usize, y: usize) -> bool {
     const ABOVE: usize = 2;
     const WIDE: usize = 5;

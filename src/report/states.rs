@@ -251,7 +251,9 @@ fn boxes(nodes: &[Node]) -> Vec<OccupiedRectangle> {
     nodes.iter().map(|node| (node.middle, node.half)).collect()
 }
 
-/// Returns an arrow for each pair of states in `ways`, if both states have a box in `nodes`.
+/// Returns one arrow for each pair of states that has a transition in `ways`. `ways` gives the events of each
+/// transition, by the names of both states. A pair is omitted if one of the states has no box in `nodes`. The arrow
+/// holds the indices of both boxes and the events.
 fn edges(nodes: &[Node], ways: &TransitionEvents) -> Vec<Edge> {
     let index = |name: &str| nodes.iter().position(|node| node.name == name);
     let known = ways
@@ -288,8 +290,9 @@ fn colour_of(events: &BTreeSet<String>) -> &'static str {
     }
 }
 
-/// Returns the label of an arrow: the names of at most two of its events, and the number of further events. Orders come
-/// first, then the normal course of a run, then faults.
+/// Returns the label of an arrow between two states: the names of at most two of its `events`. If there are more
+/// events, their number follows, such as "start, resume +3". Orders of a person come first, then the events of normal
+/// operation, then faults.
 fn label_of(events: &BTreeSet<String>) -> String {
     let rank = |event: &&String| {
         let known = |names: &[&str]| names.contains(&event.as_str());
@@ -301,8 +304,11 @@ fn label_of(events: &BTreeSet<String>) -> String {
     if sorted.len() > 2 { format!("{named} +{}", sorted.len() - 2) } else { named }
 }
 
-/// Returns start, control point and end of a curve between the two boxes of `edge`: the straightest curve that touches
-/// no other box. `both` is true if there is also an arrow in the opposite direction; then the curve is not straight.
+/// Returns the start, the control point and the end of a quadratic Bézier curve, in pixels. The curve joins the borders
+/// of the two boxes of `edge`. It is the first of several curves, from the least to the most bent, that keeps clear of
+/// all other boxes in `nodes`. If every curve meets a box, returns the least bent one. `both` is true if another arrow
+/// joins the same boxes in the opposite direction. Then the least bent curve is not straight, so that the two arrows do
+/// not coincide.
 fn route(nodes: &[Node], edge: &Edge, both: bool) -> [[f64; 2]; 3] {
     let (from, to) = (&nodes[edge.from], &nodes[edge.to]);
     let [dx, dy] = [to.middle[0] - from.middle[0], to.middle[1] - from.middle[1]];
@@ -339,9 +345,10 @@ fn within(point: [f64; 2], middle: [f64; 2], half: [f64; 2], margin: f64) -> boo
     (0..2).all(|k| (point[k] - middle[k]).abs() < half[k] + margin)
 }
 
-/// Returns a position for the centre of a label: the first position on the curve, or above or below it, at which the
-/// label covers no rectangle in `taken`. `half` is half of the width and height of the label. If no position is free,
-/// returns the middle of the curve.
+/// Returns a position, in pixels, for the centre of a label of a curve. The result is the first candidate position at
+/// which the label overlaps no rectangle in `taken`. The candidates lie on the curve first, then above and below it.
+/// `curve` is a quadratic Bézier curve: start, control point and end. `half` is half the width and half the height of
+/// the label. If no candidate is free, returns the middle of the curve.
 fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[OccupiedRectangle]) -> [f64; 2] {
     let is_free = |place: &[f64; 2]| {
         !taken.iter().any(|(middle, other)| within(*place, *middle, [other[0] + half[0], other[1] + half[1]], 1.0))

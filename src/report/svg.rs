@@ -54,7 +54,7 @@ pub(super) struct Frame<'a> {
 }
 
 impl Svg {
-    /// Begins an SVG document of this size in pixels, with a white background.
+    /// Creates an SVG document of `width` by `height` pixels with a white background.
     pub(super) fn new(width: f64, height: f64) -> Self {
         let mut svg = Self { text: String::new() };
         svg.put(format_args!(
@@ -142,8 +142,9 @@ impl Svg {
         self.put(format_args!("<path d=\"M{x:.2},{y:.2}{outline}\" fill=\"{colour}\"/>\n"));
     }
 
-    /// Draws the frame around a figure, with its ticks and their labels, the labels of both axes, and grid lines if
-    /// requested.
+    /// Draws a rectangle around the plotting area, the ticks of the x axis below it and the ticks of the y axis on its
+    /// left, with their labels, and the labels of both axes. If `frame.grid` is true, grid lines cross the rectangle at
+    /// the ticks.
     pub(super) fn frame(&mut self, frame: &Frame) {
         let Frame { corner: [left, top], size: [width, height], .. } = *frame;
         let (right, bottom) = (left + width, top + height);
@@ -162,8 +163,8 @@ impl Svg {
         self.upright([left - 46.0, top + height / 2.0], frame.y_label);
     }
 
-    /// Draws the text `content`. `[x, y]` is the point of its base line that `anchor` selects (start, middle or end),
-    /// `size` its font size in pixels.
+    /// Draws the text `content` in one line. `anchor` selects the start, the middle or the end of the baseline, and
+    /// `[x, y]` is the position of this point in pixels. `size` is the font size in pixels.
     pub(super) fn text(&mut self, [x, y]: [f64; 2], anchor: Anchor, size: f64, content: &str) {
         let (anchor, content) = (anchor.name(), escaped(content));
         self.put(format_args!(
@@ -179,8 +180,9 @@ impl Svg {
         ));
     }
 
-    /// Draws the label of a tick; an exponent is drawn raised after the label. `at` is the point of the base line that
-    /// `anchor` selects.
+    /// Draws the label of `tick`, such as "10". If the tick has an exponent, it is drawn as a superscript after the
+    /// label. `anchor` selects the start, the middle or the end of the baseline, and `at` is the position of this point
+    /// in pixels.
     pub(super) fn tick_label(&mut self, at: [f64; 2], anchor: Anchor, tick: &Tick) {
         let Some(exponent) = tick.exponent else { return self.text(at, anchor, SMALL, &tick.label) };
         let ([x, y], anchor, exponent) = (at, anchor.name(), exponent.to_string().replace('-', "\u{2212}"));

@@ -11,8 +11,9 @@ use regrind_cell::{
 };
 use regrind_journal::Record;
 
-/// Returns the content of a record of the journal in one line for people. Content that this version of the program
-/// cannot read is shown as it stands in the record. Control characters become spaces.
+/// Returns the content of a record of the journal as one readable line. The reason of the record, if it has one,
+/// follows in brackets. If this version of the program cannot interpret the content, the line contains the original
+/// text of the record. Control characters are replaced by spaces.
 pub fn words(record: &Record) -> String {
     let told = content_words(&RecordContent::from_record(record));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
@@ -101,8 +102,9 @@ pub fn in_air(share: f64) -> String {
     }
 }
 
-/// Returns in one line what the grinder reported about a pass, such as path length and removed volume. `value` is the
-/// content of the record. Values that the grinder did not report are omitted.
+/// Returns one line with the values that the grinder reported about a pass, such as path length and removed volume.
+/// `value` is the content of the record. Values that are not in `value` are omitted. If there are none, the line says
+/// so. The result is never `None`.
 fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
     let told = [
@@ -160,7 +162,8 @@ fn spaced(name: &str) -> String {
     words
 }
 
-/// Returns the name of a command or event in words. If a machine is given, its name comes first.
+/// Returns the identifier `name` of a command or an event as lower-case words. If `device` is given, the name of this
+/// machine comes first, such as "CMM: load confirmed".
 fn named(name: &str, device: Option<Device>) -> String {
     device.map_or_else(|| spaced(name), |device| format!("{device}: {}", spaced(name)))
 }
@@ -170,7 +173,7 @@ pub(super) fn judgement_words(judgement: &Judgement) -> String {
     format!("judged, {}: {}", verdict_words(judgement), judgement.reason)
 }
 
-/// Returns the verdict of a judgement in lower-case words, as `result.json` names it.
+/// Returns the verdict of a judgement as lower-case words, such as "wrong response".
 pub(super) fn verdict_words(judgement: &Judgement) -> String {
     spaced(&format!("{:?}", judgement.verdict))
 }
@@ -180,7 +183,8 @@ pub(super) fn alarm_words(alarm: &Alarm) -> String {
     format!("{} {} {}", alarm.what, alarm.consequence, alarm.remedy.join(" "))
 }
 
-/// Returns the role of the people who can clear an alarm; "itself" if the alarm clears without a person.
+/// Returns the role of the people who can clear an alarm, such as "process engineer". Returns "itself" if the alarm
+/// clears without an action of a person.
 pub(super) fn role_words(alarm: &Alarm) -> String {
     match alarm.clears {
         Role::Nobody => "itself".to_owned(),
@@ -283,7 +287,8 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
     }
 }
 
-/// Returns in words if a measurement is usable; if not, with the reason.
+/// Returns "usable" if a measurement passed its checks, and otherwise "not usable: " and the reason. `gate` is the
+/// result of these checks.
 pub(super) fn gate_words(gate: &GateResult) -> String {
     match gate {
         GateResult::Passed => "usable".to_owned(),
@@ -323,8 +328,10 @@ fn figures_words(figures: &Figures) -> String {
     line
 }
 
-/// Returns lines for people: one for each estimated machine parameter with its compensation, and one for the rms of the
-/// error that is left for the map. Returns no lines if no parameters were estimated.
+/// Returns readable lines about the compensation of machine parameters. There is one line for each estimated parameter,
+/// with its error and the compensated part. A last line gives the rms of the residual error, in micrometres, that the
+/// correction map must correct. It is omitted if this rms is not known. Returns no lines if no parameters were
+/// estimated.
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::RecordedParameter::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());

@@ -37,14 +37,16 @@ pub enum TrustError {
     Unproven { host: String, table: &'static str },
 }
 
-/// Returns the TLS configuration with which a client verifies the server `host` by the file `certificates`. Returns
-/// `None` if `certificates` is `None` and the server is on this computer, because it then needs no proof.
+/// Returns the TLS configuration for a client that connects to the server `host`. The client verifies the server with
+/// the certificates in the PEM file `certificates`. Returns `None` if `certificates` is `None` and the server is on
+/// this computer. In this case the client need not verify the server.
 ///
-/// `host` is a name, an address or the folder of a socket. `table` only names, in messages, the table of the settings
-/// that states the host.
+/// `host` is a host name, an IP address, or the folder of a Unix socket. `table` is the name of the settings table that
+/// contains the host; it is used in error messages only.
 ///
 /// # Errors
-/// The certificates cannot be read; a server on another computer without `certificates`.
+/// Returns an error if the certificates cannot be read, or if the server is on another computer and `certificates` is
+/// `None`.
 pub fn tls_config(
     host: &str,
     certificates: Option<&Path>,

@@ -78,11 +78,12 @@ fn parse(text: &str) -> io::Result<Descriptor> {
     Ok(Descriptor(descriptor))
 }
 
-/// Returns the security identifiers (SIDs) of all who can read a file, except the user of this process, the system and
-/// the administrators.
+/// Returns the security identifiers (SIDs) of all users and groups that can read `file`. The user of this process, the
+/// owner of the file, the system and the administrators are omitted. If the file has no access list, returns the SID of
+/// everyone, because then every user has full access.
 ///
 /// # Errors
-/// Windows does not report the access list.
+/// Returns an error if Windows does not report the access list.
 pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     let (mut list, mut descriptor) = (ptr::null_mut(), ptr::null_mut());
     let (what, unasked) = (DACL_SECURITY_INFORMATION, ptr::null_mut());
@@ -111,8 +112,8 @@ pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     Ok(others)
 }
 
-/// Returns the security identifiers (SIDs) that an access list allows to read. `list` must be a valid list from Windows
-/// that is not yet freed.
+/// Returns the security identifiers (SIDs) of all users and groups to which a Windows access list grants read access.
+/// `list` must point to a complete access list from Windows that is not yet freed.
 fn readers(list: *const ACL) -> io::Result<Vec<String>> {
     // SAFETY: every list begins with this header.
     let count = unsafe { list.read() }.AceCount;

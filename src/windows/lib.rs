@@ -38,12 +38,14 @@ fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     Ok(units)
 }
 
-/// Converts the answer of a Windows function that returns 0 on failure: 0 becomes the last error of the system.
+/// Converts the return value `answer` of a Windows function into a result. Use it for functions that return 0 on
+/// failure. Returns the last error of the system if `answer` is 0, and otherwise `Ok`.
 fn succeeded(answer: i32) -> io::Result<()> {
     if answer == 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
 }
 
-/// Converts the answer of a Windows function that returns an error number: 0 becomes `Ok`, any other number the error.
+/// Converts the return value `number` of a Windows function into a result. Use it for functions that return an error
+/// number, or 0 on success. Returns `Ok` if `number` is 0, and otherwise the system error with this number.
 fn no_error(number: u32) -> io::Result<()> {
     if number == 0 { Ok(()) } else { Err(io::Error::from_raw_os_error(number.cast_signed())) }
 }

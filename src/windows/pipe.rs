@@ -9,11 +9,13 @@ use windows_sys::Win32::System::Pipes::GetNamedPipeClientProcessId;
 use super::access::{OwnersAlone, is_owned_here};
 use super::succeeded;
 
-/// Creates the server end of the named pipe `name` for one client. Only the user of this process can connect. With
-/// `is_first`, a pipe of that name must not exist yet.
+/// Creates the server end of the Windows named pipe `name`, for one client. Only the user of this process on this
+/// computer can connect. If `is_first` is true, no pipe with this name may exist. If `is_first` is false, such a pipe
+/// may exist, and the call adds a further server end to it.
 ///
 /// # Errors
-/// `name` is not a valid pipe name, or belongs to another user; with `is_first`, a pipe of that name exists.
+/// Returns an error if `name` is not a valid pipe name, if a pipe with this name belongs to another user, or if
+/// `is_first` is true and a pipe with this name exists.
 ///
 /// # Panics
 /// Panics outside a tokio runtime with I/O enabled, like all sockets of tokio.

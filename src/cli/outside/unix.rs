@@ -23,7 +23,8 @@ impl Endings {
         Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
     }
 
-    /// Waits for the next event. Returns `None` if no further event can arrive.
+    /// Waits for the next event that asks this program to end: SIGTERM, or SIGHUP after the terminal was closed.
+    /// Returns `None` if no further event can arrive.
     pub(crate) async fn next(&mut self) -> Option<Ending> {
         tokio::select! {
             Some(()) = self.terminate.recv() => Some(Ending { by: "SIGTERM", hung_up: false }),
@@ -35,7 +36,9 @@ impl Endings {
     }
 }
 
-/// Returns true if the parent process set SIGHUP (signal 1) to be ignored.
+/// Returns true if this process ignores SIGHUP (signal 1, sent when the terminal is closed), because the parent process
+/// requested this, for example `nohup`. Reads the state from `/proc/self/status`. Returns false if this file cannot be
+/// read.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
@@ -47,8 +50,9 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush)?)
 }
 
-/// Waits for Enter, at most for `patience`, which must be below 1 s. Returns true after Enter, and false at the end of
-/// the input. Returns `None` if nothing was typed in this time, or if `has_terminal` returns false.
+/// Waits for Enter at the terminal, at most for the time `patience`, which must be below 1 s. Returns `Some(true)`
+/// after Enter, and `Some(false)` at the end of the input. Returns `None` if nothing was typed in this time. Also
+/// returns `None` if `has_terminal`, which is called after the input has arrived, returns false.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
     let patience = Timespec { tv_sec: 0, tv_nsec: i64::from(patience.subsec_nanos()) };
@@ -56,8 +60,9 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     typed.then(|| io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0))
 }
 
-/// Returns true if this program is in the foreground of its terminal. The system stops a background process that reads
-/// from the terminal, even if the process drives machines.
+/// Returns true if this program is in the foreground of its terminal, so that this program can read keys. Returns false
+/// in the background or without a terminal. Callers must check this before reading, because the system stops a
+/// background process that reads from the terminal. This would also stop a process that controls machines.
 pub(crate) fn is_in_front() -> bool {
     rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
 }
@@ -75,8 +80,9 @@ pub(crate) fn set_apart(command: &mut Command) {
     std::os::unix::process::CommandExt::process_group(command, 0);
 }
 
-/// Returns the name of the user who started this program, from the operating system. The environment of a service can
-/// lack it.
+/// Returns the name of the user who started this program. Asks the operating system, because the environment variables
+/// of a service can lack the name. Returns `uid` with the user number if the user has no name, and `unknown` if the
+/// number cannot be read.
 pub(crate) fn own_name() -> String {
     use std::os::unix::fs::MetadataExt;
     let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid()) else { return "unknown".into() };

@@ -33,7 +33,8 @@ impl Endings {
         })
     }
 
-    /// Waits for the next event. Returns `None` if no further event can arrive.
+    /// Waits for the next event that asks this program to end: Ctrl-Break, a closed console, a log-off, or the shutdown
+    /// of the computer. Returns `None` if no further event can arrive.
     pub(crate) async fn next(&mut self) -> Option<Ending> {
         tokio::select! {
             Some(()) = self.interrupt.recv() => Some(Ending { by: "Ctrl-Break", hung_up: false }),
@@ -53,8 +54,9 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(())
 }
 
-/// Waits for a key, at most for `patience`. Returns true if the key is Enter. Returns `None` after another key or
-/// without one, or if `has_terminal` returns false.
+/// Waits for a key at the terminal, at most for the time `patience`. Returns `Some(true)` if the key is Enter. Returns
+/// `None` if no key or another key was pressed. Also returns `None` if `has_terminal`, which is called after a key was
+/// pressed, returns false.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     if !event::poll(patience).is_ok_and(|typed| typed && has_terminal()) {
         return None;
@@ -63,8 +65,8 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     event::read().is_ok_and(|typed| typed == Event::Key(enter)).then_some(true)
 }
 
-/// Returns true if this program can read the keyboard of its terminal. On Windows this does not depend on a foreground
-/// process.
+/// Always returns true: on Windows, a program does not have to be in the foreground to read the keyboard of its
+/// terminal.
 pub(crate) fn is_in_front() -> bool {
     true
 }

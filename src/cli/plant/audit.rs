@@ -18,12 +18,15 @@ pub(in super::super) struct Copy {
     pub(in super::super) told: Value,
 }
 
-/// Fetches the plant's copy of a run and verifies it with `keys`. `plant` is the path of the plant file, and `run` the
-/// folder or the name of the run. If the folder of the run exists here, also checks that its journal still contains the
-/// records that the plant has.
+/// Fetches the copy of a run from the database of the plant, and verifies this copy with `keys`. `plant` is the path of
+/// the plant file. `run` is the folder or the name of the run; `None` means the newest run in `runs`. If the run folder
+/// exists on this computer, also checks that the local journal still contains the records of the copy. Prints the
+/// result, as JSON if `json` is true. With `json` and a local run folder, prints nothing, because the caller prints the
+/// returned result.
 ///
 /// # Errors
-/// The plant cannot be reached or does not have the run, the copy is not valid, or the local journal differs from it.
+/// The plant cannot be reached or does not have the run, the copy is not valid, or the local journal differs from the
+/// copy.
 pub(in super::super) fn prove(
     plant: &Path,
     run: Option<&Path>,

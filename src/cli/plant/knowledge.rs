@@ -22,9 +22,12 @@ pub(in super::super) struct PlantKnowledge {
     pub(in super::super) words: Vec<String>,
 }
 
-/// Queries the plant for what other cells have learned about parts of the same kind, for the run of `task`. Returns an
-/// error only if the plant file is invalid: a plant that does not answer is reported in the messages of the result, and
-/// the run begins without its knowledge.
+/// Queries the database of the plant for the results that other cells have learned about parts of the same kind.
+/// Combines these results into an initial state for the run of `task`. `plant` is the path of the plant file. If the
+/// plant does not answer within [`PATIENCE`], or answers with an error, the result contains only a message for the
+/// operator. The result is empty if the plant file names no database.
+///
+/// Returns an error only if the plant file is invalid.
 pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
     let config = super::read(plant)?;
     // A plant file for live values only has no database to query.
@@ -57,8 +60,10 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
     Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
 }
 
-/// Returns the similarity of the machines. It combines the assumed difference `machines_differ` of the plant file with
-/// the results of pairs of cells that ground the same kind of part.
+/// Estimates how similar the machines of the cells are. The estimate uses the assumed difference `machines_differ` of
+/// the plant file, if one is given. This difference is the share (rms) of the recurring error that is specific to each
+/// machine, for example 0.1. The estimate also compares the results of each pair of cells in `knowledge` that ground
+/// the same kind of part.
 fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilarity {
     let mut alike = MachineSimilarity::default();
     if let Some(share) = machines_differ {

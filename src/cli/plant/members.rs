@@ -133,8 +133,9 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     })
 }
 
-/// Converts the name of a member into the name of its database role. Converts letters to lower case and replaces every
-/// other character except ASCII digits by `_`. Keeps at most 48 characters. The result needs no quotes in SQL.
+/// Returns the name of the database role for the plant member `name`. Converts ASCII letters to lower case, and
+/// replaces every character except ASCII letters and digits by `_`. Keeps the first 48 characters. If the result begins
+/// with a digit, puts `_` before the digit. The role name therefore needs no quotes in SQL.
 fn role_of(name: &str) -> String {
     let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '_' };
     let role: String = name.chars().map(plain).take(48).collect();

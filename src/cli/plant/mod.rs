@@ -102,13 +102,14 @@ fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
     check::or_show(config.database.as_ref().ok_or_else(missing))
 }
 
-/// Signs in to the database that the plant file names. Does not check the version of its tables.
+/// Signs in to the database that the plant file names, without a check of the table layout (version of the tables) in
+/// this database. Returns an error if the plant file names no database, or if the sign-in fails.
 pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     Ok(DatabaseLink::open(database(config)?).await?)
 }
 
-/// Signs in to the database that the plant file names. Returns an error if its tables do not have the layout that this
-/// program knows.
+/// Signs in to the database that the plant file names, and checks the table layout (version of the tables) in this
+/// database. Returns an error if the sign-in fails, or if this program does not support the layout.
 pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     let link = open_any(config).await?;
     regrind_plant::check_layout(link.client()).await?;
@@ -123,9 +124,14 @@ pub(super) struct PlantProcesses {
 }
 
 impl PlantProcesses {
-    /// Starts programs in separate processes that serve the runs in the folder `runs`. If the plant file `plant` names
-    /// a database, one replicates the records to the plant. If it has a table `[sparkplug]` or `[opcua]`, another one
-    /// publishes live values. Both end when the returned value is dropped.
+    /// Starts the helper programs for the runs in the folder `runs`, each in a separate process. `plant` is the path of
+    /// the plant file.
+    ///
+    /// - If the plant file has a table `[database]`, the program `ship` replicates the records to the plant.
+    /// - If the plant file has a table `[sparkplug]` or `[opcua]`, the program `tell` publishes live values.
+    ///
+    /// The helper programs end shortly after the returned value is dropped. Returns an error if the plant file is
+    /// invalid or a process cannot be started.
     pub(super) fn start(runs: &Path, plant: &Path) -> Result<Self, Failure> {
         // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;

@@ -127,8 +127,8 @@ pub(super) fn propose(arguments: &ToPropose) -> Result<Outcome, Failure> {
     })
 }
 
-/// Reads the files that a recipe names. Returns the content of each by its path relative to the folder of the recipe.
-/// Returns an error if a file is outside of this folder.
+/// Reads the files that a recipe names. Returns a map from the path of each file, relative to the folder of the recipe,
+/// to the content. Returns an error if a file cannot be read or is outside the folder of the recipe.
 pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
     let folder = recipe.path().parent().unwrap_or(Path::new(""));
     let mut files = BTreeMap::new();
@@ -148,7 +148,8 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
     Ok(files)
 }
 
-/// Returns true if a path is relative and does not leave its folder.
+/// Returns true if `path` is a relative path that stays below its start folder, so that no part of the path is `..`.
+/// Returns false for an empty or absolute path.
 pub(in super::super) fn is_below(path: &Path) -> bool {
     path.components().next().is_some() && path.components().all(|part| matches!(part, Component::Normal(_)))
 }

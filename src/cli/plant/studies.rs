@@ -184,8 +184,9 @@ fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     })
 }
 
-/// Returns the text of a recipe in which each key of `values` has its new value. The keys are dotted, such as
-/// `compensation.gain`. Returns the reason if the recipe is not valid TOML.
+/// Returns the recipe `text` (TOML) with the new values in `values`. Each entry of `values` maps a dotted key, such as
+/// `compensation.gain`, to the new value. Creates a missing key or table. Returns the reason as text if `text` is not
+/// valid TOML, if a part of a key is not a table, or if a value does not exist in TOML.
 fn varied(text: &str, values: &Map<String, Value>) -> Result<String, String> {
     let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is not valid TOML: {error}"))?;
     for (key, value) in values {
@@ -277,9 +278,9 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     })
 }
 
-/// Runs the recipe of `study`, with the values and the seed of `job`, in a separate process with a simulated cell.
-/// Returns the summary of the run with the true state of the simulated part. If there is no such run, returns the
-/// reason as a text.
+/// Runs the recipe of `study` on a simulated cell in a separate process. `job` states the changed recipe values and the
+/// seed. Returns the summary of the run as JSON. The key `truth` of the summary contains the true PV and RMS of the
+/// simulated part in µm, or null if they are unknown. If the process leaves no run, returns the reason as text.
 fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
@@ -338,8 +339,9 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns the results of the jobs of a study as a table: a line for each set of values, in the order of the first job
-/// of the set.
+/// Returns the results of the jobs of a study as a text table with a heading. Each job is one simulated run. The table
+/// has one line for each set of recipe values, and combines the jobs with different seeds. The sets are in the order of
+/// their first job.
 fn in_words(jobs: &[Value]) -> String {
     let mut sets: BTreeMap<String, (i64, Vec<&Value>)> = BTreeMap::new();
     for job in jobs {
@@ -404,8 +406,8 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     Some((low + values.get(middle)?) / 2.0)
 }
 
-/// Returns the 95 % Wilson score interval of a proportion, in per cent: `of` successes among `all` (E. B. Wilson, JASA
-/// 22, 1927).
+/// Returns the lower and upper limit of the 95 % Wilson score interval of a proportion, in per cent (0 to 100). The
+/// proportion is `of` successes in `all` trials; `all` must be above 0. Source: E. B. Wilson, JASA 22, 1927.
 fn wilson(of: usize, all: usize) -> [f64; 2] {
     let (n, p) = (all as f64, of as f64 / all as f64);
     let middle = p + Z * Z / (2.0 * n);

@@ -39,7 +39,10 @@ pub(crate) struct EndpointIdentity {
 }
 
 impl Endpoint {
-    /// Opens the socket in a run folder.
+    /// Creates the control socket in the run folder `folder` and listens on it. Replaces a socket file that a killed
+    /// process left.
+    ///
+    /// Returns an error if the socket cannot be created, or if another kind of file has its name.
     pub(crate) fn open(folder: &Path) -> io::Result<Self> {
         Self::open_at(socket_path(folder))
     }
@@ -54,19 +57,22 @@ impl Endpoint {
         Ok(Self { listener, mark, is_for_user: false })
     }
 
-    /// Creates a second socket at the path `place`, outside the run folder. Only the user of this program and root can
-    /// connect. Always returns `Some` on Unix.
+    /// Creates a second control socket at the path `place`, outside the run folder. Only the user of this program and
+    /// root can connect. Replaces a socket file that a killed process left.
+    ///
+    /// On Unix the result is an error or `Some`, never `None`.
     pub(crate) fn open_for_user(place: &Path) -> io::Result<Option<Self>> {
         Self::open_at(place.to_owned()).map(|door| Some(Self { is_for_user: true, ..door }))
     }
 
-    /// Returns the identity of the socket file, by which a removed or replaced file is recognised. Returns `None` if it
-    /// could not be read.
+    /// Returns path and identity (device and inode) of the socket file. With this identity a later check detects that
+    /// the file was removed or replaced. Returns `None` if the identity could not be read when the socket was created.
     pub(crate) fn mark(&self) -> Option<EndpointIdentity> {
         self.mark.clone()
     }
 
-    /// Waits for the next client and returns it.
+    /// Waits for the next client and returns its connection. A socket that was created for one user ignores clients of
+    /// other users, except root. Returns an error if accepting fails.
     pub(crate) async fn accept(&mut self) -> io::Result<Client> {
         loop {
             let (stream, _) = self.listener.accept().await?;
@@ -78,8 +84,9 @@ impl Endpoint {
 }
 
 impl EndpointIdentity {
-    /// Returns true if the file at the path of the socket is still the one that this program created. Also returns true
-    /// if this cannot be read at the moment.
+    /// Returns true if the socket file still exists and is the one that this program created. Returns false if the file
+    /// is missing or another file has its path. Returns true if the file cannot be checked at present, for example for
+    /// lack of permission.
     pub(crate) fn is_in_place(&self) -> bool {
         match identity(&self.path) {
             Ok(identity) => identity == self.identity,
@@ -88,8 +95,9 @@ impl EndpointIdentity {
         }
     }
 
-    /// Creates a new socket at the same path, after its file was removed or replaced. Creates the folder too if it is
-    /// missing.
+    /// Creates a new socket at the stored path, after the socket file was removed or replaced. Also creates the folder
+    /// of this path if it is missing; only the user of this program can access a folder created in this way. Returns an
+    /// error if the socket cannot be created.
     pub(crate) fn open_again(&self) -> io::Result<Endpoint> {
         if let Some(folder) = self.path.parent() {
             std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -107,12 +115,13 @@ fn is_trusted(uid: u32) -> bool {
     uid == 0 || Some(uid) == own_uid()
 }
 
-/// Removes the socket from a run folder.
+/// Removes the control socket from the run folder `folder`. Ignores errors, because the next run replaces a socket that
+/// remains.
 pub(crate) fn remove_endpoint(folder: &Path) {
     remove_endpoint_at(&socket_path(folder));
 }
 
-/// Removes the socket at a path.
+/// Removes the socket at `path`. Ignores errors, because the next run replaces a socket that remains.
 pub(crate) fn remove_endpoint_at(path: &Path) {
     // No process listens any more. The next run replaces a socket that could not be removed.
     let _ = regrind_formats::remove_socket(path);
@@ -122,7 +131,8 @@ pub(crate) fn remove_endpoint_at(path: &Path) {
 pub(crate) struct Client(UnixStream);
 
 impl Client {
-    /// Returns the user and the process at the other end of a connection, as the operating system identifies them.
+    /// Returns the client of this connection as the operating system identifies it: the name and id of the user, and
+    /// the id of the process if known. Returns an error if the operating system does not identify the client.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let peer = self.0.peer_cred()?;
         let uid = peer.uid();
@@ -140,7 +150,8 @@ impl Client {
     }
 }
 
-/// Returns true if the client has already closed its end of the connection. Does not wait.
+/// Returns true if the client has closed its end of the connection. Does not wait for data. `says` is the half of the
+/// connection that reads from the client.
 pub(crate) fn is_closed(says: &ClientReader) -> bool {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let closed = PollFlags::RDHUP | PollFlags::HUP | PollFlags::ERR;
@@ -157,30 +168,40 @@ fn socket_path(folder: &Path) -> PathBuf {
     folder.join(SOCKET_FILE)
 }
 
-/// Returns true if a process listens on the socket of a run folder.
+/// Returns true if a process listens on the control socket of the run folder `folder`, even if this process does not
+/// answer at present.
 pub(crate) fn is_listening(folder: &Path) -> bool {
     // A listener whose queue is full exists all the same.
     connect_stream(&socket_path(folder)).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
-/// Returns true if a trusted user's process listens on a socket outside a run folder.
+/// Returns true if a process listens on the socket at the path `place`, outside a run folder. Returns false if the
+/// socket file does not belong to the user of this program or to root.
 pub(crate) fn is_listening_at(place: &Path) -> bool {
     connect_trusted(place).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
-/// Sends a line to the cell of a run folder, and returns the line of its answer. `patience` is the timeout.
+/// Sends the bytes `line` to the cell of the run folder `folder`, waits for the answer, and returns its first line.
+/// `patience` is the timeout of each read and write.
+///
+/// Returns an error if no cell listens, or an error of the kind `TimedOut` if the cell does not answer in time. Returns
+/// an empty text if the cell closes the connection without an answer.
 pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     exchange_on(connect_stream(&socket_path(folder))?, line, patience)
 }
 
-/// Sends a line to the cell that listens at a socket outside a run folder, and returns the line of its answer.
-/// `patience` is the timeout. Returns an error if the socket belongs to another user than this one or root.
+/// Sends the bytes `line` to the cell that listens on the socket at the path `place`, outside a run folder. Waits for
+/// the answer and returns its first line. `patience` is the timeout of each read and write.
+///
+/// Returns an error if no cell listens, if the cell does not answer in time, or if the socket file belongs to a user
+/// other than the user of this program or root. Returns an empty text if the cell closes the connection without an
+/// answer.
 pub(crate) fn exchange_line_at(place: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     exchange_on(connect_trusted(place)?, line, patience)
 }
 
-/// Connects to a socket at `place`, outside a run folder. Returns an error if it belongs to a user other than this one
-/// or root, because any user may be able to create files there.
+/// Connects to the socket at the path `place`, outside a run folder. Any user may be able to create files outside a run
+/// folder. So this function returns an error if the socket file does not belong to the user of this program or to root.
 fn connect_trusted(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     if !is_trusted(std::fs::symlink_metadata(place)?.uid()) {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the socket belongs to another user"));
@@ -188,8 +209,10 @@ fn connect_trusted(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     connect_stream(place)
 }
 
-/// Connects to the socket at `place` without waiting. If the queue of the listener is full because its process does not
-/// answer, returns an error of the kind `TimedOut`.
+/// Connects to the socket at the path `place` and returns the stream. Does not wait for the connection.
+///
+/// Returns an error if no process listens. Returns an error of the kind `TimedOut` if a process listens but does not
+/// accept clients, so that its queue is full.
 fn connect_stream(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
@@ -216,7 +239,8 @@ fn exchange_on(mut stream: std::os::unix::net::UnixStream, line: &[u8], patience
     }
 }
 
-/// Opens a connection to the cell of a run folder, which stays open for many lines.
+/// Connects to the cell of the run folder `folder` and returns the two halves of the connection, for reading and for
+/// writing. The connection can carry any number of lines. Returns an error if no cell listens.
 pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
     UnixStream::connect(socket_path(folder)).await.map(UnixStream::into_split)
 }

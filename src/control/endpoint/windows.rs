@@ -33,7 +33,8 @@ pub(crate) struct Endpoint {
 }
 
 impl Endpoint {
-    /// Opens the pipe of a run folder.
+    /// Creates the control pipe of the run folder `folder` and listens on it. The name of the pipe is derived from the
+    /// path of the folder. Returns an error if another program already has this pipe.
     pub(crate) fn open(folder: &Path) -> io::Result<Self> {
         let name = pipe_name(folder)?;
         let next = regrind_windows::listen(&name, true).map_err(|error| match error.kind() {
@@ -46,8 +47,9 @@ impl Endpoint {
         Ok(Self { name, next })
     }
 
-    /// Returns `None`. On Windows a cell has one endpoint only: a pipe is not a file in the run folder, so it cannot be
-    /// removed with the folder.
+    /// Returns `None`, because a cell has only one endpoint on Windows. A second endpoint is for the case that the run
+    /// folder is removed together with the first one. On Windows the endpoint is a pipe, which is not a file in the run
+    /// folder and is not removed with it.
     pub(crate) fn open_for_user(_: &Path) -> io::Result<Option<Self>> {
         Ok(None)
     }
@@ -57,7 +59,8 @@ impl Endpoint {
         None
     }
 
-    /// Waits for the next client and returns it.
+    /// Waits for the next client and returns its connection. Returns an error if the client disconnected too early, or
+    /// if the pipe cannot be prepared for another client.
     pub(crate) async fn accept(&mut self) -> io::Result<Client> {
         if let Err(error) = self.next.connect().await {
             // The client disconnected before it was accepted; the instance can serve the next one.
@@ -103,8 +106,8 @@ pub(crate) fn remove_endpoint(_: &Path) {}
 pub(crate) struct Client(NamedPipeServer);
 
 impl Client {
-    /// Returns the user at the other end of a connection. This is always the user of this program, because the
-    /// operating system lets no other user connect.
+    /// Returns the client of this connection: the user, and the process if known. The user is always the user of this
+    /// program, because Windows lets no other user connect. Returns an error if the name of this user cannot be read.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let process = regrind_windows::client_process(&self.0);
         let station = process.map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
@@ -116,13 +119,14 @@ impl Client {
     }
 }
 
-/// Returns false: on Windows, clients are not checked for a closed connection. The check is for a process that was
-/// suspended, and on Windows only a debugger can do this.
+/// Returns false, because closed connections are not detected on Windows. The check protects against orders whose
+/// client gave up while this process was suspended. On Windows only a debugger suspends a process.
 pub(crate) fn is_closed(_: &ClientReader) -> bool {
     false
 }
 
-/// Returns the name of the pipe of a run folder. Different paths to the same folder give the same name.
+/// Returns the name of the control pipe of the run folder `folder`, computed from a hash of its absolute path.
+/// Different spellings of the path give the same name. Returns an error if the folder does not exist.
 fn pipe_name(folder: &Path) -> io::Result<String> {
     let whole = std::fs::canonicalize(folder)?;
     let digest = Sha256::digest(whole.as_os_str().as_encoded_bytes());
@@ -130,13 +134,17 @@ fn pipe_name(folder: &Path) -> io::Result<String> {
     Ok(format!(r"\\.\pipe\regrind-{digits}"))
 }
 
-/// Returns true if a process listens on the pipe of a run folder.
+/// Returns true if a process of this user listens on the control pipe of the run folder `folder`. Waits up to
+/// [`PIPE_WAIT_TIMEOUT`] while the pipe is busy.
 pub(crate) fn is_listening(folder: &Path) -> bool {
     let Ok(name) = pipe_name(folder) else { return false };
     block_on_thread(async move { connect_pipe(&name).await.map(drop) }).is_ok()
 }
 
-/// Sends a line to the cell of a run folder, and returns the line of its answer. `patience` is the timeout.
+/// Sends the bytes `line` to the cell of the run folder `folder`, waits for the answer, and returns its first line.
+/// `patience` is the timeout of the answer.
+///
+/// Returns an error if no cell listens, or if the cell does not answer in time.
 pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     let (name, line) = (pipe_name(folder)?, line.to_owned());
     block_on_thread(async move {
@@ -148,7 +156,9 @@ pub(crate) fn exchange_line(folder: &Path, line: &[u8], patience: Duration) -> i
     })
 }
 
-/// Opens a connection to the cell of a run folder, which stays open for many lines.
+/// Connects to the cell of the run folder `folder` and returns the two halves of the connection, for reading and for
+/// writing. The connection can carry any number of lines. Returns an error if no cell listens, or if the pipe belongs
+/// to another user.
 pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
     connect_pipe(&pipe_name(folder)?).await.map(tokio::io::split)
 }
@@ -166,8 +176,8 @@ async fn connect_pipe(name: &str) -> io::Result<NamedPipeClient> {
     }
 }
 
-/// Runs a future to its end from synchronous code, on a thread with its own runtime. A future can be given a timeout,
-/// and the caller may already be part of another runtime.
+/// Runs the future `what` to its end, blocks until then, and returns its result. Uses a separate thread with its own
+/// runtime, so that the caller may itself run inside a runtime. Returns an error if the thread cannot start or panics.
 fn block_on_thread<T: Send + 'static>(what: impl Future<Output = io::Result<T>> + Send + 'static) -> io::Result<T> {
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)

@@ -28,7 +28,7 @@ pub struct Correction {
 }
 
 impl Correction {
-    /// Returns the correction for the first pass of a part: 0 at every node of `grid`, number of the pass 1, no
+    /// Returns the correction for the first pass of a part: pass number 1, the value 0 at every node of `grid`, and no
     /// parameter corrections. `level_mm` is the height of the target surface above the nominal surface, in millimetres.
     pub fn zero(grid: Grid, level_mm: f64) -> Self {
         Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
@@ -39,26 +39,27 @@ impl Correction {
         self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
-    /// Returns `values_mm` plus the part of the parameter corrections that a registered measurement shows
-    /// ([`ParameterCorrections::seen_mm`]), at every node, in millimetres.
+    /// Returns the part of this correction that a measurement shows after registration, at every node, in millimetres.
+    /// This is `values_mm` plus the visible part of the parameter corrections ([`ParameterCorrections::seen_mm`]).
     ///
-    /// Registration removes the rest of the parameter corrections, because it looks like a motion of the part.
+    /// The other part of the parameter corrections has the same effect as a motion of the part. Registration removes
+    /// this effect from the measurement.
     pub fn apparent_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.seen_mm)
     }
 
-    /// Returns the total displacement of the surface along its normal at every node, in millimetres: `values_mm` plus
-    /// the displacement by the parameter corrections ([`ParameterCorrections::displaced_mm`]).
-    ///
-    /// This displacement decides how much material is removed.
+    /// Returns the total displacement of the surface by this correction, at every node, in millimetres along the
+    /// normal; positive leaves material. This is `values_mm` plus the displacement by the parameter corrections
+    /// ([`ParameterCorrections::displaced_mm`]). The amount of removed material follows from this displacement.
     pub fn displacement_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.displaced_mm)
     }
 
-    /// Returns the map that is sent to the grinder, at every node, in millimetres: `values_mm` plus the displacement by
-    /// the corrections of wheel setting and part tilt ([`ParameterCorrections::setting_mm`]).
+    /// Returns the map to send to the grinder, at every node, in millimetres. This is `values_mm` plus the displacement
+    /// by the corrections of wheel setting and part tilt ([`ParameterCorrections::setting_mm`]).
     ///
-    /// The grinder has an input for the wheel radius, but none for setting and tilt.
+    /// A correction of the wheel radius is not part of the map, because the grinder has a separate input for this
+    /// radius. It has no inputs for setting and tilt.
     pub fn map_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.setting_mm)
     }

@@ -21,11 +21,13 @@ pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
     2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
 }
 
-/// Checks that a cut-off is at least 0.9 times the minimum cut-off: twice the contact width of the wheel or twice the
-/// distance of the points, whichever is larger. The points do not resolve a shorter wave, or the wheel cannot grind it.
+/// Checks that a cut-off is long enough. The minimum is twice the contact width of the wheel or twice the distance of
+/// the points, whichever is larger. A cut-off of at least 0.9 times this minimum passes the check, because the
+/// estimated distance has an uncertainty of 10 %. The wheel cannot grind a shorter wave, or the points do not resolve
+/// it. All values are in millimetres.
 ///
 /// # Errors
-/// Returns [`MapError::CutoffBelowContact`] if the contact width is the larger of the two, otherwise
+/// Returns [`MapError::CutoffBelowContact`] if the contact width is larger than the distance of the points, otherwise
 /// [`MapError::CutoffBelowSpacing`].
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
     let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
@@ -43,17 +45,20 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
 /// Estimates the distance between neighbouring readings along x and along y, and returns the larger of the two, in
 /// millimetres. Returns 0 if no reading has a neighbour at another place.
 ///
-/// Around some of the readings, the nearest other place is searched in each of four sectors: about +x, -x, +y and -y.
-/// The estimate along x is the median of the distances in the sectors about +x and -x, and likewise along y. For scan
-/// lines that are dense along x and far apart along y, the result is the distance between the lines. Repeated readings
-/// of one place count as one place.
+/// The estimate uses a sample of at most 50 readings. For each of them, it finds the nearest other reading in each of
+/// four sectors: about +x, -x, +y and -y. The distance along x is the median of the distances found in the sectors
+/// about +x and -x. The distance along y follows from the other two sectors. Repeated readings of one place count as
+/// one.
+///
+/// For scan lines that are dense along x and far apart along y, the result is the distance between the lines.
 pub fn point_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
 }
 
-/// Returns the distance between neighbouring readings along x and along y, in millimetres, estimated as described at
-/// [`point_spacing_mm`]. An element is 0 if no reading has a neighbour along that axis.
+/// Estimates the distance between neighbouring readings, and returns it along x and along y, in millimetres. Each
+/// estimate is the median distance from a reading to the nearest other reading in the directions of this axis, see
+/// [`point_spacing_mm`]. An element is 0 if no reading has a neighbour in the directions of this axis.
 pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     let step = readings.len().div_ceil(PROBED).max(1);
     let chosen: Vec<&DeviationSample> = readings.iter().step_by(step).collect();
@@ -79,9 +84,9 @@ fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
 }
 
-/// Returns the distances from the place `[x, y]` to the nearest reading in each of four sectors: about +x, -x, +y and
-/// -y. A reading nearer than `same_mm` is a repeat of the same place and does not count. Returns infinity for a sector
-/// without a reading.
+/// Returns the distances, in millimetres, from the place `[x, y]` to the nearest reading in each of four sectors, in
+/// the order +x, -x, +y, -y. A sector contains the directions within 45 degrees of its axis. Ignores readings at a
+/// distance of at most `same_mm`, because they repeat the same place. Returns infinity for a sector without a reading.
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[DeviationSample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {

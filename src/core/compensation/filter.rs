@@ -61,12 +61,14 @@ pub enum FilterOrder {
 }
 
 impl FilterOrder {
-    /// Returns alpha of the weights exp(-pi (r / (alpha cutoff))^2), where r is the distance of a reading. With this
-    /// alpha, half of the amplitude of a wave at the cut-off passes.
+    /// Returns alpha, the constant that scales the width of the weights exp(-pi (r / (alpha cutoff))^2), where r is the
+    /// distance of a reading from the place of the filtered value. Alpha is chosen so that a wave with the wavelength
+    /// `cutoff` keeps half of its amplitude.
     ///
-    /// With u = pi (alpha cutoff / wavelength)^2, the constant and the plane pass the share exp(-u) of a wave, the
-    /// quadric passes (1 + u) exp(-u). This share is one half at u = ln 2 for constant and plane, and at u = 1.678347
-    /// for the quadric. At the cut-off u = pi alpha^2, so alpha = sqrt(u / pi) with this u.
+    /// Let u = pi (alpha cutoff / wavelength)^2. Filters of order 0 and 1 (constant, plane) pass the share exp(-u) of
+    /// the amplitude. The filter of order 2 (quadric) passes (1 + u) exp(-u). The share is one half at u = ln 2 for
+    /// orders 0 and 1, and at u = 1.678347 for order 2. At wavelength = cutoff, u is pi alpha^2, so alpha = sqrt(u /
+    /// pi).
     pub fn alpha(self) -> f64 {
         match self {
             Self::Constant | Self::Plane => 0.469_718_639_349_825_66,
@@ -128,9 +130,11 @@ pub(super) struct FilterResult {
 }
 
 impl GaussianFilter {
-    /// Returns the leverage of a reading at its own place far from edges and holes, multiplied by the number of
-    /// readings per square millimetre. The leverage is the change of the filtered value per unit change of this
-    /// reading. The product does not depend on the density of the readings. Units: 1/mm².
+    /// Returns the leverage of a reading multiplied by the number of readings per square millimetre, in 1/mm². The
+    /// leverage is the change of the filtered value per unit change of a reading at the same place. The result applies
+    /// far from edges and holes, and does not depend on the density of the readings.
+    ///
+    /// Equation: 1 / (alpha cutoff)^2 for orders 0 and 1, and 2 / (alpha cutoff)^2 for order 2.
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
         if self.order == FilterOrder::Quadric { 2.0 / weight } else { 1.0 / weight }
@@ -148,9 +152,9 @@ impl GaussianFilter {
         grid.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
     }
 
-    /// Filters readings at arbitrary places and returns the filtered surface at the nodes of `grid`. `places` and
-    /// `values` have one entry for each reading. `weights` holds a factor from 0 to 1 for each reading; `None` stands
-    /// for 1.
+    /// Filters readings at arbitrary places, and returns the filtered surface at the nodes of `grid`. `places` holds
+    /// the position `[x, y]` of each reading in millimetres, and `values` its value. `weights` holds a factor from 0 to
+    /// 1 for each reading; `None` means the factor 1 for all.
     pub fn filter_scattered(
         &self,
         places: &[[f64; 2]],
@@ -193,7 +197,8 @@ impl GaussianFilter {
         filtered
     }
 
-    /// Returns how many nodes the weights reach to either side of a node, along x and along y.
+    /// Returns the reach of the filter weights, as the number of nodes of `grid` on each side of a node, along x and
+    /// along y. Beyond this reach the weights are treated as 0.
     fn taps(&self, grid: &Grid) -> [usize; 2] {
         [0, 1].map(|k| {
             let nodes = grid.counts()[k];
@@ -272,12 +277,15 @@ fn fit_node(order: FilterOrder, sums: &[Vec<Vec<f64>>; 3], i: usize) -> NodeFit 
     }
 }
 
-/// Fits a polynomial of P terms to the readings around a node by weighted least squares and returns height, slopes,
-/// leverage and relative variance at the node. `weight`, `value` and `weight2` are the moments of the weights, of the
-/// weighted values and of the squared weights, indexed by [`moment`].
+/// Fits a polynomial with P terms to the readings around a node by weighted least squares. Returns its height and
+/// slopes at the node, and the leverage and the relative variance of the height. Slopes are per standard deviation of
+/// the weights. The relative variance is the variance of the height divided by the variance of one reading.
 ///
-/// Returns `None` if the readings are one-sided ([`is_one_sided`]), if they do not determine the polynomial, or if the
-/// relative variance exceeds [`MAX_VARIANCE`].
+/// `weight`, `value` and `weight2` hold the moments of the weights, of the weighted values and of the squared weights,
+/// in the order of [`moment`].
+///
+/// Returns `None` if the readings do not surround the node closely ([`is_one_sided`]), if they do not determine the
+/// polynomial, or if the relative variance exceeds [`MAX_VARIANCE`].
 fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> NodeFit {
     if is_one_sided(weight) {
         return None;
@@ -295,11 +303,11 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     (variance <= MAX_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
 }
 
-/// Returns true if the readings around a node do not surround it closely: they lie on a line, all on one side of the
-/// node, or all far from it as around a hole. A polynomial at the node would then extrapolate, or bridge an area
-/// without readings.
+/// Returns true if the readings around a node do not surround the node closely. This is the case if they lie on a line,
+/// if they lie on one side of the node, or if the node is in a hole and all readings are far away. A polynomial at such
+/// a node would be an extrapolation.
 ///
-/// `m` holds the moments of the weights, indexed by [`moment`].
+/// `m` holds the moments of the weights about the node, in the order of [`moment`].
 fn is_one_sided(m: &[f64; MOMENTS]) -> bool {
     let (mx, my) = (m[1] / m[0], m[2] / m[0]);
     let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
@@ -346,9 +354,13 @@ impl GridSums {
     }
 }
 
-/// Distributes each reading over the nodes around it with Gaussian shares, and returns the sums at all nodes: of the
-/// weights, of the weighted values and of the squared weights. `border` is the number of nodes that are added on each
-/// side of `grid`, along x and along y.
+/// Distributes each reading with Gaussian weights over the 7 x 7 nodes around it. Returns three sums for each node: of
+/// the weights, of the weighted values, and of the squared weights (omitted if `weights` is `None`, because they equal
+/// the weights).
+///
+/// `places` holds the position `[x, y]` of each reading in millimetres, and `values` its value. `weights` holds a
+/// factor from 0 to 1 for each reading; `None` means the factor 1 for all. The sums cover `grid` and additional nodes
+/// on each side; `border` is their number along x and along y.
 fn spread_readings(
     places: &[[f64; 2]],
     values: &[f64],
@@ -421,14 +433,17 @@ fn spread_reading(
     }
 }
 
-/// Returns the convolution kernels for the powers k from 0 to `most`, each sampled at 2 `taps` + 1 nodes. Applied to
-/// the sums of [`spread_readings`], kernel k gives the moment of t^k under the weights exp(-(`scale` t)^2 / 2).
+/// Returns one-dimensional convolution kernels for the powers k from 0 to `most`. Kernel k is applied to the sums of
+/// [`spread_readings`] along one axis. The result at a node is the sum of weight times t^k over the readings, where t
+/// is the distance of a reading from the node along this axis. The weight is exp(-(`scale` t)^2 / 2). Each kernel has 2
+/// `taps` + 1 values, one for each node.
 ///
-/// t is the distance of a reading from the node. `step` is the node spacing, `spread` the standard deviation of the
-/// Gaussian by which the readings were spread; t, `step` and `spread` are in standard deviations of the filter. Let G
-/// be the required Gaussian, S the spreading Gaussian and T the narrower Gaussian with G = S * T (convolution). t^k G
-/// is a sum of derivatives of G. Each of them is S convolved with the same derivative of T: a Hermite polynomial times
-/// T.
+/// t, `step` and `spread` are in standard deviations of the filter. `step` is the node spacing. `spread` is the
+/// standard deviation of the Gaussian with which [`spread_readings`] has distributed the readings.
+///
+/// Method: let G be the required Gaussian weight, and S the Gaussian of the distribution. T is the narrower Gaussian
+/// with G = S * T (convolution). t^k G is a sum of derivatives of G. Each derivative of G is the convolution of S with
+/// the same derivative of T, and a derivative of T is a Hermite polynomial times T.
 fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<Vec<f64>> {
     let tau = (1.0 - (scale * spread).powi(2)).sqrt();
     let (t1, t2) = (1.0 / tau, 1.0 / (tau * tau));
@@ -479,9 +494,14 @@ impl RowSums {
         Self { columns, powers }
     }
 
-    /// Returns the moments x^a y^b with a + b up to `degree` at the nodes of one row: a list for each moment, in the
-    /// order of [`moment`], with one value for each node. `kernels` holds the kernels along y for the powers 0 to
-    /// `degree`.
+    /// Returns the moments at the nodes of one row. For each pair a, b with a + b up to `degree`, the moment is the sum
+    /// of q x^a y^b over the readings. Here q is the weight, the weighted value or the squared weight of a reading,
+    /// depending on the input of [`Self::along_x`]. x and y are the distances of the reading from the node, in standard
+    /// deviations of the filter. The outer list is in the order of [`moment`]; each inner list has one value for each
+    /// node of the row.
+    ///
+    /// `kernels` holds the convolution kernels along y for the powers 0 to `degree`. `row` is the index of the row in
+    /// the grid.
     fn along_y(&self, kernels: &[Vec<f64>], degree: usize, row: usize) -> Vec<Vec<f64>> {
         let mut moments = vec![vec![0.0; self.columns]; terms(degree)];
         for (a, sums) in self.powers.iter().enumerate().take(degree + 1) {
@@ -590,8 +610,8 @@ impl Trend {
         self.terms.iter().zip(self.basis(place)).map(|(term, basis)| term * basis).sum()
     }
 
-    /// Adds the height of the polynomial to `values` and its slopes to `slopes` at the nodes of `grid`, but only at
-    /// nodes for whose index `wanted` returns true.
+    /// Adds this polynomial to a filtered surface at the nodes of `grid`: its height to `values`, and its slopes along
+    /// x and y to `slopes`. Changes only the nodes for whose index `wanted` returns true.
     pub fn put_back(&self, grid: &Grid, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
         let term = |k: usize| self.terms.get(k).copied().unwrap_or(0.0);
         for k in (0..grid.len()).filter(|&k| wanted(k)) {
@@ -610,13 +630,13 @@ impl FilterResult {
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }
 
-    /// Returns value, leverage and variance (fields of [`FilterResult`]), interpolated at a place `[x, y]`; `None` if
-    /// none of the four nodes around the place is supported.
+    /// Returns `[value, leverage, variance]` (see the fields of [`FilterResult`]), interpolated at the place `[x, y]`.
+    /// Returns `None` if none of the four nodes around the place is supported.
     ///
-    /// Interpolates bilinearly between the four nodes around the place. Each node contributes its value plus half of
-    /// the rise along its slope from the node to the place. This is exact for quadrics: the second-order error of the
-    /// values cancels that of the slopes. If one of the four nodes is not supported, the others contribute with their
-    /// full slopes.
+    /// The interpolation is bilinear. For the value, each of the four nodes contributes its value plus half of the rise
+    /// along its slope from the node to the place. This is exact for quadrics: the second-order errors of values and
+    /// slopes cancel. If some of the four nodes are not supported, the other nodes contribute with the full rise along
+    /// their slopes.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
         let grid = &self.grid;
         let [(i, u), (j, v)] = grid.cell(place);

@@ -155,11 +155,15 @@ pub struct PassObservation<'a> {
 pub type ParameterExplainer<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
-    /// Creates a state that has not learned from any pass: response 1, no estimate of the repeatable error.
+    /// Creates the initial state for a recipe, before any pass. The response is 1 (as commanded), and the repeatable
+    /// error is unknown.
     ///
-    /// `map` gives the shortest wavelength (its cut-off), and `size_mm`, the extent of the part along x and y, the
-    /// longest. `repeatability_mm` is the rms of the non-repeatable error of a pass (grinding and measuring), if it is
-    /// stated; its square is divided equally between the bands.
+    /// `rule` selects how the gain is computed. The cut-off of `map` is the shortest wavelength. With
+    /// [`GainRule::Wavelength`], the wavelengths from this cut-off up to half of the longer side of the part are
+    /// divided into octaves (bands). `size_mm` is the extent of the part along x and y.
+    ///
+    /// `repeatability_mm` is the rms of the non-repeatable error of a pass (grinding and measuring), or `None` if it is
+    /// unknown. Its square is divided equally between the bands.
     pub fn new(rule: GainRule, map: &MapOptions, size_mm: [f64; 2], repeatability_mm: Option<f64>) -> Self {
         let mut edges = vec![map.cutoff_mm];
         if rule == GainRule::Wavelength {
@@ -193,11 +197,11 @@ impl LearningState {
         }
     }
 
-    /// Returns the state after one more measured pass. [`Self::next_correction_mm`] of the new state is the next
-    /// correction.
+    /// Returns the state after the measured pass `seen`. The new state contains the updated estimate of the repeatable
+    /// error, and [`Self::next_correction_mm`] of the new state gives the next correction.
     ///
-    /// If the response shows that the pass was not ground as commanded, no estimate changes, and the next correction is
-    /// the correction of this pass again.
+    /// If the measured response shows that the pass was not ground as commanded (for example mirrored), all estimates
+    /// stay unchanged. The next correction is then the same as the correction of this pass.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
         if seen
@@ -247,8 +251,8 @@ impl LearningState {
         self.wanted_mm.as_deref()
     }
 
-    /// Returns the state with which the next part of the same recipe begins. The learned error and the response are
-    /// kept with a larger uncertainty; the correction is dropped.
+    /// Returns the state for the start of the next part of the same recipe. Keeps the learned error and the response,
+    /// but increases their uncertainties. Removes the next correction, because it belongs to the previous part.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -260,12 +264,13 @@ impl LearningState {
         known
     }
 
-    /// Returns the forecast of the rms of the error after the next pass. `error` is the map after the last pass.
-    /// `scallops_mm` is the rms of the scallops between the tracks, in millimetres.
+    /// Forecasts the rms of the error after the next pass, in millimetres, with its standard deviation and its lower
+    /// limit. `error` is the map measured after the last pass. `scallops_mm` is the rms of the scallops (grooves
+    /// between the tracks of the wheel).
     ///
-    /// The forecast includes structure that is too fine for the map: noise of the points, and scallops. A probe that
-    /// reaches the bottom of the grooves has already measured the scallops. So the larger of the measured residuals and
-    /// the known scallops counts, not their sum.
+    /// The forecast includes structure that is too fine for the map: noise of the points, and scallops. If the probe
+    /// reaches the bottom of the grooves, the residuals of the map already contain the scallops. So the forecast uses
+    /// the larger of the rms of the residuals and `scallops_mm`, not their sum.
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
@@ -298,15 +303,16 @@ impl LearningState {
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
 
-    /// Returns a pair `[from_mm, share]` for each band of wavelengths, from the shortest waves to the longest.
-    /// `from_mm` is the shortest wavelength of the band in millimetres, `share` the share of the newest error that the
-    /// next correction compensates.
+    /// Returns a pair `[from_mm, gain]` for each band of wavelengths, from the shortest waves to the longest. `from_mm`
+    /// is the shortest wavelength of the band in millimetres. `gain` is the share of the newest error that the next
+    /// correction compensates in this band; 1 compensates all of the error.
     pub fn gains(&self) -> Vec<[f64; 2]> {
         self.bands.iter().map(|band| [band.from_mm, self.compensated_share(band)]).collect()
     }
 
-    /// Returns the share of the newest error that the next correction compensates in this band, from 0 to 1 for an
-    /// adaptive rule. For [`GainRule::Fixed`] it is the fixed gain.
+    /// Returns the share of the newest error that the next correction compensates in `band`. For [`GainRule::Fixed`]
+    /// this is the fixed gain. For the other rules it is the Kalman gain times the share that remains after shrinkage,
+    /// from 0 to 1.
     fn compensated_share(&self, band: &Band) -> f64 {
         if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
@@ -352,8 +358,9 @@ impl LearningState {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits a map into its bands of wavelengths and returns one map for each band, from the shortest waves to the
-    /// longest. `rest` holds the values at the nodes of `told`. The returned maps add up to `rest`.
+    /// Splits a map into its bands of wavelengths. Returns one map for each band, from the shortest waves to the
+    /// longest; the returned maps add up to the given map. `rest` holds the values of the given map. `told` gives the
+    /// grid of these values and the valid nodes; its error is not used.
     pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -366,13 +373,17 @@ impl LearningState {
         parts
     }
 
-    /// Returns how much the noise of the measured points contributes to each band of a map, as a mean square in mm².
-    /// `whole_mm2` is the mean square of this noise in the whole map.
+    /// Returns the mean square of the noise in each band of an error map, in mm², from the shortest waves to the
+    /// longest. This noise comes from the noise of the measured points. `whole_mm2` is its mean square in all bands
+    /// together, in mm².
     ///
-    /// Equation: white noise that passes a Gaussian of width s has a power of 1 / s^2. Between two Gaussians of widths
-    /// s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of the
-    /// cut-off, so that the squares of the widths add up. This holds far from edges; near the border the longest waves
-    /// contain up to twice as much.
+    /// Equation: white noise that has passed a Gaussian low-pass filter of width s has a mean square proportional to 1
+    /// / s^2. The difference of two such filters, of widths s and t, gives 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map
+    /// has already passed the filter with the shortest cut-off. So s^2 and t^2 are the square of the width of that
+    /// filter plus the square of the width of the filter of the band. All widths are relative to that of the first
+    /// filter.
+    ///
+    /// The result applies far from edges. Near the border, the longest waves can contain up to twice as much noise.
     fn band_noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
         let first2 = self.bands[0].from_mm.powi(2);
         let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
@@ -383,8 +394,9 @@ impl LearningState {
 }
 
 impl MeanError {
-    /// Returns the learned mean error, interpolated to the nodes of `grid` and multiplied by `factor`. If `mean`
-    /// already has this grid, nothing is interpolated. If `mean` is `None`, all values are 0.
+    /// Returns the learned mean error at the nodes of `grid`: the values of `mean`, interpolated bilinearly to these
+    /// nodes and multiplied by `factor`. If `mean` is already on this grid, its values are not interpolated. If `mean`
+    /// is `None`, all values are 0.
     fn resampled(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
@@ -393,10 +405,11 @@ impl MeanError {
 }
 
 impl ResampledError {
-    /// Returns an error map, interpolated to the nodes of `grid`, the grid of the correction.
+    /// Interpolates the measured error map `error` to the nodes of `grid`, the grid of the correction, and returns the
+    /// result. A node is valid if the nearest node of `error` is valid.
     ///
-    /// All learned values are on the grid of the correction. So only the measured error is ever interpolated, and its
-    /// size, and with it the error of the interpolation, falls from pass to pass.
+    /// All learned values are on the grid of the correction, so only the measured error is interpolated. The measured
+    /// error becomes smaller from pass to pass, and with it the error of the interpolation.
     fn resampled(error: &ErrorMap, grid: Grid) -> Self {
         let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
         let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
@@ -407,8 +420,9 @@ impl ResampledError {
         mean_square(&self.valid, values)
     }
 
-    /// Returns `values`, given at the nodes of the grid, after a Gaussian low-pass filter with the cut-off `cutoff_mm`.
-    /// Returns 0 at every node if the map is too small for this cut-off.
+    /// Applies a Gaussian low-pass filter with the cut-off `cutoff_mm` to `values`, one for each node of the grid of
+    /// this map, and returns the filtered values. Uses only valid nodes. Returns 0 at every node if the filter cannot
+    /// be computed, because the map is too small for this cut-off.
     fn low_pass(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
         match filter_grid(&self.grid, values, &self.valid, cutoff_mm, FilterOrder::default(), false) {
             Ok(smooth) => smooth.values,
@@ -430,9 +444,12 @@ impl Band {
         self.scatter[1] > 0.0 && self.scatter[1] < 1.0
     }
 
-    /// Updates the Kalman filter of the band after a pass. The innovation is the observed error minus its prediction.
-    /// `news_mm2` is the mean square of the innovation in this band, in mm². `independent` is the number of independent
-    /// values that it was computed from.
+    /// Updates the Kalman filter of this band after a pass: the noise variance, the Kalman gain, and the variance of
+    /// the mean error. `news_mm2` is the mean square, in mm², of the innovation (the observed error minus its
+    /// prediction) in this band. `independent` is the number of independent values in this mean square.
+    ///
+    /// If the innovation is much larger than expected, the machine is treated as changed, and the gain becomes larger.
+    /// If this happens in two consecutive passes, the noise variance is treated as too small and is replaced.
     fn update(&mut self, news_mm2: f64, independent: f64) {
         let expected = self.belief.zip(self.noise_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
         let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
@@ -459,9 +476,10 @@ impl Band {
         self.borrowed *= 1.0 - self.gain;
     }
 
-    /// Computes `share`, the share of the mean error that remains after Wiener shrinkage (see the module). `mean_mm2`
-    /// is the mean square of the mean error in this band. `noise_mm2` is the mean square of the noise of the points; it
-    /// is used only if the variance of the non-repeatable error is unknown.
+    /// Computes the share of the learned mean error that remains after Wiener shrinkage (see the module), from 0 to 1,
+    /// and stores it in `share`. `mean_mm2` is the mean square of the mean error in this band, in mm². `noise_mm2` is
+    /// the mean square of the noise of the measured points in this band; it is used only if the variance of the
+    /// non-repeatable error is unknown.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
@@ -478,18 +496,22 @@ impl Band {
     }
 }
 
-/// Returns how many statistically independent values a map of the area `area_mm2` contains for waves longer than
-/// `from_mm`, at least 1. A square with sides of twice this wavelength counts as one value, and
-/// [`VALUES_PER_INDEPENDENT_VALUE`] of these correlated values count as one independent value.
+/// Returns how many statistically independent values a map contains for waves longer than `from_mm`, at least 1.
+/// `area_mm2` is the area of the map.
+///
+/// The area is divided into squares with sides of twice the wavelength `from_mm`, and each square gives one value.
+/// These values are correlated: [`VALUES_PER_INDEPENDENT_VALUE`] of them count as one independent value.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
     (area_mm2 / (2.0 * from_mm).powi(2) / VALUES_PER_INDEPENDENT_VALUE).max(1.0)
 }
 
-/// Combines the known response (`before`, with its standard uncertainty `sigma`) with the newly measured response
-/// `answer`, weighted by inverse variances. Returns the new response and its standard uncertainty.
+/// Combines the known response with the newly measured response `answer`, as a mean weighted by inverse variances. The
+/// response is the change of the surface divided by the commanded change. Returns the new response and its standard
+/// uncertainty.
 ///
-/// `independent` is the number of independent values of the measurement. If the measured response is outside
-/// [`RESPONSE_LIMITS`], returns the known response unchanged.
+/// `before` is the known response and `sigma` its standard uncertainty. `independent` is the number of independent
+/// values in the measurement. If the measured response is outside [`RESPONSE_LIMITS`], returns the known response
+/// unchanged.
 fn combine_responses([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
     let [least, most] = RESPONSE_LIMITS;
     if !(least..=most).contains(&answer.slope) {

@@ -9,14 +9,14 @@ pub(super) struct Levelled {
     pub sources: Vec<usize>,
 }
 
-/// Extends a surface from the nodes with a value (`known`) to all nodes of `grid`. Far from the known nodes, a node
-/// gets the value of the nearest known node, its source.
+/// Extends a surface from the known nodes of `grid` to all of its nodes. `known` is true for the nodes whose `values`
+/// are valid. Returns the values at all nodes, and for each node the index of its source: the nearest known node. Far
+/// from the known nodes, a node has the value of its source.
 ///
-/// `slopes` are the slopes of the surface along x and y at the nodes. The surface changes into the constant value of
-/// the source over `distance_mm` (L) without a kink: at the distance t from the source it differs from the constant by
-/// g t (1 - t / L)^2, where g is the slope at the source in the direction of the node. So it starts with the slope g,
-/// differs from the constant by at most 4/27 |g| L, and equals the constant from t = L on. With L = 0 it is constant
-/// outside the known nodes.
+/// `slopes` holds the slopes of the surface along x and y at each node. The transition to the constant value has the
+/// length `distance_mm` (L) and no kink. At the distance t from the source, the surface differs from the value of the
+/// source by g t (1 - t / L)^2. Here g is the slope at the source in the direction of the node. This difference starts
+/// with the slope g, is at most 4/27 |g| L, and is 0 from t = L on. With L = 0, there is no transition.
 pub(super) fn level_off(
     grid: &Grid,
     mut values: Vec<f64>,
@@ -36,10 +36,11 @@ pub(super) fn level_off(
     Levelled { values, sources }
 }
 
-/// Returns, for every node of `grid`, the index of the nearest node for which `known` is true; for a known node its own
-/// index. At least one node must be known.
+/// Returns, for every node of `grid`, the index of the nearest known node: the nearest node for which `known` is true.
+/// For a known node this is its own index. At least one node must be known.
 ///
-/// Two sweeps over the grid pass the nearest known node on from neighbour to neighbour (Danielsson 1980).
+/// Method: two sweeps over the grid, in which each node compares its candidate for the nearest known node with the
+/// candidates of its neighbours (Danielsson 1980).
 pub(super) fn nearest_known(grid: &Grid, known: &[bool]) -> Vec<usize> {
     const NONE: usize = usize::MAX;
     let (columns, rows) = (grid.columns, grid.rows);

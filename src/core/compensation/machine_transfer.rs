@@ -87,17 +87,19 @@ struct BandEvidence {
 }
 
 impl MachineSimilarity {
-    /// Adds a person's estimate of the similarity as one comparison, for all wavelengths. `rms_share` (0 to 1) is the
-    /// rms of a machine's own part of the repeatable error, divided by the rms of the whole repeatable error.
+    /// Adds the estimate of a person as one comparison of machines, valid for all wavelengths. `rms_share` (0 to 1) is
+    /// the rms of the part of the repeatable error that only one machine has, divided by the rms of its whole
+    /// repeatable error.
     pub fn add_statement(&mut self, rms_share: f64) {
         let share = rms_share * rms_share;
         self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
     }
 
-    /// Compares what two machines learned for the same recipe and adds the comparison. Returns true if the machines can
-    /// be compared in at least one band of wavelengths; otherwise adds nothing and returns false.
+    /// Compares the repeatable errors that two machines learned for the same recipe, and stores the comparison. Returns
+    /// true if at least one band of wavelengths could be compared. Otherwise stores nothing and returns false, for
+    /// example if the bands of the two states differ.
     ///
-    /// `is_own` is true if one of the two is the machine that is to receive an initial state.
+    /// `is_own` is true if one of the two machines is the machine for which an initial state is required.
     pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
         let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
         if !has_same_bands(one, other) {
@@ -123,9 +125,13 @@ impl MachineSimilarity {
         self.comparisons.len()
     }
 
-    /// Returns which share of the power (mean square) of the repeatable error is a machine's own, not common to all
-    /// machines, in the band that begins at the wavelength `from_mm`. The share is from 0 to 1. Returns `None` if no
-    /// comparison covers this band.
+    /// Returns the expected share of the repeatable error that is specific to one machine and not common to all
+    /// machines. The share is a ratio of mean squares, from 0 to 1, for the band of wavelengths that begins at
+    /// `from_mm`. Returns `None` if no comparison covers this band.
+    ///
+    /// The share is the mean over n comparisons, increased by the factor 1 + 1/n for the uncertainty of few
+    /// comparisons, and limited to 1. If the comparisons with the receiving machine alone give a larger share, returns
+    /// that share.
     pub fn own_share(&self, from_mm: f64) -> Option<f64> {
         let all = self.expected_share(from_mm, |_| true)?;
         Some(self.expected_share(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
@@ -140,9 +146,12 @@ impl MachineSimilarity {
 }
 
 impl Comparison {
-    /// Returns the share of the power that is a machine's own, in the band that contains the wavelength `from_mm`. A
-    /// longer wavelength than that of the last band belongs to the last band. Returns `None` if the two machines were
-    /// not comparable in this band.
+    /// Returns the share of the repeatable error that is specific to one machine, according to this comparison. The
+    /// share is a ratio of mean squares, from 0 to 1, for the band that contains the wavelength `from_mm`. The last
+    /// band contains all longer wavelengths. If the share for all bands together is larger, returns that share.
+    ///
+    /// Returns `None` if the two machines could not be compared in this band, or if `from_mm` is shorter than the waves
+    /// of the first band.
     fn share(&self, from_mm: f64) -> Option<f64> {
         let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
         share.map(|share| share.max(self.whole))
@@ -150,11 +159,11 @@ impl Comparison {
 }
 
 impl LearningState {
-    /// Returns the reason why this state cannot be an initial state for another machine, nor be compared with the state
-    /// of another machine. Returns `None` if there is no obstacle.
+    /// Returns a text with the reason why this state cannot be used for other machines: neither as the source of their
+    /// initial state nor for a comparison with their states. Returns `None` if there is no such reason.
     ///
-    /// A state that is valid ([`LearningState::is_valid`]) can still have an obstacle: a learned error without
-    /// uncertainty, an implausibly large learned error, or too many nodes.
+    /// Even a valid state ([`LearningState::is_valid`]) can have such a reason: a learned error without uncertainty, an
+    /// implausibly large learned error, or too many nodes.
     pub fn transfer_obstacle(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
             return Some("a learned mean error has no uncertainty".into());
@@ -172,13 +181,15 @@ impl LearningState {
         (steps > MAX_STEPS).then(why)
     }
 
-    /// Returns an initial state for a machine that has not ground this recipe, predicted from the machines that have
-    /// (best linear unbiased prediction with random effects).
+    /// Predicts the initial state of a machine that has not ground this recipe, from the states of machines that have
+    /// ground it. The method is the best linear unbiased prediction with random effects.
     ///
-    /// `self` is the state of the machine without this transfer, `others` are the states of the other machines, `alike`
-    /// is the similarity of the machines, and `grid` is the grid of the correction. A band of wavelengths is taken over
-    /// only if the machines have at least half of its power in common. Returns `None` if no other state has learned an
-    /// error in the same bands.
+    /// `self` is the state of the machine before this prediction. `others` holds the states of the other machines,
+    /// `alike` the similarity of the machines, and `grid` is the grid of the correction. A band of wavelengths is
+    /// predicted only if at least half of the mean square of its repeatable error is common to the machines. The other
+    /// bands stay unchanged; [`TransferredState::own_shares`] lists the predicted bands.
+    ///
+    /// Returns `None` if none of `others` has learned an error in the same bands.
     #[must_use]
     pub fn seeded_from(&self, others: &[&Self], alike: &MachineSimilarity, grid: Grid) -> Option<TransferredState> {
         let others: Vec<&Self> =
@@ -222,14 +233,18 @@ fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
-/// Returns an error that is 0 and valid at every node of `grid`.
+/// Returns an error object in which every node of `grid` is valid. It contains no values, and is used only for its grid
+/// and its valid nodes.
 fn zero_error(grid: Grid) -> ResampledError {
     ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
 }
 
-/// Returns, for each band of wavelengths, the repeatable error that the machine's own passes show, at the nodes of
-/// `grid`. `known` is the state of the machine. An element is `None` if the variance in this band is unknown, or if
-/// most of the learned error comes from other machines.
+/// Returns, for each band of wavelengths, the repeatable error of a machine at the nodes of `grid`, with its variance.
+/// `known` is the state of this machine. The variance excludes the information that came from other machines, so it is
+/// larger than the variance in `known`.
+///
+/// An element is `None` if the machine has learned no error in this band, if the variance in this band is unknown or 0,
+/// or if most of the learned error comes from other machines.
 fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>> {
     let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
     let on_grid = zero_error(*grid);
@@ -245,8 +260,11 @@ fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>
     known.bands.iter().zip(parts).map(of_band).collect()
 }
 
-/// Returns two mean squares of the repeatable error in one band, averaged over two machines, in mm²: first of the part
-/// that differs between the machines, then of the whole. Returns `None` if the whole does not exceed its noise.
+/// Compares the repeatable errors `a` and `b` of two machines in one band, and returns two mean squares in mm². The
+/// first is that of the part that is specific to one machine, the second that of the whole repeatable error. Each is
+/// the average of the two machines, with the noise subtracted.
+///
+/// Returns `None` if the second mean square is not above 0: then the error does not exceed the noise.
 fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
     let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
     let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
@@ -255,11 +273,12 @@ fn own_and_power(a: &BandEvidence, b: &BandEvidence) -> Option<[f64; 2]> {
     (power_mm2 > 0.0).then_some([own_mm2, power_mm2])
 }
 
-/// Predicts the repeatable error in one band on a machine that has not ground the recipe. Returns the error at each of
-/// the `nodes` nodes in mm, and its variance in mm².
+/// Predicts the repeatable error in one band for a machine that has not ground the recipe. Returns the predicted error
+/// at each node in millimetres, and its variance in mm².
 ///
-/// `machines` holds the evidence of the other machines, `own_share` the share of the power that is a machine's own.
-/// Returns `None` if the machines have no part of the error in common.
+/// `machines` holds the errors of the other machines. `own_share` is the share (0 to 1) of the mean square of the error
+/// that is specific to one machine. `nodes` is the number of nodes. Returns `None` if the errors of `machines` do not
+/// exceed their noise, or if they have nothing in common (`own_share` is 1).
 fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option<(Vec<f64>, f64)> {
     let power = machines.iter().map(|of| of.mean_mm2 - of.variance_mm2).sum::<f64>() / machines.len().max(1) as f64;
     let (own, common) = (own_share * power, (1.0 - own_share) * power);
@@ -275,9 +294,11 @@ fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option
     Some((values_mm, own + common / rest))
 }
 
-/// Returns the estimate for all wavelengths together, for a machine that starts from others. `own` is the estimate of
-/// the machine itself, `variance_mm2` the variance of the predicted error. If `own` has no estimate of the
-/// non-repeatable error, the mean estimate of `others` is used.
+/// Returns the estimate for all wavelengths together, for a machine whose initial state is predicted from the machines
+/// `others`. `own` is the estimate of the machine before the prediction. `variance_mm2` is the variance of the
+/// predicted error in mm².
+///
+/// The variance of the non-repeatable error is taken from `own`. If `own` has none, the mean over `others` is used.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
@@ -292,9 +313,12 @@ fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     Band { belief, borrowed: 1.0, ..with }
 }
 
-/// Returns the expected response of a machine and its standard uncertainty: the mean response of `others`, combined
-/// with the earlier estimate (`before`, with the standard uncertainty `sigma`) by inverse variances. The variance of
-/// the mean includes the variance between machines.
+/// Returns the expected response of a machine and its standard uncertainty. The response is the change of the surface
+/// divided by the commanded change; 1 is as commanded.
+///
+/// The result combines the mean response of the machines `others` with the earlier estimate `before`, weighted by
+/// inverse variances. `sigma` is the standard uncertainty of `before`. The variance of the mean includes the variance
+/// between machines. The response is limited to [`RESPONSE_LIMITS`].
 fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
     let n = others.len() as f64;
     let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;

@@ -100,21 +100,23 @@ pub struct ErrorMap {
     pub advice: Vec<String>,
 }
 
-/// Computes the map of the error from deviations: rejects outliers, filters the remaining readings, and returns the
-/// result at the nodes of a grid over the readings.
+/// Computes the map of the error from measured deviations (`readings`, in any order). Rejects outliers, filters the
+/// other readings, and returns the result at the nodes of a grid that covers all readings.
 ///
-/// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least
-/// squares of a polynomial at every node with the weights exp(-pi (r / (alpha cutoff))^2), where r is the distance of a
-/// reading, see [`FilterOrder::alpha`]; or the smoothing spline.
+/// Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a polynomial at every
+/// node. The weights are exp(-pi (r / (alpha cutoff))^2), where r is the distance of a reading from the node, see
+/// [`FilterOrder::alpha`]. With [`Smoothing::Spline`], a smoothing spline replaces this filter.
 ///
-/// Two neighbouring readings that are far from the surface on the same side are a feature of the part, not outliers.
-/// The Gaussian filter keeps at least half of the height of a feature, unless less than an eighth of it passes the
-/// filter. A cut-off that is too short for the wheel or for the distance of the points is no error;
-/// [`ErrorMap::advice`] reports it.
+/// Two neighbouring readings that are far from the surface on the same side are not outliers, but a feature of the
+/// part. The Gaussian filter is repeated to keep at least half of the height of a feature. This fails only for a
+/// feature of which less than an eighth passes the filter.
+///
+/// A cut-off that is too short for the wheel or for the distance of the points is not an error. It is reported in
+/// [`ErrorMap::advice`].
 ///
 /// # Errors
 /// Returns an error if a deviation is not finite, if there are too few readings for the cut-off, if an option is out of
-/// range, or if no grid fits the readings.
+/// range, or if no grid can be built for the readings.
 pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
     let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm)?;
@@ -165,11 +167,13 @@ pub fn error_map(readings: &[DeviationSample], options: &MapOptions) -> Result<E
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
-/// Restores the features of the part that the filter made too low: filters what is missing of them and adds the result
-/// to `filtered`, at most 8 times, until most of the height of each feature is in the surface.
+/// Restores features of the part (places where neighbouring readings confirm a deviation) that the filter has made too
+/// low. A small feature, such as a chip with only two measured points, is narrower than the filter.
 ///
-/// `features` holds, for each feature, the index of a reading and its height above the surface around it. A small
-/// feature, such as a chip under only two touches, is narrower than the filter.
+/// Filters the missing height of the features and adds the result to `filtered`. Repeats this until `filtered` contains
+/// most of the height of each feature, at most 8 times. `gaussian` is the filter of the map, and `kept` holds the
+/// readings without outliers. `features` holds, for each feature, the index of a reading in `kept` and its height above
+/// the surface around it, in millimetres.
 fn preserve_features(
     filtered: &mut FilterResult,
     gaussian: &GaussianFilter,
@@ -202,11 +206,12 @@ fn preserve_features(
     }
 }
 
-/// Computes the map of a form that a model predicts at many places.
+/// Computes the error map of a form that a model predicts at many places.
 ///
-/// `told` holds each predicted deviation with its standard uncertainty, in millimetres. The uncertainties are filtered
-/// in the same way as the deviations. No prediction is rejected as an outlier, since predictions have no noise.
-/// `scatter_mm` is the standard deviation of the noise of a measured point, as the model estimates it.
+/// `told` holds the predicted deviations, each with its standard uncertainty, in millimetres. The filter is applied to
+/// the deviations and in the same way to the uncertainties. No prediction is rejected as an outlier, because
+/// predictions have no noise. `scatter_mm` is the standard deviation of the noise of a measured point, as estimated by
+/// the model, in millimetres; the map reports it as the noise of a reading.
 ///
 /// # Errors
 /// Returns the same errors as [`error_map`].
@@ -240,8 +245,9 @@ impl ReferenceFilter {
         filter_robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
-    /// Returns the standard deviation of a single reading, from the residuals of the reference filter. `filtered` is
-    /// the result of the filter of the map; it is used if the two filters are the same.
+    /// Returns the standard deviation of a single reading, computed from the differences between the readings `kept`
+    /// and the surface of this reference filter. `filtered` is the surface of the filter of the map. If both filters
+    /// are the same, `filtered` is used and the readings are not filtered again.
     fn point_sigma(&self, kept: &InlierReadings, filtered: &FilterResult) -> f64 {
         if self.is_map_filter {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
@@ -251,8 +257,9 @@ impl ReferenceFilter {
     }
 }
 
-/// Returns the typical number of readings per square millimetre, computed from the median leverage at the supported
-/// nodes of `filtered`. `gaussian` is the filter that gave this result.
+/// Returns the typical number of readings per square millimetre. It is computed from the median of the leverage (change
+/// of a filtered value per unit change of a reading at the same place) at the supported nodes of `filtered`. `gaussian`
+/// is the filter with which `filtered` was computed.
 fn density(filtered: &FilterResult, gaussian: &GaussianFilter) -> f64 {
     let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
@@ -311,8 +318,9 @@ struct UnlevelledMap {
 }
 
 impl UnlevelledMap {
-    /// Selects the nodes of `grid`, the grid of the map, from the finer grid of `filtered`. `point_sigma` is the
-    /// standard deviation of a single reading.
+    /// Builds the map from a filter result on a finer grid: copies values, slopes and validity at those nodes that are
+    /// also nodes of `grid`, the grid of the map. The uncertainty of each value is computed from `point_sigma`, the
+    /// standard deviation of a single reading in millimetres.
     fn from_filtered(filtered: &FilterResult, grid: &Grid, point_sigma: f64) -> Self {
         let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
         let (across, along) = (step(filtered.grid.columns, grid.columns), step(filtered.grid.rows, grid.rows));
@@ -327,8 +335,9 @@ impl UnlevelledMap {
         }
     }
 
-    /// Replaces values, slopes and uncertainties of the Gaussian filter by those of the smoothing spline. `valid` stays
-    /// as it is. `density` is the number of readings per square millimetre.
+    /// Fits a smoothing spline to the readings `kept` and returns a map with its values, slopes and uncertainties at
+    /// the nodes of `grid`. Only the validity of the nodes is kept from the Gaussian filter. `density` is the number of
+    /// readings per square millimetre. `options` gives the cut-off and the choice of the smoothness.
     ///
     /// # Errors
     /// Returns the error of the spline fit.
@@ -368,7 +377,8 @@ impl UnlevelledMap {
 }
 
 impl ErrorMap {
-    /// Returns an error map with exactly known values: all uncertainties are 0, there are no outliers and no advice.
+    /// Returns an error map with exactly known values: all uncertainties are 0, and there are no outliers and no
+    /// advice. `values_mm` (in millimetres) and `valid` have one entry for each node of `grid`.
     pub fn exact(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
             grid,
@@ -422,15 +432,17 @@ pub struct FilteredGrid {
     pub rounds: usize,
 }
 
-/// Filters a map that is given on a grid, such as that of an interferometer: by ISO 16610-61, or with `robust_form` by
-/// the robust form ISO 16610-71.
+/// Filters a map that is given at the nodes of a grid, for example from an interferometer, and returns the filtered map
+/// at the same nodes. The filter is the areal Gaussian filter of ISO 16610-61. If `robust_form` is true, it is the
+/// robust Gaussian filter of ISO 16610-71.
 ///
-/// Shapes: `values` and `valid` have an entry for every node, row by row, x fastest. A value that is not valid is not
-/// used. Units: any for the values; the cut-off in millimetres.
+/// Shapes: `values` and `valid` have one entry for each node of `grid`, row by row, x fastest. Values whose `valid` is
+/// false are not used. `order` is the order of the polynomial that passes the filter unchanged. Units: any unit for the
+/// values; millimetres for the cut-off.
 ///
 /// # Errors
-/// Returns an error if the number of values is not that of the nodes, if a valid value is not finite, if the cut-off is
-/// not above 0, or if no node has enough valid values around it.
+/// Returns an error if the number of values differs from the number of nodes, if a valid value is not finite, if the
+/// cut-off is not above 0, or if no node has enough valid values around it.
 pub fn filter_grid(
     grid: &Grid,
     values: &[f64],

@@ -70,11 +70,12 @@ pub enum NextPassError {
 }
 
 impl Correction {
-    /// Returns this correction with its values replaced by those that compensate the learned error. Number of the pass
-    /// and level stay the same, and no limit is checked.
+    /// Returns a copy of this correction with new values that compensate the learned error. The number of the pass and
+    /// the level are not changed. No limit is checked.
     ///
-    /// `known` gives the learned correction. `set` holds the parameter corrections of the next pass; the map does not
-    /// repeat the part of the error that they compensate.
+    /// `known` is the learned state that gives the required total correction; if it has none, the present correction is
+    /// used. `set` holds the parameter corrections of the next pass, or `None`. Their visible effect is subtracted from
+    /// the values, so that no part of the error is compensated twice.
     pub fn compensating(&self, known: &LearningState, set: Option<&ParameterCorrections>) -> Self {
         let seen_mm = self.apparent_mm();
         let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
@@ -84,8 +85,9 @@ impl Correction {
         Self { values_mm, set: set.cloned(), ..self.clone() }
     }
 
-    /// Returns the largest total removal at any node, in millimetres, measured from the surface that a first pass
-    /// without a correction leaves.
+    /// Returns the total removal of this correction at the node with the largest removal, in millimetres. The removal
+    /// is measured from the surface that a first pass without correction leaves. `limits` holds the allowance and the
+    /// limits of the recipe.
     ///
     /// # Errors
     /// Returns [`NextPassError::TooLarge`] if the correction exceeds its limit at a node, and
@@ -106,15 +108,17 @@ impl Correction {
         Ok(removed_mm)
     }
 
-    /// Returns the next pass: its correction compensates the learned error, and it is deep enough to cut everywhere.
+    /// Returns the next pass: a correction that compensates the learned error, and a depth at which the wheel cuts
+    /// everywhere.
     ///
-    /// `self` is the correction of the last pass, `error` the map measured after it, and `known` the learned state. The
-    /// parameter corrections in `set` compensate a part of the error, the map compensates the rest.
+    /// `self` is the correction of the last pass, `error` the map measured after that pass, and `known` the learned
+    /// state. `set` holds the parameter corrections of the next pass. They compensate a part of the error; the map
+    /// compensates the other part.
     ///
-    /// A pass can only remove material: the new surface must lie below the present one everywhere. A rise of the
-    /// correction by d raises the surface by s d, where s is the response of the part, and every pass adds its own
-    /// non-repeatable error. So the depth is at least the sum of the largest rise, two standard deviations of this
-    /// error and the minimum depth of removal.
+    /// A pass can only remove material, so the new surface must be below the present surface everywhere. If the
+    /// correction increases by d at a node, the surface rises there by s d, where s is the response of the part. In
+    /// addition, every pass has a non-repeatable error. So the depth is at least the sum of three values: the largest
+    /// rise s d, two standard deviations of the non-repeatable error, and the minimum depth of removal.
     ///
     /// Frames: x and y of the model frame. Units: millimetres.
     ///

@@ -60,13 +60,14 @@ const WELL_EXPLAINED: f64 = 0.05;
 /// Slope above which a response is nearer to twice the command than to a single command on a stiff machine.
 const TWICE: f64 = 1.6;
 
-/// Compares the change of the error from one pass to the next with the commanded change of the correction, and returns
-/// the response of the part: its slope and its classification.
+/// Compares the measured change of the error map between two passes with the commanded change of the correction.
+/// Returns the response of the part: its slope (measured change divided by commanded change) and its classification,
+/// for example as commanded, mirrored or without effect.
 ///
-/// Shapes: `errors` and `corrections` belong to the pass before and to the last pass, in this order. `places` are
-/// points of the nominal surface with their unit normals, in any order, where both maps were measured. `scatter_mm` is
-/// the repeatability of grinding and measuring together: the standard deviation by which the error changes without a
-/// command. Frames: the model frame.
+/// `errors` and `corrections` each contain two maps: of the previous pass, then of the last pass. `places` are points
+/// of the nominal surface with their unit normals, in any order. Both error maps must have a value at these points.
+/// `scatter_mm` is the repeatability of grinding and measuring together, in millimetres: the standard deviation of the
+/// error without a new command. Frame: the model frame.
 pub fn estimate_response(
     errors: [&ErrorMap; 2],
     corrections: [&Correction; 2],
@@ -177,8 +178,8 @@ impl MotionProjector {
         Self { inverse: inverse.sum(), rows }
     }
 
-    /// Returns `values`, given at the places of this projector, minus the part of them that a rigid motion of the part
-    /// explains.
+    /// Removes from `values` the part that a rigid motion of the part explains (least squares), and returns the rest.
+    /// `values` holds one value for each place of this projector, in the same order.
     fn without(&self, mut values: Vec<f64>) -> Vec<f64> {
         let seen: Vector6<f64> = self.rows.iter().zip(&values).map(|(row, v)| row * *v).sum();
         let motion = self.inverse * seen;

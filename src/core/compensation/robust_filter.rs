@@ -70,8 +70,11 @@ pub(super) struct Residuals {
     pub freedom: Vec<f64>,
 }
 
-/// Returns the residual of each reading from the surface `filtered`, and its freedom. The surface must be the result of
-/// filtering these readings with these `weights`; `None` stands for 1.
+/// Returns the residual (reading minus surface) of each reading, and the freedom of each residual: the ratio of its
+/// variance to the variance of a reading. The residual is NaN and the freedom is 0 where `filtered` has no value.
+///
+/// `filtered` must be the result of filtering these readings (`places` and `values`) with these `weights`. If `weights`
+/// is `None`, all weights are 1.
 pub(super) fn residuals(
     filtered: &FilterResult,
     places: &[[f64; 2]],
@@ -96,8 +99,9 @@ impl Residuals {
         self.values.iter().zip(&self.freedom).map(each).collect()
     }
 
-    /// Estimates the standard deviation of one reading: the square root of the sum of the squared residuals, divided by
-    /// the sum of their freedoms. Returns 0 if no residual has enough freedom.
+    /// Estimates the standard deviation of one reading: the square root of the ratio (sum of the squared residuals) /
+    /// (sum of the freedoms). The freedom of a residual is the ratio of its variance to the variance of a reading.
+    /// Residuals that are NaN or have a freedom of at most 0.02 are omitted. Returns 0 if none remains.
     pub fn sigma(&self) -> f64 {
         let known = (0..self.values.len()).filter(|&k| self.freedom[k] > MIN_FREEDOM && self.values[k].is_finite());
         let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.values[k].powi(2), f + self.freedom[k]));
@@ -105,8 +109,11 @@ impl Residuals {
     }
 }
 
-/// Filters readings with the robust Gaussian filter of ISO 16610-71, which gives readings far from the surface less
-/// weight. `gaussian` is the filter without weights, `grid` the grid of the result.
+/// Applies the robust Gaussian filter of ISO 16610-71 to scattered readings: a reading far from the filtered surface
+/// gets less weight. `places` are the positions `[x, y]` of the readings, `values` their heights. `gaussian` is the
+/// filter to apply in each round, and the result is computed at the nodes of `grid`.
+///
+/// Returns the filtered surface, and weight and residual of each reading.
 pub(super) fn filter_robust(
     gaussian: &GaussianFilter,
     places: &[[f64; 2]],
@@ -118,11 +125,12 @@ pub(super) fn filter_robust(
     iterate(gaussian.filter_scattered(places, values, None, grid), values.len(), again, compare)
 }
 
-/// Repeats two steps until the weights converge (iteratively reweighted least squares): weights the readings by their
-/// residuals, and filters them again.
+/// Filters the readings repeatedly until the weights converge or after fifteen rounds (iteratively reweighted least
+/// squares). Each round computes new weights from the residuals and filters the readings with these weights.
 ///
-/// `first` is the result without weights, `count` the number of readings. `again` filters the readings with given
-/// weights. `compare` returns the residuals from a filtered surface and the weights that gave it.
+/// `first` is the filtered surface with all weights 1. `count` is the number of readings. `again` filters the readings
+/// with the weights that it is given. `compare` returns the residuals of the readings from a filtered surface; its
+/// second argument holds the weights of that surface, or `None` if all are 1.
 pub(super) fn iterate(
     first: FilterResult,
     count: usize,
@@ -163,12 +171,17 @@ pub(super) struct FarReadings {
 }
 
 impl RobustResult {
-    /// Finds the readings that are far from the surface, with a scaled residual above `limit` standard deviations, and
-    /// divides them into outliers and features. A feature is confirmed by a neighbouring reading.
+    /// Finds the readings that are far from the filtered surface and divides them into outliers and features. A reading
+    /// is far if its scaled residual (the residual divided by the square root of its freedom) exceeds `limit` times the
+    /// standard deviation of one reading. A far reading is a feature of the part if a neighbouring reading confirms it;
+    /// otherwise it is an outlier.
     ///
-    /// `places` and `values` are those of the readings, `apart` is the distance of neighbouring readings along x and y.
-    /// With fewer than 20 readings none is far. Returns `None` if more than a tenth of the readings would be outliers:
-    /// then the surface itself is doubtful.
+    /// `places` and `values` are the positions and heights of the readings. `apart` is the distance between
+    /// neighbouring readings along x and along y. Returns the indices of the readings in ascending order. With fewer
+    /// than 20 readings both lists are empty.
+    ///
+    /// Returns `None` if more than a tenth of the readings would be outliers, because then the surface itself is
+    /// doubtful.
     pub fn find_far(
         &self,
         (places, values): (&[[f64; 2]], &[f64]),
@@ -203,9 +216,11 @@ impl RobustResult {
         (outliers.len() * 10 <= places.len()).then_some(FarReadings { outliers, features })
     }
 
-    /// Returns true if a neighbour confirms the reading `off[n]`: one of its eight neighbours deviates to the same
-    /// side, by at least a quarter of its residual. `off` holds the indices of the readings that deviate much, sorted
-    /// along x. `apart` is the distance of neighbouring readings along x and y.
+    /// Returns true if a neighbour confirms the reading with the index `off[n]`: one of its eight neighbours has a
+    /// residual of the same sign and at least a quarter of the size.
+    ///
+    /// `off` holds the indices of all readings with a large residual, sorted by x. `places` are the positions of all
+    /// readings. `apart` is the distance between neighbouring readings along x and along y.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
@@ -221,8 +236,11 @@ impl RobustResult {
     }
 }
 
-/// Returns true if a reading at the distance `away` along x and y is one of the eight neighbours of another reading,
-/// and not a repeat of the same place. `apart` is the distance of neighbouring readings along x and y.
+/// Returns true if two readings are neighbours, as one of the eight surrounding nodes of a grid. `away` is the distance
+/// between the two readings along x and y. `apart` is the usual distance between neighbouring readings along x and y.
+///
+/// The distance must be at most 1.5 spacings along both axes. Returns false if it is at most 0.25 spacings along both
+/// axes: this is a repeated reading of the same place.
 fn is_neighbour(away: [f64; 2], apart: [f64; 2]) -> bool {
     is_within(away, apart, NEIGHBOUR) && !is_within(away, apart, SAME_PLACE)
 }
@@ -240,9 +258,13 @@ struct ReadingIndex<'r> {
 }
 
 impl ReadingIndex<'_> {
-    /// Returns true if a neighbour confirms the reading `k`. Heights are measured from the plane through the readings
-    /// farther around. The height of the neighbour must be at least `least`, and at least a quarter of the height of
-    /// the reading. `side` is 1 for a reading above the surface, and -1 for one below.
+    /// Returns true if a neighbour confirms that the reading with the index `k` is a feature of the part. The height of
+    /// each reading is measured from a plane, which is fitted to nearby readings that are not neighbours of reading
+    /// `k`.
+    ///
+    /// The height of the neighbour must be at least `least`, and at least a quarter of the height of reading `k`.
+    /// `side` is 1 for a reading above the surface, and -1 for one below. Returns false if the nearby readings do not
+    /// determine a plane.
     fn is_confirmed(&self, k: usize, side: f64, least: f64) -> bool {
         let own = on_plane(&self.places[k]);
         let near = self.tree.nearest(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);

@@ -136,8 +136,8 @@ struct SplineAxis {
     cells: usize,
 }
 
-/// Returns the values of the four uniform cubic B-splines that are not 0 in a cell, at the position `u` (0 to 1) in the
-/// cell. `derivative` is 0 for the values, 1 or 2 for the first or second derivative by `u`.
+/// Evaluates the four uniform cubic B-splines that are not 0 in a grid cell, at the position `u` in the cell, from 0 to
+/// 1. `derivative` is 0 for the values, and 1 or 2 for the first or second derivative with respect to `u`.
 fn basis(derivative: usize, u: f64) -> [f64; 4] {
     let v = 1.0 - u;
     match derivative {
@@ -161,16 +161,18 @@ impl SplineAxis {
         self.cells as f64 * self.step
     }
 
-    /// Finds the cell that contains the coordinate `at`. Returns the index of the first of the four splines that are
-    /// not 0 there, and the position in the cell, from 0 to 1. A coordinate beyond the axis counts as its end.
+    /// Finds the cell of this axis that contains the coordinate `at`, in mm. Returns the index of the cell and the
+    /// position in the cell, from 0 to 1. The index is also that of the first of the four splines that are not 0 in the
+    /// cell. For a coordinate outside the axis, the nearest end of the axis is used.
     fn cell(&self, at: f64) -> (usize, f64) {
         let u = ((at - self.first) / self.step).clamp(0.0, self.cells as f64);
         let cell = (u as usize).min(self.cells - 1);
         (cell, u - cell as f64)
     }
 
-    /// Returns, for each spline, the integrals of its product with itself and with the next three splines along the
-    /// axis. `derivative` is 0, 1 or 2: the derivative of the splines that is multiplied.
+    /// Integrates products of B-splines along the axis. For each spline, returns four integrals: of its product with
+    /// itself, and with each of the next three splines. `derivative` is 0 for the splines themselves, and 1 or 2 for
+    /// their first or second derivatives.
     fn products(&self, derivative: usize) -> Vec<[f64; 4]> {
         // Gauss-Legendre with four points is exact up to the seventh degree; here the degree is at most six.
         const GAUSS: [(f64, f64); 4] = [
@@ -198,8 +200,9 @@ impl SplineAxis {
 /// Number of entries of a coefficient: with itself and 24 later neighbours.
 const LATER: usize = 25;
 
-/// Returns the index of a neighbour among the entries of a coefficient. The neighbour is `di` columns and `dj` rows
-/// after the coefficient; [`offset`] is the inverse.
+/// Returns the storage index (0 to 24) of the matrix entry that couples a spline coefficient with a neighbouring
+/// coefficient. The neighbour is `di` columns and `dj` rows after the coefficient. The function [`offset`] is the
+/// inverse.
 fn later(di: isize, dj: isize) -> usize {
     if dj == 0 { di as usize } else { (4 + (dj - 1) * 7 + di + 3) as usize }
 }
@@ -252,9 +255,9 @@ impl<'a> NormalEquations<'a> {
         }
     }
 
-    /// Returns the entries of the system matrix A = B^T B + `mu` P, in the order of the sparsity pattern. B is the
-    /// matrix of the splines at the readings, P the bending, `mu` its weight. A tiny ridge on the diagonal keeps A
-    /// positive definite.
+    /// Returns the non-zero entries of the matrix A = B^T B + `mu` P, in the order of the sparsity pattern. B holds the
+    /// values of the splines at the readings, P is the matrix of the bending energy, and `mu` is the weight of the
+    /// bending energy. A tiny constant is added to the diagonal, so that A is positive definite.
     fn matrix(&self, mu: f64) -> Vec<f64> {
         let at = |&(c, s): &(u32, u8)| c as usize * LATER + s as usize;
         let largest =
@@ -263,8 +266,8 @@ impl<'a> NormalEquations<'a> {
         self.entries.iter().map(|e| self.normal[at(e)] + mu * self.bending[at(e)] + ridge(e)).collect()
     }
 
-    /// Copies the entries of an inverse into the layout of `normal`: [`LATER`] entries for each coefficient; 0 where a
-    /// neighbour does not exist.
+    /// Copies the entries of an inverse matrix into the layout of the field `normal`: [`LATER`] entries for each spline
+    /// coefficient, one for itself and one for each later neighbour. The entry is 0 if a neighbour does not exist.
     fn spread(&self, inverse: &SelectedInverse) -> Vec<f64> {
         let nx = self.axes[0].count();
         let mut spread = vec![0.0; self.right.len() * LATER];
@@ -284,8 +287,9 @@ impl<'a> NormalEquations<'a> {
         self.pattern.factor(&self.matrix(mu))?.solve(&self.right)
     }
 
-    /// Returns the trace of the product of two symmetric matrices, which is the sum of the products of their entries.
-    /// Both have [`LATER`] entries for each coefficient.
+    /// Returns the trace of the product of the two symmetric matrices `a` and `b`. The trace is the sum of the products
+    /// of corresponding entries; an entry off the diagonal counts twice. Each matrix is stored with [`LATER`] entries
+    /// for each spline coefficient.
     fn trace(&self, a: &[f64], b: &[f64]) -> f64 {
         let twice = |k: usize| if k.is_multiple_of(LATER) { 1.0 } else { 2.0 };
         a.iter().zip(b).enumerate().map(|(k, (a, b))| twice(k) * a * b).sum()
@@ -325,12 +329,14 @@ impl<'a> NormalEquations<'a> {
         })
     }
 
-    /// Chooses the weight of the bending between `least` and `most` by generalised cross-validation: returns the weight
-    /// mu that minimises n |d - B c|^2 / (n - tr H)^2, with the symbols of the module. Returns `None` if a matrix
-    /// cannot be factored.
+    /// Chooses the weight mu of the bending energy between `least` and `most` by generalised cross-validation. Returns
+    /// the weight that minimises n |d - B c|^2 / (n - tr H)^2. Returns `None` if a matrix cannot be factored.
     ///
-    /// Nine weights, evenly spaced in their logarithm, are tried; golden-section search then continues between the
-    /// neighbours of the best.
+    /// Symbols: n is the number of readings and d their values. B holds the values of the splines at the readings. c
+    /// are the spline coefficients fitted with mu. H is the matrix that maps d to the fitted values B c.
+    ///
+    /// First tries nine weights with equal steps in ln mu. Then a golden-section search continues between the
+    /// neighbours of the best weight.
     fn cross_validated(&self, least: f64, most: f64) -> Option<f64> {
         const TRIED: usize = 9;
         let count = self.values.len() as f64;
@@ -354,15 +360,16 @@ impl<'a> NormalEquations<'a> {
     }
 }
 
-/// Returns how many columns and rows a neighbour is after its coefficient. `s` is the index of the neighbour among the
-/// entries of the coefficient; [`later`] is the inverse.
+/// Returns the offset `[columns, rows]` from a spline coefficient to one of its later neighbours. `s` is the storage
+/// index (0 to 24) of the matrix entry that couples the two. The function [`later`] is the inverse.
 fn offset(s: usize) -> [isize; 2] {
     if s < 4 { [s as isize, 0] } else { [((s - 4) % 7) as isize - 3, ((s - 4) / 7) as isize + 1] }
 }
 
-/// Returns the sparsity pattern of the system for `nx` x `ny` coefficients: the entries (a coefficient, and the index
-/// of a later neighbour that exists), the index of the first entry of each matrix column, and the matrix row of each
-/// entry.
+/// Returns the sparsity pattern of the matrix for a grid of `nx` x `ny` spline coefficients, as three lists. The first
+/// holds, for each matrix entry, the coefficient and the storage index of a later neighbour inside the grid. The second
+/// holds the position of the first entry of each matrix column, and the total number of entries at the end. The third
+/// holds the matrix row of each entry.
 fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) {
     let (mut entries, mut begins, mut rows) = (Vec::new(), vec![0], Vec::new());
     for c in 0..nx * ny {
@@ -379,8 +386,9 @@ fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) 
     (entries, begins, rows)
 }
 
-/// Returns the bending energy (the matrix P) for every pair of neighbouring splines, [`LATER`] entries for each
-/// coefficient.
+/// Returns the matrix P of the bending energy of the splines. An entry is the integral, over the grid, of f_xx g_xx + 2
+/// f_xy g_xy + f_yy g_yy for two neighbouring splines f and g. The matrix is stored with [`LATER`] entries for each
+/// spline coefficient.
 fn bending(axes: &[SplineAxis; 2]) -> Vec<f64> {
     let [x, y] = axes.map(|axis| [0, 1, 2].map(|derivative| axis.products(derivative)));
     let (nx, ny) = (axes[0].count(), axes[1].count());
@@ -431,8 +439,8 @@ impl LocalSplines {
         })
     }
 
-    /// Returns b^T S b, where b holds the splines at this place and S is the symmetric `matrix` with [`LATER`] entries
-    /// for each coefficient.
+    /// Returns b^T S b, where b holds the values of the splines at this place. S is the symmetric matrix `matrix`,
+    /// stored with [`LATER`] entries for each spline coefficient.
     fn quadratic_form(&self, matrix: &[f64]) -> f64 {
         let mut sum = 0.0;
         for a in 0..16 {

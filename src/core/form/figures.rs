@@ -154,7 +154,11 @@ fn rectangle_from_bounds([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormErr
     if has_area { Ok(Aperture::from_corners([low, high])) } else { Err(FormError::NoArea) }
 }
 
-/// Computes PVr: the PV of `fit` at the samples plus three times the RMS of its residuals.
+/// Computes PVr (robust peak to valley, Evans 2009): the PV of the fitted polynomials `fit` at the positions of the
+/// samples, plus three times the RMS of the residuals of the fit.
+///
+/// # Errors
+/// Returns an error if a sample lies more than 1.5 radii from the centre of a Zernike disc.
 fn robust_pv(fit: &PolynomialFit, samples: &[DeviationSample]) -> Result<RobustPv, FormError> {
     let values = fit.values_mm(samples)?;
     let fit_pv_mm = pv(values.into_iter());
@@ -179,12 +183,12 @@ pub fn pv_998(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
-/// Computes which share of the aperture is measured. The bounds of the aperture are divided into square cells. Only
-/// cells with their centre in the aperture count; the share is the number of those that contain a point, divided by the
-/// number of all of them.
+/// Computes the share of the aperture that is measured, from 0 to 1. The bounding box of the aperture is divided into
+/// square cells. The share is the number of cells that contain a sample, divided by the number of all cells. Cells
+/// whose centre is outside the aperture are not counted.
 ///
-/// A cell has the area that contains four points on average. Its side is at least 1/64 of the longer side of the
-/// bounds.
+/// The size of a cell is chosen so that a cell contains four samples on average. The side of a cell is at least 1/64 of
+/// the longer side of the bounding box.
 fn coverage(aperture: &Aperture, samples: &[DeviationSample]) -> Coverage {
     let [low, high] = aperture.bounds();
     let size: [f64; 2] = std::array::from_fn(|k| high[k] - low[k]);

@@ -123,9 +123,11 @@ pub(super) struct LeastSquaresSolution {
 
 /// Fits a weighted sum of `terms` functions to the deviations of the samples by least squares (QR decomposition).
 ///
-/// For each sample, `row(index, sample, values)` is called; it writes the value of every function at that sample into
-/// `values`. If the samples do not determine a function, the result names the first such function in
-/// [`LeastSquaresSolution::undetermined`], and its coefficients are 0.
+/// The caller defines the functions by `row(index, sample, values)`. It is called once for each sample and writes the
+/// value of every function at this sample into `values`.
+///
+/// If the samples do not determine all functions, [`LeastSquaresSolution::undetermined`] holds the index of the first
+/// undetermined function, and all coefficients are 0.
 ///
 /// # Errors
 /// Returns the error of the first sample for which `row` fails.
@@ -167,8 +169,9 @@ pub(super) fn solve_least_squares(
     Ok(back_substituted(&r, terms, samples.len()))
 }
 
-/// Solves the least-squares problem from `r`, the triangular factor of the matrix of all terms with the deviations as
-/// the last column. `points` is the number of points.
+/// Solves a least-squares problem by back substitution. `r` is the triangular matrix R of a QR decomposition. The
+/// decomposed matrix has one column for each of the `terms` functions, and the deviations as the last column. `points`
+/// is the number of points.
 fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> LeastSquaresSolution {
     let scale = (points as f64).sqrt();
     let undetermined = (0..terms).find(|&k| {

@@ -44,10 +44,12 @@ pub struct Iso10110 {
     pub notation: String,
 }
 
-/// Computes the ISO 10110-5 figures of the deviations of a surface: power, irregularity and others.
+/// Computes the ISO 10110-5 figures of the deviations of a surface, in nanometres: PV of power, irregularity and its
+/// symmetric part, and RMS of total, irregularity and varying part.
 ///
-/// The samples are in the model frame, in millimetres. The symmetric part is symmetric about the centre of the bounds
-/// of `aperture`. `wavelength_nm` only appears in the notation.
+/// The positions and deviations of the samples are in the model frame, in millimetres. The symmetric part is symmetric
+/// about the centre of the bounding box of `aperture`. `wavelength_nm` only appears in the notation and does not change
+/// the figures.
 ///
 /// # Errors
 /// Returns an error if there are fewer than four points, if they lie on a line, if a number is not finite, or if the
@@ -94,11 +96,11 @@ pub fn iso_10110(samples: &[DeviationSample], aperture: &Aperture, wavelength_nm
 }
 
 /// Fits a rotationally symmetric form to the deviations by least squares. Returns the value of this form at each
-/// sample.
+/// sample, in millimetres.
 ///
-/// `square` returns (r/R)^2 of a sample, where r is the distance of the sample from the centre and R the largest
-/// distance of all samples. The form is a sum of the polynomials of [`even_terms`]. Fewer of them are used if the
-/// samples do not determine all seven.
+/// `square` returns (r/R)^2 of a sample. r is the distance of the sample from the centre, and R is the largest such
+/// distance. The form is a weighted sum of the seven polynomials of [`even_terms`]. The polynomials of the highest
+/// degrees are omitted if there are fewer than 28 samples, or if the samples do not determine all seven.
 fn fit_symmetric_part(
     samples: &[DeviationSample],
     square: impl Fn(&DeviationSample) -> f64 + Sync,
@@ -119,10 +121,10 @@ fn fit_symmetric_part(
     }
 }
 
-/// Returns the Legendre polynomials P_0 to P_6 at the argument 2 `square` - 1.
+/// Evaluates the Legendre polynomials P_0 to P_6 at 2 `square` - 1.
 ///
-/// `square` is (r/R)^2, with the distance r of a point from the centre and the largest distance R. Up to a factor, the
-/// polynomials are the Zernike terms without azimuth.
+/// `square` is (r/R)^2, from 0 to 1. r is the distance of a point from the centre, and R is the largest such distance.
+/// Except for a constant factor, these polynomials are the rotationally symmetric Zernike terms.
 pub(super) fn even_terms(square: f64) -> [f64; MAX_SYMMETRIC_DEGREE + 1] {
     let t = 2.0 * square - 1.0;
     let mut row = [1.0; MAX_SYMMETRIC_DEGREE + 1];
@@ -145,11 +147,11 @@ fn notation(found: &Iso10110) -> String {
     iso_10110_notation([power_nm, irregularity_nm, symmetric_nm], rms_nm, found.wavelength_nm)
 }
 
-/// Formats six figures and the wavelength as an ISO 10110-5 indication: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F; lambda=G`.
+/// Formats the figures of a surface as an ISO 10110-5 indication: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F; lambda=G`.
 ///
-/// All arguments are in nanometres: first the PV of power, irregularity and symmetric part (A, B, C), then the RMS of
-/// total, irregularity and varying part (D, E, F), as in [`Iso10110`]. Each figure is rounded up, the wavelength is
-/// not.
+/// The first array holds the PV of the power (A), of the irregularity (B) and of the symmetric part (C). The second
+/// array holds the RMS of the total (D), of the irregularity (E) and of the varying part (F). See [`Iso10110`].
+/// `wavelength_nm` is G. All values are in nanometres. A to F are rounded up; the wavelength is not rounded.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
     let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(format_rounded_up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")

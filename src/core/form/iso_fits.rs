@@ -75,7 +75,8 @@ impl IsoFits {
         Some(Self { quadric_terms: base, power: 1.0 / scales[3], power_pv: most - least, symmetric_terms: even })
     }
 
-    /// Computes the ISO 10110-5 figures of one form. `form` has one value in millimetres for each place of
+    /// Computes the ISO 10110-5 figures of one form, in millimetres: PV of power, irregularity and symmetric part, and
+    /// RMS of total, irregularity and varying part. `form` holds one deviation in millimetres for each place of
     /// [`IsoFits::new`], in the same order.
     pub fn evaluate(&self, form: &[f64]) -> IsoFormValues {
         let n = form.len() as f64;
@@ -109,12 +110,12 @@ impl IsoFits {
     }
 }
 
-/// Orthonormalises the columns of `rows` one after another (QR decomposition). Returns the columns of the matrix Q and
-/// the diagonal elements of the triangular matrix R.
+/// Makes the columns of the matrix `rows` orthonormal, one after another (QR decomposition). Returns the columns of Q
+/// and the diagonal elements of the triangular matrix R.
 ///
-/// A diagonal element is, apart from its sign, the length of that part of a column that is independent of the columns
-/// before it. Returns `None` if for a column this length is at most [`MIN_INDEPENDENT_SHARE`] of the length of the
-/// whole column.
+/// The absolute value of a diagonal element is the length of the part of a column that is linearly independent of the
+/// columns before it. Returns `None` if, for one column, this length is at most [`MIN_INDEPENDENT_SHARE`] times the
+/// length of the whole column.
 fn orthogonalize(rows: &DMatrix<f64>) -> Option<(Vec<Vec<f64>>, Vec<f64>)> {
     let (q, r) = rows.clone().qr().unpack();
     let columns = q.column_iter().map(|column| column.iter().copied().collect()).collect();

@@ -40,7 +40,8 @@ pub struct RemovedParts {
 }
 
 impl RemovedParts {
-    /// Returns [`RemovedParts::motion`] and the names of `forms` as one text, separated by commas.
+    /// Returns a text for a label: the motions that the registration removed ([`RemovedParts::motion`]), then the names
+    /// of the removed `forms`, separated by commas.
     pub fn describe(&self, forms: &[RemovedForm]) -> String {
         let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.name()));
         words.collect::<Vec<_>>().join(", ")
@@ -50,10 +51,11 @@ impl RemovedParts {
 /// Cut-off label of figures that are computed from the points, without a filter.
 pub const NO_CUT_OFF: &str = "none: every point used";
 
-/// Converts figures of points to labelled figures for a report, from PV to coverage; the ISO 10110-5 figures are not
-/// included.
+/// Converts the form figures of measured points into labelled figures for a report: PV, PVr, PV 99.8 %, RMS, mean,
+/// highest and lowest point, and coverage. The ISO 10110-5 figures are not included.
 ///
-/// `taken_out` states the motion that the registration removed. Units: micrometres; coverage in percent.
+/// `taken_out` states, in words, the motions that the registration removed from the deviations. Units: micrometres;
+/// coverage in percent.
 pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
     let DeviationFigures { pvr, highest, lowest, coverage, .. } = figures;
     let removed = taken_out.describe(&figures.removed);
@@ -85,9 +87,11 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
     ]
 }
 
-/// Converts the slopes of a map to labelled figures for a report: the RMS and the largest slope, in microradians.
+/// Converts the slopes of a map into two labelled figures for a report: the RMS slope and the largest slope, in
+/// microradians.
 ///
-/// `taken_out` states the motion that the registration removed and what the filter of the map removed.
+/// `taken_out` states, in words, the motions that the registration removed and the part that the filter of the map
+/// removed.
 pub fn label_slope(slope: &Slope, taken_out: &RemovedParts) -> Vec<LabelledFigure> {
     let [x, y] = slope.integration_mm;
     let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);

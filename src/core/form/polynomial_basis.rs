@@ -45,8 +45,9 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the Fringe Zernike polynomials on the smallest disc that contains the aperture and is centred on its
-    /// bounds.
+    /// Returns the Fringe Zernike polynomials on a disc that contains the aperture. The centre of the disc is the
+    /// centre of the bounding rectangle of `aperture`. The radius is the smallest one for which the disc contains the
+    /// whole aperture.
     pub fn zernike(aperture: &Aperture) -> Self {
         let (centre_mm, half_mm) = centre_and_half(aperture.bounds());
         let radius_mm = match aperture {
@@ -101,11 +102,11 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the largest number of terms, at most `most` and at most [`Self::max_terms`], that ends with a complete
-    /// order; 0 if `most` is 0.
+    /// Returns the largest number of terms that does not cut an order of the basis. The number is at most `most` and at
+    /// most [`Self::max_terms`]. Returns 0 if `most` is 0.
     ///
-    /// The complete orders end at the terms 1, 4, 9, 16 and so on for Fringe Zernike, and at the terms 1, 3, 6, 10 and
-    /// so on (all terms up to a degree) for the other polynomials.
+    /// The possible numbers are 1, 4, 9, 16 and so on for Fringe Zernike. For all other polynomials they are 1, 3, 6,
+    /// 10 and so on: all terms up to a degree.
     pub(super) fn complete_terms(&self, most: usize) -> usize {
         let counts =
             |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
@@ -152,11 +153,12 @@ impl Terms {
         }
     }
 
-    /// Writes the value of every term at the position of `sample` to `row`.
+    /// Evaluates every term of the basis at the position of `sample`, and writes the values to `row`. `row` has one
+    /// entry for each term. `index` is the index of the sample; it is used only in the error.
     ///
     /// # Errors
-    /// Returns [`FormError::FarOut`] with `index`, the index of the sample, if the sample lies more than 1.5 radii from
-    /// the centre of a Zernike disc.
+    /// Returns [`FormError::FarOut`] with `index` if the basis is Zernike and the sample is more than 1.5 radii from
+    /// the centre of the disc.
     pub(super) fn values(&self, index: usize, sample: &DeviationSample, row: &mut [f64]) -> Result<(), FormError> {
         let [x, y] = sample.place_mm;
         match self {
@@ -197,8 +199,11 @@ pub(super) struct AzimuthalOrder {
 }
 
 impl AzimuthalOrder {
-    /// Groups Zernike terms by the absolute value of their azimuthal order. `terms` has the degree and the azimuthal
-    /// order of each term. The group of the azimuthal order m has the index m in the result.
+    /// Groups Zernike terms by the absolute value of their azimuthal order. `terms` has the degree n and the azimuthal
+    /// order m of each term.
+    ///
+    /// Returns one group for each value of |m| from 0 to the largest; the group of |m| has the index |m|. A group can
+    /// be empty.
     fn grouped(terms: impl Iterator<Item = (u32, i32)>) -> Vec<Self> {
         let mut orders: Vec<Self> = Vec::new();
         for (place, (n, m)) in terms.enumerate() {
@@ -215,11 +220,13 @@ impl AzimuthalOrder {
     }
 }
 
-/// Writes the values of all Zernike terms in `orders` at one point to `row`.
+/// Evaluates all Zernike terms in `orders` at one point, and writes the values to `row`. Each term has a mean square of
+/// 1 over the disc.
 ///
-/// The coordinates `[u, v]` of the point are in radii of the disc, from its centre, and `q` is u^2 + v^2. A term is a
-/// radial factor, the Jacobi polynomial P_k^(0, m)(2 q - 1), times the real part (cosine) or the imaginary part (sine)
-/// of (u + i v)^m.
+/// `[u, v]` is the position of the point relative to the centre of the disc, in radii; `q` is u^2 + v^2. The term of
+/// degree n and azimuthal order m is, apart from a constant factor, the product of two functions. One is the Jacobi
+/// polynomial P_k^(0, |m|)(2 q - 1) with k = (n - |m|) / 2. The other is the real part (m >= 0) or the imaginary part
+/// (m < 0) of (u + i v)^|m|.
 fn zernike(orders: &[AzimuthalOrder], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
     let mut power = [1.0, 0.0];
     let mut radial = [0.0; MAX_RADIAL_TERMS];

@@ -40,12 +40,13 @@ impl RemovedForm {
     }
 }
 
-/// Fits the forms in `removed` to the deviations by least squares, all at once. Returns the samples with the fit
-/// subtracted from the deviations, or unchanged if `removed` is empty.
+/// Removes the forms in `removed`, such as a tilt, from the deviations. All forms are fitted together by least squares.
+///
+/// Returns `samples` with the fit subtracted from the deviations. Returns them unchanged if `removed` is empty.
 ///
 /// # Errors
-/// Returns an error if there are fewer points than terms of the forms, if a number is not finite, if all points lie at
-/// one place, or if the points do not determine a form.
+/// Returns an error if there are fewer samples than terms of the forms, if a number is not finite, if all samples have
+/// the same position, or if the samples do not determine a form.
 pub(super) fn remove_forms(
     removed: &[RemovedForm],
     samples: &[DeviationSample],

@@ -20,12 +20,14 @@ pub struct Slope {
     pub nodes: usize,
 }
 
-/// Computes the slopes of a map: the root mean square and the maximum over all nodes that have a slope.
+/// Computes the slopes of a map, and returns their root mean square and maximum over all nodes that have a slope. The
+/// slopes are in radians.
 ///
-/// `values_mm` and `valid` have one entry for each node of `grid`. The slope at a node, along x and along y, is the
-/// difference of the values half of `integration_mm` before and after the node, divided by `integration_mm`. For this,
-/// `integration_mm` is rounded to an even number of grid steps, at least two. A node has a slope if these four
-/// neighbours are all valid.
+/// `values_mm` and `valid` have one entry for each node of `grid`: its height, and true if this height is known. The
+/// slope along x is a central difference: the value at half of `integration_mm` after the node, minus the value at half
+/// of `integration_mm` before the node, divided by `integration_mm`. The slope along y is computed in the same way.
+/// Before this, `integration_mm` is rounded to an even number of grid steps, at least two. A node has a slope if the
+/// four nodes of its two differences are all valid.
 ///
 /// # Errors
 /// Returns an error if `integration_mm` is not a finite number above 0, or if no node has a slope.

@@ -40,14 +40,15 @@ pub struct SlopeOperator {
 }
 
 impl SlopeOperator {
-    /// Prepares the computation of slopes for many forms at the same scattered `places`.
+    /// Prepares the computation of slopes at scattered `places` (x and y in mm, model frame). The result can be used
+    /// for many forms that are given at these places.
     ///
-    /// `integration_mm` is the length over which a slope is taken. With `None`, it is the shortest length that the
-    /// spacing of the places allows. If the places are too far apart for the given length, a longer one is used
-    /// ([`SlopeOperator::integration_mm`]). Frame: model. Units: millimetres.
+    /// `integration_mm` is the length, in mm, over which a slope is averaged. With `None`, the shortest length is used
+    /// that the spacing of the places allows. If the places are too far apart for the given length, a longer one is
+    /// used. The field [`SlopeOperator::integration_mm`] has the length that was used.
     ///
-    /// Returns `None` if there are fewer than 20 places, or if too few of them have a slope at every length that fits
-    /// the part.
+    /// Returns `None` if there are fewer than 20 places. Also returns `None` if no length up to about 0.4 of the
+    /// shorter side of the part gives enough slopes: at least 6, and at a quarter or more of the examined places.
     pub fn new(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
         if places.len() < MIN_PLACES {
             return None;
@@ -75,8 +76,9 @@ impl SlopeOperator {
         None
     }
 
-    /// Builds the weights for slopes from planes over the places within `radius_mm`, at no more than [`MAX_NODES`]
-    /// nodes. `order` has the indices of all places, sorted by x.
+    /// Computes the slope weights at at most [`MAX_NODES`] of the `places`, evenly chosen. The slope at such a node is
+    /// that of the least-squares plane through the values at all places within `radius_mm`. `order` has the indices of
+    /// all places, sorted by x. A place without enough neighbours is skipped.
     fn with_radius(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
         let most = places.len().min(MAX_NODES);
         let (mut begins, mut weights) = (vec![0], Vec::new());
@@ -89,9 +91,10 @@ impl SlopeOperator {
         Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, node_starts: begins, weights }
     }
 
-    /// Computes the slope of a form at each node. Returns the root mean square and the maximum of these slopes (the
-    /// lengths of the gradients), in radians. `form` has one value in millimetres for each place of
-    /// [`SlopeOperator::new`], in the same order.
+    /// Computes the slope (the length of the gradient) of a form at each node, that is, at each place that has a slope.
+    /// Returns the root mean square and the maximum of these slopes, in radians.
+    ///
+    /// `form` has one value in mm for each of the places given to [`SlopeOperator::new`], in the same order.
     pub fn evaluate(&self, form: &[f64]) -> [f64; 2] {
         let (mut squares, mut most) = (0.0, 0.0_f64);
         for ends in self.node_starts.windows(2) {
@@ -108,12 +111,12 @@ impl SlopeOperator {
     }
 }
 
-/// Computes the weights that give the slope at the place with the index `of`: the slope of the least-squares plane
-/// through the values at the places within `radius_mm` of it.
+/// Computes the weights that give the slope at one place, `places[of]`. The slope is that of the least-squares plane
+/// through the values at the places within `radius_mm` of `places[of]`.
 ///
-/// Returns, for each of at most 24 places used, the index of the place and the weights of its value for the slopes
-/// along x and y. `order` has the indices of all places, sorted by x. Returns `None` if fewer than four places are
-/// within the radius, or if they do not surround the place.
+/// Returns one entry for each place that the plane uses, at most 24: the index of the place, and the weights of its
+/// value for the slopes along x and along y, in 1 / mm. `order` has the indices of all places, sorted by x. Returns
+/// `None` if fewer than four places are within the radius, or if these places lie mainly on one side or along a line.
 fn plane_slope_weights(
     places: &[[f64; 2]],
     order: &[usize],

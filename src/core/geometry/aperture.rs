@@ -118,9 +118,13 @@ impl Aperture {
     /// Checks that the numbers describe a closed outline with an area above 0.
     ///
     /// # Errors
-    /// Returns an error if a coordinate is not finite or beyond a kilometre in magnitude, if a size is not above 0 or
-    /// above a kilometre, if the hole of an annulus is as large as its rim, or if a polygon is not a simple closed line
-    /// of 3 to 4000 corners.
+    /// Returns an error in each of these cases:
+    ///
+    /// - A coordinate is not finite, or its magnitude is above one kilometre.
+    /// - A size is not above 0, or is above one kilometre.
+    /// - The inner radius of an annulus is negative, or is not less than the outer radius.
+    /// - A polygon has fewer than 3 or more than 4000 corners.
+    /// - Two neighbouring corners of a polygon are equal, or its edges cross or touch.
     pub fn validate(&self) -> Result<(), ApertureError> {
         match self {
             Self::Rectangle { centre_mm, width_mm, height_mm } => {
@@ -221,9 +225,10 @@ impl Aperture {
         }
     }
 
-    /// Returns places along the whole boundary, at least `count` in total, including the corners.
+    /// Returns positions (x, y) in mm along the whole boundary of the aperture: at least `count` in total. The corners
+    /// of a rectangle or polygon are included. For an annulus, each of its two circles gets `count` positions.
     ///
-    /// Units: millimetres. On a round boundary a place can lie outside by rounding.
+    /// On a round boundary, a position can be slightly outside the aperture because of rounding.
     pub fn outline_mm(&self, count: usize) -> Vec<[f64; 2]> {
         let around = |[x, y]: [f64; 2], a: f64, b: f64| {
             (0..count).map(move |i| {
@@ -257,11 +262,12 @@ impl Aperture {
         }
     }
 
-    /// Returns places in mm that represent the aperture, always the same ones: up to 800 places inside, then at least
-    /// 240 along the outline.
+    /// Returns positions (x, y) in mm that represent the aperture: up to 800 positions inside, then at least 240 along
+    /// the outline. The result is the same at every call.
     ///
-    /// The places inside are those of 800 places spread over the bounds that lie in the aperture. They follow the
-    /// additive recurrence of the plastic number, a sequence that leaves no gaps and forms no lattice.
+    /// For the positions inside, 800 positions are spread evenly over the bounding rectangle. Those that lie outside
+    /// the aperture are dropped. The positions follow the additive recurrence of the plastic number (a low-discrepancy
+    /// sequence).
     pub(crate) fn places_mm(&self) -> Vec<[f64; 2]> {
         let [least, most] = self.bounds();
         let plastic = 1.324_717_957_244_746_f64;
@@ -276,8 +282,11 @@ impl Aperture {
     }
 }
 
-/// Returns [`ApertureError::Coordinate`] with `key`, the key in TOML, if a coordinate of `point` is NaN or beyond
-/// [`MAX_COORDINATE_MM`] in magnitude.
+/// Checks that both coordinates of `point`, in mm, are numbers of at most [`MAX_COORDINATE_MM`] in magnitude. `key` is
+/// the TOML key of the point, for the error.
+///
+/// # Errors
+/// Returns [`ApertureError::Coordinate`] with `key` if a coordinate is NaN or too large.
 fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
     match point.iter().find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_MM) {
         Some(&value_mm) => Err(ApertureError::Coordinate { key, value_mm }),
@@ -285,8 +294,11 @@ fn check_coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), Aperture
     }
 }
 
-/// Returns [`ApertureError::Size`] with `key`, the key in TOML, if `value_mm` is not above 0 or is above
-/// [`MAX_COORDINATE_MM`].
+/// Checks that the size `value_mm` is above 0 and at most [`MAX_COORDINATE_MM`]. `key` is the TOML key of the size, for
+/// the error.
+///
+/// # Errors
+/// Returns [`ApertureError::Size`] with `key` if the size is outside these limits or NaN.
 fn check_size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
     if value_mm > 0.0 && value_mm <= MAX_COORDINATE_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
 }
@@ -331,8 +343,8 @@ fn edges(corners: &[[f64; 2]]) -> impl Iterator<Item = [[f64; 2]; 2]> + '_ {
     corners.iter().zip(corners.iter().cycle().skip(1)).map(|(p, q)| [*p, *q])
 }
 
-/// Returns at least `count` places along the edges of a closed polygon: each corner, and the same number of places on
-/// every edge between its corners.
+/// Returns at least `count` positions along the edges of a closed polygon. These are the corners and, on each edge,
+/// equally spaced positions between its two corners. Each edge has the same number of positions.
 fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     let steps = count.div_ceil(corners.len()).max(1);
     let places = edges(corners).flat_map(|[p, q]| {
@@ -344,8 +356,9 @@ fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     places.collect()
 }
 
-/// Returns true if the ray from the place (`x`, `y`) towards +x crosses the edge from `p` to `q`. Of the two ends of an
-/// edge, only the lower one belongs to it, so that a corner is not counted twice.
+/// Returns true if the ray from the point (`x`, `y`) towards +x crosses the edge from `p` to `q`. The end of the edge
+/// with the lower y counts as part of the edge, the other end does not. Therefore a ray through a corner is not counted
+/// twice.
 fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
     (p[1] > y) != (q[1] > y) && x < p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
 }
@@ -356,7 +369,8 @@ fn orient2d(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
     (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
 }
 
-/// Returns true if the second edge starts at the end `q` of the first and runs back over it.
+/// Returns true if the edge from `q` to `r` runs back along the edge from `p` to `q`: both lie on one line and have
+/// opposite directions.
 fn folds_back([p, q]: [[f64; 2]; 2], [_, r]: [[f64; 2]; 2]) -> bool {
     let forward = (q[0] - p[0]) * (r[0] - q[0]) + (q[1] - p[1]) * (r[1] - q[1]);
     orient2d(p, q, r) == 0.0 && forward < 0.0
@@ -381,11 +395,12 @@ fn segment_distance([p, q]: [[f64; 2]; 2], x: f64, y: f64) -> f64 {
     (x - p[0] - t * ex).hypot(y - p[1] - t * ey)
 }
 
-/// Returns the distance of a place outside an ellipse about the origin with the semi-axes a and b; 0 inside.
+/// Returns the distance of the point (`x`, `y`) to an ellipse with its centre at the origin and the semi-axes `[a, b]`
+/// along x and y. Returns 0 if the point lies inside the ellipse. All lengths have the same unit.
 ///
-/// The nearest point of the ellipse is (a^2 x / (t + a^2), b^2 y / (t + b^2)), where t >= 0 is chosen so that this
-/// point lies on the ellipse. The condition for t is convex and decreases in t. Therefore Newton's steps from 0
-/// approach the root from below and never pass it.
+/// The nearest point of the ellipse is (a^2 x / (t + a^2), b^2 y / (t + b^2)). The number t >= 0 is the root of the
+/// condition that this point lies on the ellipse. The condition is a convex, decreasing function of t. Therefore
+/// Newton's method, started at t = 0, approaches the root from below and never passes the root.
 fn ellipse_distance([a, b]: [f64; 2], x: f64, y: f64) -> f64 {
     if (x / a).hypot(y / b) <= 1.0 {
         return 0.0;

@@ -5,12 +5,12 @@ use super::Point;
 /// Limit of the distance from the middle, in units of the median distance.
 const MAX_MEDIAN_RATIO: f64 = 50.0;
 
-/// Finds a single point that lies far from all others. The middle of the points has the median x, y and z of all
-/// points.
+/// Finds a single point that lies far from all others. The distances are measured from the middle: the point with the
+/// median x, the median y and the median z of all points.
 ///
-/// Returns the index of the point farthest from the middle, and its distance from the middle in millimetres, if this
-/// distance is more than [`MAX_MEDIAN_RATIO`] times the median distance. Returns `None` if it is not, if there are
-/// fewer than three points, or if more than half of the points coincide.
+/// Returns the index of the point that is farthest from the middle, and its distance from the middle in mm. Returns
+/// `None` if this distance is at most [`MAX_MEDIAN_RATIO`] times the median distance, if there are fewer than three
+/// points, or if more than half of the points coincide.
 pub(crate) fn find_far_off(points: &[Point]) -> Option<(usize, f64)> {
     if points.len() < 3 {
         return None;

@@ -37,12 +37,16 @@ pub enum GridError {
 }
 
 impl Grid {
-    /// Builds a grid over the smallest rectangle that contains `places_mm`, with nodes on its border. The spacing along
-    /// x and along y is at most `spacing_mm`: it is reduced to divide the side of the rectangle.
+    /// Builds a grid that covers the smallest rectangle around `places_mm` (x and y of each place, in mm). The
+    /// outermost nodes lie on the border of the rectangle.
+    ///
+    /// The spacing along x is the largest one that is at most `spacing_mm` and divides the width of the rectangle into
+    /// equal steps. The spacing along y follows in the same way from the depth. If the width or the depth is 0, the
+    /// grid has two nodes in this direction, at the distance `spacing_mm`.
     ///
     /// # Errors
     /// Returns an error if `spacing_mm` is not a finite number above 0, if the grid would have more than four million
-    /// nodes, or if there is no place.
+    /// nodes, or if `places_mm` is empty.
     pub fn over(places_mm: impl Iterator<Item = [f64; 2]>, spacing_mm: f64) -> Result<Self, GridError> {
         let mut bounds: Option<[[f64; 2]; 2]> = None;
         for [x, y] in places_mm {
@@ -113,8 +117,11 @@ impl Grid {
         Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
     }
 
-    /// Interpolates `values`, one for each node of this grid, to the nodes of the grid `onto`. Returns one value for
-    /// each node of `onto`; these are `values` themselves if the grids are equal.
+    /// Interpolates a map bilinearly from this grid to the grid `onto`. `values` has one value for each node of this
+    /// grid. Returns one value for each node of `onto`.
+    ///
+    /// A node of `onto` outside this grid gets the value at the nearest position on the border of this grid. If both
+    /// grids are equal, returns a copy of `values`.
     pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
         if self == onto {
             return values.to_vec();
@@ -122,10 +129,12 @@ impl Grid {
         (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
     }
 
-    /// Finds the cell of the grid that contains `place_mm`, or the cell nearest to a place outside the grid.
+    /// Finds the cell of the grid that contains `place_mm` (x and y in mm). For a place outside the grid, finds the
+    /// nearest cell.
     ///
-    /// Returns two pairs, for x and for y: the index of the lower node of the cell along this axis, and the position of
-    /// the place between this node (0) and the next (1).
+    /// Returns one pair for x and one for y. The first number is the index of the column (x) or the row (y) at the
+    /// lower side of the cell. The second number is the relative position in the cell, from 0 (lower side) to 1 (upper
+    /// side).
     pub fn cell(&self, place_mm: [f64; 2]) -> [(usize, f64); 2] {
         [0, 1].map(|k| {
             let nodes = self.counts()[k];

@@ -9,15 +9,16 @@ use super::Point;
 pub(crate) struct PointTree(KDTree<f64, TreePoint>);
 
 impl PointTree {
-    /// Builds the search tree of `points`. A point with a coordinate that is not finite is kept, at an arbitrary
-    /// position.
+    /// Builds a k-d tree of `points`, for the search of nearest points. A point with a coordinate that is not finite is
+    /// not removed: NaN is replaced by 0, and an infinite coordinate by a very large one.
     pub(crate) fn new(points: impl Iterator<Item = Point>) -> Self {
         // With 16 points in a leaf the tree is built faster than with 8, and a query takes the same time.
         Self(KDTree::new_with_bucket_size(&points.map(TreePoint::from).collect::<Vec<_>>(), 16))
     }
 
-    /// Returns the `count` points nearest to `p`, the nearest first: the index of each in [`PointTree::new`], and its
-    /// squared distance from `p`. Returns all points if there are fewer than `count`.
+    /// Returns the `count` points of the tree that are nearest to `p`, in ascending order of distance. Each entry has
+    /// the index of the point in the sequence given to [`PointTree::new`], and the squared distance from `p` in mm^2.
+    /// Returns all points if the tree has fewer than `count`.
     pub(crate) fn nearest(&self, p: &Point, count: u32) -> impl Iterator<Item = (usize, f64)> {
         let exact = Parameters { epsilon: 0.0, max_radius: f64::INFINITY, allow_self_match: true, sort_results: true };
         // For some tens of neighbours a list is faster than the crate's default, a heap.

@@ -58,7 +58,7 @@ impl Pose {
         Self { rotation: Matrix3::identity(), translation_mm: Vector::zeros() }
     }
 
-    /// Returns the pose that the twist generates: the exact exponential map of SE(3), eq. (10) of the paper.
+    /// Returns the pose that belongs to `twist`: the exact exponential map of SE(3) (the group of rigid motions).
     ///
     /// Units: the first three coordinates of the twist in millimetres, the last three in radians.
     pub fn exp(twist: &Twist) -> Self {
@@ -73,7 +73,8 @@ impl Pose {
         }
     }
 
-    /// Returns the twist whose exponential is this pose; the angle lies in the interval from 0 to pi.
+    /// Returns the twist that [`Pose::exp`] maps to this pose: the logarithm in SE(3). The first three coordinates are
+    /// in mm. The last three are the rotation vector in radians; its length, the angle of rotation, is from 0 to pi.
     pub fn log(&self) -> Twist {
         let omega = rotation_logarithm(&self.rotation);
         let [a, b, _] = exponential_coefficients(omega.norm());
@@ -107,10 +108,11 @@ impl Pose {
         self.rotation * v
     }
 
-    /// Returns the same pose with its rotation orthonormalised, against the drift of repeated products.
+    /// Returns the same pose with an orthonormal rotation matrix. Use it after many products of poses, because their
+    /// rounding errors add up.
     ///
-    /// The method is one Newton step towards the nearest rotation: exact to rounding for a matrix that is off by less
-    /// than 1e-8.
+    /// The method is one Newton step towards the nearest rotation. The result is exact to rounding if the matrix
+    /// differs from a rotation by less than 1e-8.
     pub fn orthonormalised(&self) -> Self {
         let gram = self.rotation.transpose() * self.rotation;
         Self { rotation: self.rotation * (Matrix3::identity() * 1.5 - gram * 0.5), translation_mm: self.translation_mm }
@@ -121,7 +123,8 @@ impl Pose {
         rotation_logarithm(&self.rotation).norm()
     }
 
-    /// Returns the homogeneous matrix, four rows of four entries.
+    /// Returns the pose as a homogeneous matrix of four rows. The upper left 3 x 3 block is the rotation, the last
+    /// column has the translation in mm, and the last row is 0 0 0 1.
     pub fn to_rows(&self) -> [[f64; 4]; 4] {
         let (r, t) = (&self.rotation, &self.translation_mm);
         [
@@ -132,11 +135,13 @@ impl Pose {
         ]
     }
 
-    /// Reads a homogeneous matrix, four rows of four entries, and makes its rotation orthonormal to rounding.
+    /// Builds a pose from a homogeneous matrix of four rows, with the translation in mm in the last column. Small
+    /// errors of the rotation are removed: the result has an orthonormal rotation.
     ///
     /// # Errors
-    /// Returns an error if an entry is not finite, if the last row is not 0 0 0 1, or if the upper left block is not a
-    /// rotation within 1e-4.
+    /// Returns an error if an entry is not finite, if the last row is not 0 0 0 1, or if the upper left 3 x 3 block R
+    /// is not a rotation. R counts as a rotation if every entry of R R^T - 1 is at most 1e-4 in magnitude and the
+    /// determinant is positive.
     pub fn from_rows(rows: [[f64; 4]; 4]) -> Result<Self, PoseError> {
         for (row, entries) in rows.iter().enumerate() {
             if let Some(column) = entries.iter().position(|v| !v.is_finite()) {
@@ -169,8 +174,8 @@ impl std::ops::Mul for Pose {
     }
 }
 
-/// Returns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 for t = `theta` in radians, at least 0; for small t from their
-/// series.
+/// Returns three coefficients of the exponential map for the angle t = `theta` (in radians, at least 0): sin(t)/t, (1 -
+/// cos t)/t^2 and (t - sin t)/t^3. If t is small, they are computed from their power series.
 fn exponential_coefficients(theta: f64) -> [f64; 3] {
     let t2 = theta * theta;
     if theta < SERIES_BELOW_RAD {
@@ -185,7 +190,7 @@ fn exponential_coefficients(theta: f64) -> [f64; 3] {
 }
 
 /// Returns the rotation vector of a rotation matrix: the unit vector of the axis times the angle in radians, from 0 to
-/// pi. The computation over the quaternion is accurate up to pi.
+/// pi. The computation uses the quaternion of the rotation. Therefore the result is accurate even for angles near pi.
 fn rotation_logarithm(rotation: &Matrix3<f64>) -> Vector {
     let q = UnitQuaternion::from_rotation_matrix(&nalgebra::Rotation3::from_matrix_unchecked(*rotation));
     let (w, v) = (q.w.abs(), q.imag() * if q.w < 0.0 { -1.0 } else { 1.0 });

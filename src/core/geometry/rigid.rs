@@ -96,7 +96,11 @@ pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
     Ok(RigidFit { pose, residuals_mm, rms_mm })
 }
 
-/// Checks the two lists of points of [`fit_rigid`], and returns its errors except [`RigidError::Mirrored`].
+/// Checks the input of [`fit_rigid`].
+///
+/// # Errors
+/// Returns an error if the lists have different lengths or fewer than three points, if a coordinate is not finite, or
+/// if the points of a list lie on one line.
 fn check(from: &[Point], to: &[Point]) -> Result<(), RigidError> {
     if from.len() != to.len() {
         return Err(RigidError::Counts { from: from.len(), to: to.len() });

@@ -55,15 +55,15 @@ pub enum PatternError {
     NoneOnPart { requested: usize, margin_mm: f64 },
 }
 
-/// Returns the targets of a measuring pattern on the part, in the order of measurement: points of the nominal surface
-/// with their normals towards `side`.
+/// Returns the targets of a measuring pattern on the part, in the order of measurement. A target is a point of the
+/// nominal surface with its unit normal towards `side`, the side of the probe.
 ///
-/// `layout` gives the places over x and y. A place is omitted if it is not on the part, or less than `margin_mm` from
-/// the edge. Frame: model. Units: millimetres.
+/// `layout` is a grid or a spiral in the xy plane, or a list of points. A target is omitted if it is not on the part,
+/// or if it is less than `margin_mm` from the edge. Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if the spacing of the layout is not a finite number above 0, if the pattern has more than ten
-/// million places, or if every place is omitted.
+/// Returns an error if the spacing of the layout is not a finite number above 0, if a grid or a spiral has more than
+/// ten million points, or if every target is omitted.
 pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -> Result<Vec<Target>, PatternError> {
     let surface = OffsetSurface::new(nominal, 0.0, side).expect("a radius of 0 is good");
     let bounds = bounds(nominal);
@@ -82,8 +82,10 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     Ok(found)
 }
 
-/// Returns `count` targets spread evenly over the upper part of a reference sphere, from its top (+z) down to 80
-/// degrees from it, for a probe that comes from above. The targets are in the frame of `centre`, in millimetres.
+/// Returns `count` targets, spread evenly over the upper part of a reference sphere, for a probe that approaches from
+/// above. The angle between the normal of a target and +z is at most 80 degrees.
+///
+/// `centre` is the centre of the sphere, in mm. The targets are in the same frame as `centre`.
 pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target> {
     // Equal areas from the pole down to 80 degrees, each turned by the golden angle.
     let lowest = 80f64.to_radians().cos();
@@ -118,11 +120,13 @@ fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
     }
 }
 
-/// Returns the places of a layout within the given bounds, reduced by `margin_mm` on every side, in the order of
-/// measurement.
+/// Returns the positions of a layout, in the order of measurement. A grid or a spiral covers the rectangle with the
+/// corners `[low, high]`, made smaller by `margin_mm` on every side. The points of a list are returned unchanged.
+/// Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if the spacing is not a finite number above 0, or if there are more than [`MAX_TARGETS`] places.
+/// Returns an error if the spacing of the layout is not a finite number above 0, or if a grid or a spiral has more than
+/// [`MAX_TARGETS`] positions.
 fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result<Vec<TargetRequest>, PatternError> {
     let [width, depth] = [0, 1].map(|k| (high[k] - low[k] - 2.0 * margin_mm).max(0.0));
     let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
@@ -165,11 +169,12 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
     }
 }
 
-/// Returns the places of an Archimedean spiral about `middle` that lie in the rectangle of size `[width, depth]` about
-/// it. `spacing` is the distance between turns and between successive places, in mm.
+/// Returns positions along an Archimedean spiral that starts at `middle`. Positions outside the rectangle of size
+/// `[width, depth]` with the centre `middle` are left out. `spacing` is the distance between turns, and also between
+/// successive positions. Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if there are more than [`MAX_TARGETS`] places.
+/// Returns an error if there are more than [`MAX_TARGETS`] positions.
 fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Vec<TargetRequest>, PatternError> {
     let reach = 0.5 * width.hypot(depth);
     let count = PI * (reach / spacing).powi(2);
@@ -209,9 +214,9 @@ impl<'a> SurfaceWalk<'a> {
         Self { surface, facet: FacetIndex::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
-    /// Finds the target at the given x and y: the point of the surface above or below this place. Newton's method
-    /// searches its height; each step intersects the vertical line with the tangent plane at the projection of the
-    /// current point.
+    /// Finds the point of the surface with the given x and y, in mm, and returns it as a target with its normal. The
+    /// height z is found by Newton's method. Each step intersects the vertical line through (x, y) with the tangent
+    /// plane at the projection of the current point onto the surface.
     ///
     /// Returns `None` if the surface is nearly vertical, if the iteration does not converge, or if the point lies
     /// beyond the edge of the surface.
@@ -245,9 +250,11 @@ impl<'a> SurfaceWalk<'a> {
         (foot.beyond_edge_mm <= EDGE_TOLERANCE_MM && near).then_some(target)
     }
 
-    /// Returns true if the target lies within the outline of the part and is not nearer than `margin_mm` to the edge.
-    /// For the distance, eight points around the target are checked, `margin_mm` away in the tangent plane: each must
-    /// lie within the outline and project onto the surface.
+    /// Returns true if the target lies within the outline of the part and at least `margin_mm` from the edge.
+    ///
+    /// The distance from the edge is checked with eight points. They lie in the tangent plane, on a circle of radius
+    /// `margin_mm` about the target. Each must lie within the outline, and its projection must not lie beyond the edge
+    /// of the surface.
     fn is_inside(&self, target: &Target, margin_mm: f64) -> bool {
         let outline = self.surface.nominal().outline();
         let (u, _) = frame(&target.normal);
@@ -264,9 +271,9 @@ impl<'a> SurfaceWalk<'a> {
     }
 }
 
-/// Returns two unit vectors that are perpendicular to the unit vector `normal` and to each other. The first has the
-/// direction of the x axis projected onto the plane perpendicular to `normal`; if `normal` is close to x, that of the y
-/// axis.
+/// Returns two unit vectors that are perpendicular to each other and to the unit vector `normal`. The first is the x
+/// axis, projected onto the plane perpendicular to `normal` and normalised. If `normal` is close to the x axis, the y
+/// axis is used instead.
 fn frame(normal: &Vector) -> (Vector, Vector) {
     let x = if normal.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
     let u = (x - normal * normal.dot(&x)).normalize();

@@ -73,11 +73,13 @@ pub fn fit_sphere(points: &[Point]) -> Result<SphereFit, SphereFitError> {
     if finite && radius > 0.0 { Ok(fit) } else { Err(SphereFitError::Degenerate) }
 }
 
-/// Fits a sphere to the points by a linear least-squares problem (algebraic fit). Returns the centre and the radius.
+/// Fits a sphere by linear least squares (algebraic fit). `middle` is the centroid of the points. Returns the centre
+/// and the radius of the sphere, in mm.
 ///
-/// For a point p on a sphere with the centre c and the radius r, |p|^2 = 2 p.c + (r^2 - |c|^2) is linear in c and in
-/// the term in brackets. Coordinates are taken from `middle`, the centroid of the points. Returns `None` if the points
-/// lie on a plane.
+/// For a point p on a sphere with the centre c and the radius r, |p|^2 = 2 p.c + (r^2 - |c|^2). This equation is linear
+/// in c and in the term in brackets. To reduce rounding errors, it is solved with `middle` as the origin.
+///
+/// Returns `None` if the points lie on a plane, or if the result is not finite.
 fn algebraic(points: &[Point], middle: &nalgebra::Vector3<f64>) -> Option<(nalgebra::Vector3<f64>, f64)> {
     let (mut normal, mut right) = (Matrix4::zeros(), Vector4::zeros());
     let size = points.iter().map(|p| (p.coords - middle).norm()).fold(0.0, f64::max);
@@ -97,8 +99,11 @@ fn algebraic(points: &[Point], middle: &nalgebra::Vector3<f64>) -> Option<(nalge
     radius.is_finite().then(|| (middle + centre * size, radius))
 }
 
-/// Returns the normal equations of one Gauss-Newton step, with the unknowns centre and radius: the matrix J'J and the
-/// right side J'r, with the Jacobian J and the residuals r of the distances at the given `centre` and `radius`.
+/// Returns the normal equations of one Gauss-Newton step of a sphere fit. The four unknowns are the changes of the
+/// centre (x, y, z) and of the radius.
+///
+/// The results are the matrix J'J and the right side J'r. The residuals r are the distances of the points from
+/// `centre`, minus `radius`. J has one row for each point: the unit vector from `centre` to the point, then 1.
 fn normal_equations(points: &[Point], centre: &nalgebra::Vector3<f64>, radius: f64) -> (Matrix4<f64>, Vector4<f64>) {
     points.iter().fold((Matrix4::zeros(), Vector4::zeros()), |(normal, gradient), p| {
         let from = p.coords - centre;

@@ -25,18 +25,21 @@ impl ThermalExpansion {
         1.0 + (self.part_per_k - self.scales_per_k) * (temperature_c - REFERENCE_TEMPERATURE_C)
     }
 
-    /// Returns the standard uncertainty of [`ThermalExpansion::length_factor`].
+    /// Returns the standard uncertainty of [`ThermalExpansion::length_factor`] at `temperature_c` (degrees Celsius).
+    /// The result has no unit. It contains the uncertainties of the temperature and of the expansion coefficient of the
+    /// part.
     pub fn length_factor_sigma(&self, temperature_c: f64) -> f64 {
         let by_temperature = (self.part_per_k - self.scales_per_k) * self.temperature_sigma_k;
         by_temperature.hypot(self.part_sigma_per_k * (temperature_c - REFERENCE_TEMPERATURE_C))
     }
 
-    /// Converts points of a part, measured at `temperature_c` (degrees Celsius), to their positions at 20 degrees
-    /// Celsius, by scaling about their centroid.
+    /// Converts points that were measured at `temperature_c` (degrees Celsius) to their positions at 20 degrees
+    /// Celsius. The points are scaled about their centroid by 1 / [`ThermalExpansion::length_factor`]. Frame: any.
+    /// Units: millimetres.
     ///
-    /// Frame: any. If the points are centres of the probe's ball, their distance from the surface is scaled too: it
-    /// becomes the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the ball itself
-    /// is already in the radius that was found on the reference sphere.
+    /// If the points are centres of the probe's ball, the scaling also changes their distance from the surface. This
+    /// distance becomes the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the
+    /// ball itself needs no correction, because the calibration on the reference sphere already contains it.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;
         let middle = Point::from(points.iter().map(|p| p.coords).sum::<crate::geometry::Vector>() / n);

@@ -44,12 +44,13 @@ pub(super) struct Basis {
 }
 
 impl Basis {
-    /// Builds the basis functions for a field over the given places: polynomials of the degrees 2 to `degree`, and
-    /// `count` cosines.
+    /// Builds the basis functions of a random field at the given places (x and y in mm): polynomials of total degree 2
+    /// to `degree`, then `count` cosines. The polynomials of degree 0 and 1 (constant and tilt) are left out, because a
+    /// motion of the part has the same effect.
     ///
-    /// `lay` is the anisotropy of the field. Of all cosines over the rectangle around the places, those with the
-    /// largest variance in such a field are used, in descending order of the variance. A constant and a tilt (degrees 0
-    /// and 1) are left out of the polynomials, because they are motions of the part.
+    /// `lay` is the anisotropy of the field. The cosines are defined on a rectangle that is wider than the area of the
+    /// places. Those with the largest variance in a field of this anisotropy are used, in descending order of their
+    /// variance.
     pub(super) fn over(places: &[[f64; 2]], lay: Anisotropy, count: usize, degree: usize) -> Self {
         let [low, high] = bounds(places.iter().map(|&place| lay.rotated(place)));
         let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
@@ -101,12 +102,12 @@ impl Basis {
         std::f64::consts::PI / self.squared_wavenumbers.last().copied().unwrap_or(0.0).sqrt()
     }
 
-    /// Returns the prior standard deviation of the coefficient of each basis function, and the share of the variance of
-    /// the field that the basis cannot represent.
+    /// Computes the prior of a field of variance 1 with the given smoothness and range. Returns the prior standard
+    /// deviation of the coefficient of each basis function, in mm. Also returns the share (0 to 1) of the variance that
+    /// the basis cannot represent: the share of all waves shorter than the shortest cosine.
     ///
-    /// Both are for a field of variance 1 with the given smoothness and range. The share is that of waves shorter than
-    /// the shortest cosine. The standard deviations of the polynomials are 0 unless the field is differentiable and its
-    /// range is at least the longer side of the part.
+    /// The standard deviations of the polynomials are 0 if the field is not differentiable, or if `range_mm` is less
+    /// than the longer side of the part.
     pub(super) fn standard_deviations(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
         let strength = |number2: &f64| spectral_density_mm2(smoothness, range_mm, *number2).sqrt();
         let last2 = self.squared_wavenumbers.last().copied().unwrap_or(0.0);
@@ -121,7 +122,8 @@ impl Basis {
         )
     }
 
-    /// Evaluates every basis function at the places: one row for each place, one column for each polynomial and cosine.
+    /// Evaluates every basis function at `places` (x and y in mm). Returns a matrix with one row for each place and one
+    /// column for each basis function: the polynomials first, then the cosines.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
         let at_mm =
             [0, 1].map(|axis| places.iter().map(|&place| self.anisotropy.rotated(place)[axis]).collect::<Vec<f64>>());
@@ -137,8 +139,9 @@ impl Basis {
         waves
     }
 
-    /// Evaluates the cosines of one variable along `axis` (0 for u, 1 for v) at the coordinates `at_mm`. Returns one
-    /// vector for each order from 0, with one value for each coordinate.
+    /// Evaluates the one-dimensional cosines along one axis at the coordinates `at_mm`. `axis` is 0 for u (along the
+    /// anisotropy of the field) or 1 for v (across it). Returns one vector for each order, from order 0, with one value
+    /// for each coordinate.
     fn cosines(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let length_mm = self.lengths_mm[axis];
         let scale = |order: usize| if order == 0 { 1.0 } else { 2.0_f64.sqrt() } / length_mm.sqrt();
@@ -148,10 +151,12 @@ impl Basis {
         (0..self.counts[axis]).map(of).collect()
     }
 
-    /// Evaluates the Legendre polynomials along `axis` (0 for u, 1 for v) at the coordinates `at_mm`. Returns one
-    /// vector for each degree from 0, with one value for each coordinate.
+    /// Evaluates the Legendre polynomials of one variable at the coordinates `at_mm`. `axis` is 0 for u (along the
+    /// anisotropy of the field) or 1 for v (across it). Returns one vector for each degree, from degree 0, with one
+    /// value for each coordinate.
     ///
-    /// The polynomials are scaled to the mean square of the cosines along this axis: 1 / (length of the rectangle).
+    /// The polynomials are scaled so that their mean square over the part is 1 / L, as for the cosines. L is the length
+    /// along this axis of the rectangle on which the cosines are defined.
     fn polynomials(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let root = self.lengths_mm[axis].sqrt().recip();
         let places: Vec<f64> = at_mm.iter().map(|at| (at - self.middle_mm[axis]) / self.halves_mm[axis]).collect();
@@ -168,10 +173,12 @@ impl Basis {
         all
     }
 
-    /// Evaluates the polynomials and cosines of one variable along both axes of a grid, as input of [`Self::on_grid`].
+    /// Evaluates the one-dimensional polynomials and cosines at the node coordinates of `grid`, as input of
+    /// [`Self::on_grid`].
     ///
-    /// Returns one matrix for u and one for v. It has one row for each node along the axis; the columns are the
-    /// polynomials from degree 0, then the cosines from order 0.
+    /// Returns two matrices: one for the axis u (along the anisotropy of the field), one for the axis v (across it).
+    /// Each has one row for each node along its axis. The columns are the polynomials from degree 0, then the cosines
+    /// from order 0.
     pub(super) fn grid(&self, grid: &BasisGrid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
@@ -181,9 +188,9 @@ impl Basis {
         })
     }
 
-    /// Evaluates a field at all nodes of a grid. `coefficients` has the coefficient of each basis function; `along` and
-    /// `across` are the matrices of [`Self::grid`]. Returns one row for each node along u, one column for each node
-    /// along v.
+    /// Evaluates a field at all nodes of a grid. `coefficients` has the coefficient of each basis function. `along` and
+    /// `across` are the two matrices that [`Self::grid`] returns. Returns a matrix with one row for each node along u
+    /// and one column for each node along v.
     pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
         let mut square = Mat::<f64>::zeros(along.ncols(), across.ncols());
         let (polynomials, cosines) = coefficients.split_at(self.degrees.len().min(coefficients.len()));
@@ -203,23 +210,26 @@ pub(super) struct BasisGrid {
 }
 
 impl BasisGrid {
-    /// Converts the number of a node to its indices along u and v. Nodes are numbered along u first.
+    /// Converts the number of a node, from 0, to its two indices: along u (along the anisotropy of the field) and along
+    /// v (across it). The numbers increase along u first.
     pub(super) fn indices(&self, node: usize) -> [usize; 2] {
         [node % self.counts[0], node / self.counts[0]]
     }
 
-    /// Returns the coordinates u and v of the node with the number `node`, in mm.
+    /// Returns the coordinates of the node with the number `node`, in mm: u along the anisotropy of the field, v across
+    /// it.
     pub(super) fn place(&self, node: usize) -> [f64; 2] {
         let indices = self.indices(node);
         [0, 1].map(|axis: usize| self.corner_mm[axis] + self.spacing_mm * indices[axis] as f64)
     }
 }
 
-/// Returns the spectral density of a field of variance 1, in mm^2, at the squared wavenumber `number2`, in 1 / mm^2.
+/// Returns the spectral density of an isotropic field of variance 1, in mm^2. `number2` is the squared angular
+/// wavenumber w^2, in 1 / mm^2.
 ///
-/// For a squared-exponential field, the covariance is exp(-2 (r / range)^2). Otherwise, it is the Matern covariance
-/// with the smoothness nu, and with w^2 for `number2` and kappa^2 = 8 nu / range^2, the density is 4 pi nu kappa^(2 nu)
-/// / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
+/// A squared-exponential field has the covariance exp(-2 (r / range)^2) at the distance r. Every other field has a
+/// Matern covariance with the smoothness nu. With kappa^2 = 8 nu / range^2, its density is 4 pi nu kappa^(2 nu) /
+/// (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
 fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return 0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp();
@@ -228,8 +238,9 @@ fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> 
     2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
 }
 
-/// Returns the share of the variance of a field that lies in waves with a squared wavenumber above `number2`, in 1 /
-/// mm^2: the integral of the spectral density outside a circle, from 0 to 1.
+/// Returns the share (0 to 1) of the variance of a field that lies in short waves, that is, waves with a squared
+/// wavenumber above `number2`, in 1 / mm^2. This is the integral of the spectral density outside a circle in the plane
+/// of wavenumbers.
 fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let Some(nu) = smoothness.nu() else {
         return (-number2 * range_mm.powi(2) / 8.0).exp();

@@ -39,13 +39,15 @@ struct VarianceComponents {
     random_effects: Vec<f64>,
 }
 
-/// Computes the uncertainty budget: divides the standard uncertainties of the root mean square and of PV 99.8 %, given
-/// as `uncertainties_mm`, among their sources. Returns one entry for each source; empty if the variances cannot be
-/// computed.
+/// Computes the uncertainty budget of the figures. `uncertainties_mm` has the standard uncertainties of the root mean
+/// square and of PV 99.8 %, in mm. Each is divided among its sources. Returns one entry for each source; empty if the
+/// variances cannot be computed.
 ///
-/// `sources` has the source of each random effect in `observed`, or of each column of `ground_in`. `ground_in` has one
-/// row for each place of `drawn`, one column for each effect: the form that one standard uncertainty of the effect has
-/// ground into the part, without the best fit. It is `None` before the first correction.
+/// `ground_in` is `None` before the first correction of the part. Later, it has the form that each effect of the
+/// machine has ground into the part, for one standard uncertainty of the effect and after its best fit is subtracted.
+/// It has one row for each place of `drawn` (the sampled forms) and one column for each effect.
+///
+/// `sources` has the source of each column of `ground_in`; without `ground_in`, of each random effect in `observed`.
 pub(super) fn decompose(
     (observed, sources): (&Observations, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -77,14 +79,16 @@ pub(super) fn decompose(
     UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
-/// Divides the variance of a linear figure of the form among its sources. The figure is the sum, over `places`, of the
-/// form times the given `slopes` (derivatives of the figure). The most probable field is used.
+/// Divides the variance of a linear figure of the form among its sources, in mm^2. The figure is the sum, over
+/// `places`, of the form times the derivative of the figure in `slopes`. Only the most probable hypothesis of the field
+/// (its smoothness, range and variance) is used.
 ///
-/// If the motions of the part were known, the figure would be estimated as w'd, with weights w and the observed
-/// deviations d in the coordinates of [`FieldHypotheses::coordinates`]. The variance of its error consists of s^2 w'w
-/// from the noise s, (w'e)^2 from each random effect e, and the remainder from the field. The pose contributes the
-/// increase of the variance when the motions are unknown. Returns `None` if there is no hypothesis of the field or a
-/// covariance is singular.
+/// If the motions of the part were known, the figure would be estimated as w'd. Here d are the observed deviations in
+/// the coordinates of [`FieldHypotheses::coordinates`], and w are their weights. The variance of the error then has
+/// three components: s^2 w'w from the noise s, (w'e)^2 from each random effect e, and the remainder from the field. A
+/// fourth component comes from the pose: the increase of the variance because the motions are unknown.
+///
+/// Returns `None` if there is no hypothesis, or if a covariance is singular.
 fn parts(
     observed: &Observations,
     fields: &FieldHypotheses,
@@ -145,13 +149,13 @@ fn parts(
     })
 }
 
-/// Computes the derivatives of the root mean square and of PV 99.8 % with respect to the form at each place, averaged
-/// over the sampled forms. Their components along the motions of the part are removed, because a best fit removes the
-/// motions.
+/// Computes the derivatives of two figures (the root mean square and PV 99.8 %) with respect to the form at each place.
+/// They are averaged over the sampled forms. The components along the motions of the part are removed, because the best
+/// fit removes these motions from the form.
 ///
-/// Also returns, for both figures, the mean square of the derivative along each column of `ground_in` (form that an
-/// effect of the machine has ground into the part). Along such a column, the derivative is as often positive as
-/// negative over the samples: its mean is 0, its mean square is not.
+/// The second result has the mean square, over the sampled forms, of the derivative of each figure along each column of
+/// `ground_in` (the form that an effect of the machine has ground into the part). The mean itself is of no use: the
+/// derivative is as often positive as negative, so its mean is 0.
 fn slopes(drawn: &SampledForms, ground_in: Option<&DMatrix<f64>>) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let forms = &drawn.forms[0];
     let (n, count) = forms.shape();

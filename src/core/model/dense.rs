@@ -46,25 +46,30 @@ pub struct DensePosterior {
 }
 
 impl DensePosterior {
-    /// Estimates the effects and the field from the observed points, for the given hyperparameters (generalised least
-    /// squares and kriging). The cost is cubic in the number of points.
+    /// Estimates the effects and the field from the observed points, for the given hyperparameters. The method is
+    /// generalised least squares for the effects and kriging for the field. The computing time grows with the cube of
+    /// the number of points.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows differ, if there are not more points than fixed effects, if a number is
-    /// not finite, if a hyperparameter is out of range, if the points do not separate the effects, or if the covariance
-    /// of the points is not positive definite.
+    /// Returns an error in each of these cases:
+    ///
+    /// - The fields of `observed` have different numbers of rows.
+    /// - There are not more points than fixed effects.
+    /// - A number is not finite, or a hyperparameter is out of range.
+    /// - One effect is nearly a combination of others.
+    /// - The covariance of the points is not positive definite.
     pub fn fit(observed: &Observations, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
         Self::with_shared_covariance(observed, hyperparameters, |_, _| 0.0)
     }
 
-    /// Estimates effects and field as [`Self::fit`] does, with an additional covariance of the observed points:
-    /// `shared_mm2(a, b)` in mm^2 for the points with the indices `a` and `b`. A session of measurements, for example,
-    /// has such a covariance.
+    /// Estimates the effects and the field from the observed points, with an additional covariance of these points.
+    /// `shared_mm2(a, b)` returns this covariance in mm^2 for the points with the indices `a` and `b`. For example,
+    /// points of the same measuring session have a common error.
     ///
-    /// The additional covariance belongs to the observed points alone: [`Self::predict`] predicts the field without it.
+    /// The additional covariance applies only to the observed points. [`Self::predict`] predicts the field without it.
     ///
     /// # Errors
-    /// Those of [`Self::fit`].
+    /// Returns the errors of [`Self::fit`].
     pub(super) fn with_shared_covariance(
         observed: &Observations,
         hyperparameters: Hyperparameters,
@@ -113,23 +118,24 @@ impl DensePosterior {
         self.likelihood
     }
 
-    /// Returns the generalised residual sum of squares d'K^-1 (d - H b): d are the deviations in `observed`, which must
-    /// be those of the fit, K their covariance, H the effects and b their estimates.
+    /// Returns the generalised residual sum of squares d'K^-1 (d - H b), without unit. Here d are the deviations in
+    /// `observed`, K is their covariance, H has the effects as columns, and b are the estimated effects. `observed`
+    /// must be the same as in the fit.
     pub(super) fn whitened_squares(&self, observed: &Observations) -> f64 {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// Returns the estimates of the effects and the covariance of these estimates: the fixed effects first, then the
-    /// random effects.
+    /// Returns the estimates of the effects, and the covariance of these estimates. Both have the fixed effects first,
+    /// then the random effects. The unit of an estimate is that of its effect.
     ///
     /// The covariance includes the uncertainty due to the unknown field. If the fixed effects are the motions of the
-    /// part, the estimates are the pose of its nominal frame.
+    /// part, their estimates are the pose of the nominal frame of the part.
     pub fn estimated_effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.estimates, &self.covariance)
     }
 
-    /// Predicts the field at each of `places`: posterior mean and standard uncertainty. The effects and the noise of a
-    /// touch are not included.
+    /// Predicts the field at each of `places` (x and y in mm). Returns the posterior mean and the standard uncertainty
+    /// of each value, in mm. Neither the effects nor the noise of a further measured point are included.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
         let p = self.estimates.len();
         let across = self.hyperparameters.field.pair_covariance().cross_covariance(&self.places, places);
@@ -163,9 +169,9 @@ impl DensePosterior {
     }
 }
 
-/// Computes the covariance of the deviations of all observed points, from the field and the noise, without the effects.
-/// `shared_mm2(a, b)` is added for the points with the indices `a` and `b`. Only the lower triangle of the result is
-/// filled.
+/// Computes the covariance matrix of the deviations of all observed points, in mm^2. The covariance is the sum of three
+/// terms: the field, the noise, and `shared_mm2(a, b)` for the points with the indices `a` and `b`. The effects are not
+/// included. Only the lower triangle of the matrix is filled.
 fn covariance_mm2(
     observed: &Observations,
     hyperparameters: &Hyperparameters,
@@ -194,12 +200,12 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the Cholesky factor of `gram`, the matrix of the products of all pairs of effects (H'K^-1 H for the effects
-/// H and the covariance K of the points, or H'H).
+/// Computes the Cholesky factor of `gram`. This is the matrix of the products of all pairs of effects: H'K^-1 H or H'H,
+/// where H has the effects as columns and K is the covariance of the points.
 ///
 /// # Errors
-/// Returns [`ModelError::CollinearEffects`] if one effect is nearly a combination of the others: the smallest
-/// eigenvalue of the matrix, scaled to a unit diagonal, is at most 1e-12.
+/// Returns [`ModelError::CollinearEffects`] if one effect is nearly a combination of the others. The criterion: after
+/// `gram` is scaled to a unit diagonal, its smallest eigenvalue is at most 1e-12.
 pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const MIN_PIVOT: f64 = 1e-12;
     if gram.nrows() == 0 {

@@ -23,18 +23,18 @@ pub struct EffectEstimates {
 }
 
 impl EffectEstimates {
-    /// Estimates the fixed and random effects in `observed` together with a form of unknown strength and range, and
-    /// returns them with their covariance.
+    /// Estimates the fixed and random effects in `observed` in the presence of an unknown form. The form is a random
+    /// field of unknown strength, range and smoothness; `priors` is the prior of this field. Returns the estimates with
+    /// their covariance.
     ///
     /// For one field, the estimate is that of generalised least squares (Aitken 1935): b = (H'K^-1 H)^-1 H'K^-1 d with
     /// the covariance (H'K^-1 H)^-1. The columns of H are the effects, d are the deviations, and K is the covariance of
     /// the points. The result is the mean over the possible fields, weighted with their posterior probabilities
-    /// (Bayesian model averaging). The covariance includes the differences between these fields. `priors` is the prior
-    /// of the field.
+    /// (Bayesian model averaging). The covariance includes the differences between these fields.
     ///
     /// # Errors
     /// Returns an error if the prior is invalid, if there are too few points, if one effect is a combination of others,
-    /// if a number is not finite, or if the numbers of rows differ.
+    /// if a number is not finite, or if the fields of `observed` have different numbers of rows.
     pub fn estimate(observed: &Observations, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();

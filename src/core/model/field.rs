@@ -50,7 +50,8 @@ impl Smoothness {
         }
     }
 
-    /// Returns a word for how often the field can be differentiated: `never`, `once` or `endless`.
+    /// Returns a word that says how many times the field can be differentiated: `never`, `once` or `endless` (any
+    /// number of times).
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "never",
@@ -64,21 +65,22 @@ impl Anisotropy {
     /// Isotropic: all directions are alike.
     pub const NONE: Self = Self { along: [1.0, 0.0], stretch: 1.0 };
 
-    /// Creates an anisotropy from the angle between its direction and the x axis, and from its stretch, the ratio of
-    /// the range along this direction to the range across it.
+    /// Creates an anisotropy. `angle_rad` is the angle from the x axis to the direction in which the range of the field
+    /// is longest. `stretch` is the range along this direction, divided by the range across it. The values are not
+    /// checked.
     pub fn from_angle(angle_rad: f64, stretch: f64) -> Self {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
-    /// Rotates a place into the axes of the anisotropy: returns its coordinates along and across the direction
-    /// [`Anisotropy::along`].
+    /// Rotates a position into the axes of the anisotropy. Returns two coordinates: along the direction
+    /// [`Anisotropy::along`], and perpendicular to this direction.
     pub(super) fn rotated(self, [x, y]: [f64; 2]) -> [f64; 2] {
         let [c, s] = self.along;
         [c * x + s * y, c * y - s * x]
     }
 
-    /// Returns the angle of the direction to the x axis, in radians, above -pi/2 and at most pi/2; `None` if the field
-    /// is isotropic.
+    /// Returns the angle from the x axis to the direction of the longest range, in radians, above -pi/2 and at most
+    /// pi/2. Returns `None` if the field is isotropic.
     pub fn angle_rad(&self) -> Option<f64> {
         let [c, s] = self.along;
         let angle = if c > 0.0 || c == 0.0 && s > 0.0 { s.atan2(c) } else { (-s).atan2(-c) };
@@ -98,14 +100,16 @@ impl Field {
         self.pair_covariance().covariance_mm2(a, b)
     }
 
-    /// Prepares the field for the fast computation of the covariances of many pairs of places.
+    /// Precomputes the constants of the covariance function of this field. With the result, the covariances of many
+    /// pairs of positions are computed fast.
     pub(super) fn pair_covariance(&self) -> PairCovariance {
         let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.isotropic_place(axis).map(|v| v / self.range_mm));
         PairCovariance { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Correlation::new(self.smoothness) }
     }
 
-    /// Maps a place to coordinates in which the field is isotropic: shortened along the anisotropy and extended across
-    /// it, with the same area.
+    /// Maps a position to coordinates in which the field is isotropic. The coordinate along the anisotropy is divided
+    /// by the root of the stretch, and the coordinate across it is multiplied by this root. Areas do not change.
+    /// Returns `at` unchanged if the field is isotropic.
     fn isotropic_place(&self, at: [f64; 2]) -> [f64; 2] {
         if self.anisotropy.stretch == 1.0 {
             return at;
@@ -150,8 +154,8 @@ impl PairCovariance {
         self.variance_mm2 * self.curve.at(u * u + v * v)
     }
 
-    /// Computes the covariance of the field at the place `at` with that at each of `places`, in mm^2, and writes it to
-    /// `into`.
+    /// Computes the covariance, in mm^2, between the value of the field at `at` and its value at each of `places`.
+    /// Writes one covariance for each place to `into`.
     pub(super) fn column(&self, at: [f64; 2], places: &[[f64; 2]], into: &mut [f64]) {
         into.iter_mut().zip(places).for_each(|(into, place)| *into = self.covariance_mm2(at, *place));
     }

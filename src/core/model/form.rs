@@ -138,8 +138,9 @@ const FEW_LOW_FACTOR: f64 = 0.75;
 const MAX_LOCKED_SHARE: f64 = 1e-13;
 
 impl Form {
-    /// Estimates the form of a part from the deviations of a registered measurement, and its figures with their
-    /// uncertainties. The form is given at the measured points.
+    /// Estimates the form of a part at the measured points, from the deviations of a registered measurement. The form
+    /// is the deviation of the surface from the nominal one, after its best fit is subtracted. The result also has the
+    /// figures of the form with their uncertainties. `inputs` has the stated uncertainties and priors.
     ///
     /// # Errors
     /// Returns an error if there are too few points, if the points do not determine the motions of the part, or if a
@@ -180,14 +181,15 @@ impl Form {
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
-    /// Estimates the form at given places of the part, touched or not, and the figures over all these places.
+    /// Estimates the form of a part at the given `places`, and the figures over all these places. The places need not
+    /// be measured points. Each is a point of the nominal surface with its normal, in the model frame.
     ///
-    /// `places` are points of the nominal surface with their normals, in the model frame. Form that is narrower than
-    /// the spacing of the touches cannot be distinguished from the noise of the probe by the touches alone: this needs
-    /// [`ModelInputs::probe_noise_mm`]. Such form gets an independent random value at every place.
+    /// The measured points alone do not distinguish between the noise of the probe and form that is narrower than the
+    /// spacing of the points. Therefore [`ModelInputs::probe_noise_mm`] is required for such narrow form. Narrow form
+    /// is then added as an independent random value at every place.
     ///
     /// # Errors
-    /// Those of [`Form::estimate`].
+    /// Returns the errors of [`Form::estimate`].
     pub fn estimate_at(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -196,8 +198,12 @@ impl Form {
         Self::estimate_with(registration, inputs, places, true)
     }
 
-    /// Estimates the form as [`Form::estimate_at`] does. If `is_whole` is false, the result has no slopes, no ISO
-    /// figures and no budget; this saves most of the computing time if few points were touched.
+    /// Estimates the form of a part at the given `places`, which need not be measured points, and the figures over all
+    /// these places. If `is_whole` is true, the result is that of [`Form::estimate_at`]. If it is false, the slopes,
+    /// the ISO figures and the budget are omitted. For few measured points, this saves most of the computing time.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Form::estimate`].
     pub(super) fn estimate_with(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -246,14 +252,17 @@ struct FittedModel {
 }
 
 impl FittedModel {
-    /// Computes the field hypotheses over the points of a registration, and finds the points that no field explains.
-    /// This is repeated without these points, up to three times.
+    /// Fits the model of the form to the points of a registration. Computes the field hypotheses (covariance functions
+    /// with their smoothness and range), then finds outliers: points that the field does not explain. The hypotheses
+    /// are computed again without the outliers, up to three times. Newly found outliers stay in the model if there
+    /// would be more than 10 % outliers in total.
     ///
     /// If `at_points` is true, the noise of successive points can be correlated (autocorrelation along the path of the
     /// probe).
     ///
     /// # Errors
-    /// Those of [`Self::from_fitted_points`]; also if the prior in `inputs` is invalid.
+    /// Returns an error if the prior in `inputs` is invalid. Otherwise returns the errors of
+    /// [`Self::from_fitted_points`].
     fn fit(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
         /// Number of rounds. Each round estimates the hyperparameters again. Once the tallest points of a defect are
         /// left out, its flanks stand out too.
@@ -284,13 +293,15 @@ impl FittedModel {
         Ok(Self { is_chance: by_chance > MIN_PROBABILITY, ..seen })
     }
 
-    /// Returns the posterior of the field over the points in the model, with the priors in `inputs`.
+    /// Returns the posterior of the field, computed from all points that are not outliers. The priors of the field and
+    /// of the probe noise are those in `inputs`.
     fn posterior(&self, inputs: &ModelInputs) -> Posterior<'_> {
         Posterior::new(&self.fields, &self.observed, inputs.prior.as_ref(), noise_prior(inputs))
     }
 
-    /// Evaluates samples of the field at `places`, in the frame of the registration. `effects` has the motions of the
-    /// part at these places. To each sample, the motion is added that fits the sample best to the observed deviations.
+    /// Evaluates the posterior samples `draws` of the field at `places` (x and y in mm). A motion of the part is added
+    /// to each sample: the motion for which the sample fits the observed deviations best. `effects` has the form that a
+    /// unit of each motion causes, with one row for each place and one column for each motion.
     ///
     /// If `is_between` is true, the samples are also evaluated between the places ([`IntermediateNodes`]).
     fn evaluate_samples(
@@ -313,8 +324,10 @@ impl FittedModel {
         SampledForms::evaluate(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
-    /// Finds the outliers of the field: the points whose residual from the most probable field is too large for noise.
-    /// Returns their indices among all used points; none if there are fewer than 40 points.
+    /// Finds outliers: points whose residual from the most probable field is too large to be noise. The limit is six
+    /// robust standard deviations of the residuals, or more if the residuals are much smaller than the estimated noise.
+    /// Returns the indices of the outliers among all used points. Returns no index if the model has fewer than 40
+    /// points.
     fn find_unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
         /// Minimum number of points: with fewer, the usual residual is unknown.
         const MIN_POINTS: usize = 40;
@@ -336,16 +349,19 @@ impl FittedModel {
         self.indices_of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
     }
 
-    /// Converts indices among the points in the model to indices among all used points.
+    /// Converts indices of points. An index in `chosen` counts only the points that are not outliers. An index in the
+    /// result counts all used points.
     fn indices_of_all(&self, chosen: &[usize]) -> Vec<usize> {
         chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
-    /// Adds the points `apart` to the sampled forms. These are indices of used points that no field explains; at them,
-    /// each sample is the measured deviation minus random noise of a touch.
+    /// Adds the outliers (points that the field does not explain) to the sampled forms. `apart` has their indices among
+    /// all used points. The form at such a point is the measured deviation, minus the random effects and a random noise
+    /// of the probe.
     ///
-    /// If the places of `drawn` are measured points, the points are inserted in the order of measurement. Otherwise
-    /// each point replaces the nearest place.
+    /// If the places of `drawn` are measured points, the outliers are inserted in the order of measurement. If only a
+    /// part of the measured points is in `drawn`, the same share of the outliers is inserted, the largest first. If the
+    /// places of `drawn` are other places, each outlier replaces the nearest place.
     fn with_unexplained_points(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.indices_of_all(&drawn.chosen);
@@ -365,10 +381,12 @@ impl FittedModel {
         if at_points { drawn.joined_with(found) } else { drawn.replaced_by(&found) }
     }
 
-    /// Returns samples of the form at the used points with the indices `points`, which no field explains: for each
-    /// sample of `drawn`, the measured deviation minus the random effects of this sample and minus random noise.
+    /// Returns samples of the form at outliers (points that the field does not explain). `points` has their indices
+    /// among all used points. For each sample of `drawn`, the form is the measured deviation, minus the random effects
+    /// of this sample and a random noise of the probe. The error of the machine that is ground into the part is also
+    /// subtracted.
     ///
-    /// The result has one row for each point, one column for each sample.
+    /// The result has one row for each point and one column for each sample.
     fn samples_at_points(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
         let of_probe = |mm: f64| noise_prior(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
@@ -401,15 +419,16 @@ impl FittedModel {
         found.without_ground_in(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
 
-    /// Computes the field hypotheses over those points of a registration that its pose was fitted to. The other points
-    /// that belong to the part are far from its surface; no field describes them, and they count as unexplained.
+    /// Computes the field hypotheses (covariance functions with their smoothness and range) from the points to which
+    /// the pose of the registration was fitted. All other points of the part lie far from the nominal surface. No field
+    /// describes them, so they count as outliers.
     ///
     /// If `at_points` is true, the noise of successive points can be correlated (autocorrelation along the path of the
     /// probe).
     ///
     /// # Errors
-    /// Returns an error if there are too few points, if the points do not determine the motions, or if a stated
-    /// uncertainty in `inputs` is invalid.
+    /// Returns an error if there are too few points, if the points do not determine the motions of the part, or if a
+    /// stated uncertainty in `inputs` is invalid.
     fn from_fitted_points(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -446,20 +465,22 @@ impl FittedModel {
         })
     }
 
-    /// Computes the slope figures of the sampled forms. `drawn` must not yet contain form that is too narrow to be
-    /// resolved, because such form has no measurable slope. Returns `None` if the places are too few or too far apart
-    /// for slopes.
+    /// Computes the slope figures (RMS and maximum slope) of the sampled forms in `drawn`. Call this function before
+    /// form that is too narrow to be resolved is added to `drawn`, because the slope of such form cannot be measured.
+    /// Returns `None` if there are too few places, or if they are too far apart.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
         Some(SlopeFigures::from_forms(&slopes, &smooth, (is_form_detected(posterior), inputs)))
     }
 
-    /// Builds the result of the model from the sampled forms, without slopes.
+    /// Builds the result of the model from the sampled forms in `drawn`. The slopes of the result are `None`.
     ///
-    /// `ends` has the figures of further samples: the first set extends the intervals downwards, the second upwards.
-    /// `ground_in` has one column for each effect of the machine that is ground into the part, one row for each place
-    /// of `drawn`. If `is_whole` is false, ISO figures and budget are omitted.
+    /// `ends` has the figures (RMS, PV, PV 99.8 %) of further samples. The first set can only lower the lower ends of
+    /// the intervals, the second set can only raise the upper end of the interval of RMS. `ground_in` is the form that
+    /// each effect of the machine has ground into the part: one column for each effect, one row for each place of
+    /// `drawn`. It is `None` before the first correction. If `is_whole` is false, the ISO figures and the budget are
+    /// omitted.
     fn form(
         &self,
         inputs: &ModelInputs,
@@ -515,17 +536,18 @@ impl FittedModel {
     }
 }
 
-/// Returns true if the points show a form: the logarithm of the likelihood ratio of the best field and no field is
-/// above [`MIN_EVIDENCE`].
+/// Returns true if the points show a form. The criterion is the logarithm of the likelihood ratio between the model
+/// with the best field and the model without a field. It must be above [`MIN_EVIDENCE`].
 fn is_form_detected(posterior: &Posterior) -> bool {
     posterior.evidence > MIN_EVIDENCE
 }
 
-/// Returns `inputs` for the lower bounds of the figures. If the estimated noise is consistent with
-/// [`ModelInputs::probe_noise_mm`], the probe noise is set to unknown, so that no noise counts as form.
+/// Returns a copy of `inputs` for the lower bounds of the figures. If the estimated noise is consistent with
+/// [`ModelInputs::probe_noise_mm`], the probe noise is set to unknown. All noise then counts as noise of the probe, and
+/// none as form.
 ///
-/// The reason: a reference sphere with some twenty touches determines the noise of the probe to 15 %. A small excess of
-/// the estimated noise over it is not necessarily form.
+/// The reason: about twenty touches on a reference sphere determine the noise of the probe only to 15 %. If the
+/// estimated noise is slightly larger, the excess is not necessarily form.
 fn min_form_inputs(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
     const MAX_EXCESS_SIGMAS: f64 = 2.0;
@@ -545,8 +567,8 @@ fn is_underdetermined(posterior: &Posterior, inputs: &ModelInputs) -> bool {
     posterior.degrees_of_freedom() < MIN_DEGREES_OF_FREEDOM && noise_prior(inputs).is_none()
 }
 
-/// Returns [`ModelInputs::probe_noise_mm`] as the prior of the noise; `None` if its standard deviation is 0, which
-/// means unknown.
+/// Returns [`ModelInputs::probe_noise_mm`] as the prior of the noise: its standard deviation in mm and the relative
+/// uncertainty of this standard deviation. Returns `None` if the standard deviation is 0, that is, unknown.
 fn noise_prior(inputs: &ModelInputs) -> NoisePrior {
     (inputs.probe_noise_mm[0] > 0.0).then_some(inputs.probe_noise_mm)
 }
@@ -555,8 +577,9 @@ fn mean(of: &[f64]) -> f64 {
     of.iter().sum::<f64>() / of.len().max(1) as f64
 }
 
-/// Returns true if the places, in their order, follow a path: the median distance between successive places is at most
-/// three times the typical spacing.
+/// Returns true if successive places are close to each other, as on a path. The criterion: the median distance between
+/// successive places is at most three times the typical spacing of all places. Returns false if there are fewer than
+/// two places.
 fn is_path(places: &[[f64; 2]]) -> bool {
     const NEAR: f64 = 3.0;
     let apart_mm = |pair: &[[f64; 2]]| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
@@ -573,8 +596,8 @@ fn xy((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
-/// Returns the indices 0 to `of` - 1; if these are more than [`MAX_PLACES`], only [`MAX_PLACES`] of them, evenly
-/// spaced.
+/// Returns the indices 0 to `of` - 1. If there are more than [`MAX_PLACES`], returns only [`MAX_PLACES`] of them,
+/// evenly spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
     let most = of.min(MAX_PLACES);
     (0..most).map(move |k| k * of / most)
@@ -629,12 +652,13 @@ impl Default for ModelInputs {
     }
 }
 
-/// Returns the covariance of the motions that a least-squares registration finds, including the error that the form
-/// causes.
+/// Returns the covariance of the motions of the part that a least-squares registration finds. The covariance includes
+/// the error that the form causes.
 ///
-/// With the fixed effects H, it is A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (least squares with correlated errors, Aitken
-/// 1935). K is the covariance of the field, averaged over all hypotheses, and s is the noise. `alike` has one column
-/// for each effect that is common to all points, such as a machine error; the covariance due to these effects is added.
+/// It is A+ (K + s^2) A+' plus the covariance due to `alike` (least squares with correlated errors, Aitken 1935). Here
+/// A+ = (H'H)^-1 H', and H has the fixed effects (motions) as columns. K is the covariance of the field, averaged over
+/// all hypotheses, and s is the standard deviation of the noise. For autocorrelated noise, s^2 is increased. `alike`
+/// has one column for each effect that is common to all points, such as a machine error.
 fn best_fit_covariance(
     observed: &Observations,
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -650,10 +674,10 @@ fn best_fit_covariance(
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
 
-/// Returns a matrix B for which B z, with standard normal numbers z, is a sample of the motion by which the best fit
-/// follows the form of the part.
+/// Returns a matrix B for random samples of the motion that the form of the part causes in a best fit. If z is a vector
+/// of independent standard normal numbers, B z is such a sample.
 ///
-/// B B' = A+ K A+', with the symbols of [`best_fit_covariance`].
+/// B satisfies B B' = A+ K A+', with the symbols of [`best_fit_covariance`].
 fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatrix<f64> {
     let rows = &observed.fixed_effects;
     let weights = rows * inverse_of_products(rows);
@@ -662,7 +686,8 @@ fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatr
     eigenvectors * DMatrix::from_diagonal(&eigenvalues.map(|value| value.max(0.0).sqrt()))
 }
 
-/// Returns (H'H)^-1 for the matrix H of effects; the pseudo-inverse if the effects are linearly dependent.
+/// Returns the inverse of the matrix of products, (H'H)^-1, where H is the matrix `effects`. Returns the pseudo-inverse
+/// if the columns of H are linearly dependent.
 fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
     let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
     inverse.unwrap_or_else(|_| DMatrix::zeros(effects.ncols(), effects.ncols()))
@@ -702,11 +727,15 @@ struct IntermediateForms {
 }
 
 impl SampledForms {
-    /// Evaluates samples of the field at `places` and adds motions of the part. `effects` has one row for each place,
-    /// one column for each motion; `moved` has the size of each motion, one column for each sample, for both variance
-    /// factors.
+    /// Evaluates the posterior samples `draws` of the field at `places` (x and y in mm), and adds a motion of the part
+    /// to each sample.
     ///
-    /// If `is_between` is true, does the same between the places ([`IntermediateNodes`]).
+    /// `effects` has the form that a unit of each motion causes, with one row for each place and one column for each
+    /// motion. `moved` has one matrix for each of the two variance factors ([`HypothesisSet`]). Its rows are the
+    /// motions, its columns are the samples, and its entries are the sizes of the motions.
+    ///
+    /// If `is_between` is true and there are fewer than [`MAX_PLACES`] places, the samples are also evaluated between
+    /// the places ([`IntermediateNodes`]).
     fn evaluate(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
@@ -767,9 +796,9 @@ impl SampledForms {
         }
     }
 
-    /// Keeps the samples with the second variance factor ([`HypothesisSet`]) only at the places near a point of
-    /// `touched`. At all other places, such samples are nearly unconstrained; there they are replaced by the samples of
-    /// the posterior.
+    /// Restricts the samples with the second variance factor ([`HypothesisSet`]) to the places near a measured point in
+    /// `touched`. Near means closer than half the typical spacing of the places. At all other places, the measured
+    /// points hardly limit these samples. Therefore they are replaced there by the samples of the posterior.
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
@@ -782,10 +811,11 @@ impl SampledForms {
         self
     }
 
-    /// Computes the standard uncertainty of the smooth form at each place: the standard deviation over the samples.
+    /// Computes the standard uncertainty of the smooth form at each place, in mm: the standard deviation of the samples
+    /// at this place.
     ///
-    /// If there are random effects, or if the places are not measured points, the samples contain motions of the part,
-    /// which are not form. The best fit of each sample is then removed first.
+    /// The samples can contain motions of the part, which are not form. This is so if there are random effects, or if
+    /// the places are not measured points. In these cases, the best fit of each sample is subtracted first.
     fn with_smooth_sigma(self, observed: &Observations) -> Self {
         let at_points = !self.chosen.is_empty();
         let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
@@ -795,11 +825,15 @@ impl SampledForms {
         Self { smooth_sigma_mm, ..self }
     }
 
-    /// Adds form that is too narrow to be resolved to the samples at the measured points and between them.
+    /// Adds form that is too narrow to be resolved to the samples, at the measured points and between them.
     ///
-    /// The residuals of the smooth form are the sum of probe noise and narrow form. Each residual is multiplied by the
-    /// share of narrow form in their variance and added to the sample. The uncertainty of this split is added as random
-    /// numbers.
+    /// At a measured point, the residual of the smooth form is the sum of probe noise and narrow form. The variance of
+    /// this sum is the noise variance of the sample plus that of the short waves. Each residual is multiplied by the
+    /// share of narrow form in this variance, and then added to the sample. A random number is also added, for the
+    /// uncertainty of this split.
+    ///
+    /// If the points are too few to separate form from noise ([`is_underdetermined`]), further samples are created in
+    /// which the deviations count entirely as form.
     fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
@@ -852,9 +886,11 @@ impl SampledForms {
         self
     }
 
-    /// Adds form that is too narrow to be resolved to the samples, for places that are not measured points and between
-    /// them: independent normal random numbers. Their variance is that of the noise beyond the noise of the probe, plus
-    /// that of the waves shorter than the basis functions.
+    /// Adds form that is too narrow to be resolved to the samples: an independent normal random number at every place,
+    /// and at every node between the places. Use it for places that are not measured points.
+    ///
+    /// The variance of the random numbers has two terms. The first is the noise variance of the sample minus that of
+    /// the probe. The second is the variance of the waves that are shorter than the basis functions.
     fn with_narrow_form(mut self, inputs: &ModelInputs) -> Self {
         add_narrow(&mut self.forms, (&self.noise_mm, &self.truncated_mm), inputs, 4);
         self.add_narrow_between(inputs);
@@ -891,8 +927,8 @@ impl SampledForms {
         self
     }
 
-    /// Adds the places of `other`, with their samples, to those of `self`. All places are sorted by the index of their
-    /// measured point.
+    /// Merges the places of `other`, with their samples, into those of `self`. The places of the result are sorted by
+    /// the index of their measured point.
     fn joined_with(self, other: Self) -> Self {
         let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
@@ -916,7 +952,8 @@ impl SampledForms {
         }
     }
 
-    /// Replaces, for each place of `other`, the samples at the nearest place of `self` by those of `other`.
+    /// Replaces samples of `self` by those of `other`. For each place of `other`, the samples at the nearest place of
+    /// `self` are replaced. The positions of the places do not change.
     fn replaced_by(mut self, other: &Self) -> Self {
         let square = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
         for (r, place) in other.places.iter().enumerate() {
@@ -933,8 +970,8 @@ impl SampledForms {
         self
     }
 
-    /// Subtracts from each sample its own least-squares best fit: the motion of the part that explains most of the
-    /// sample at the places.
+    /// Subtracts from each sample its least-squares best fit at the places: the motion of the part that is closest to
+    /// the sample. The same motion is also subtracted between the places.
     fn after_best_fit(mut self) -> Self {
         if self.effects.ncols() == 0 {
             return self;
@@ -977,17 +1014,21 @@ impl SampledForms {
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
-    /// Returns RMS, PV and PV 99.8 % of each sample over the places alone, in mm. RMS is that of the samples of the
-    /// posterior; PV and PV 99.8 % are those of the samples with the second variance factor ([`HypothesisSet`]).
+    /// Returns the figures RMS, PV and PV 99.8 % of each sample, in mm. They are computed from the places only, not
+    /// from the nodes between the places. RMS is that of the posterior samples. PV and PV 99.8 % are those of the
+    /// samples with the second variance factor ([`HypothesisSet`]), which bound the extremes.
     fn figures_at_places(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// Returns RMS, PV and PV 99.8 % with their credible intervals. `least` and `most` have these three figures for
-    /// each of further samples; they extend the intervals downwards and upwards.
+    /// Returns the figures RMS, PV and PV 99.8 % with their credible intervals, in mm.
     ///
-    /// If `is_seen` is false, no form was detected, and the lower ends of the intervals are 0.
+    /// `least` and `most` have these three figures for each of further samples. The figures in `least` can only lower
+    /// the lower ends of the intervals. The figures in `most` can only raise the upper end of the interval of RMS. For
+    /// PV and PV 99.8 %, the samples with the second variance factor ([`HypothesisSet`]) raise the upper ends instead.
+    /// With fewer than 200 measured points, the lower ends are multiplied by [`FEW_LOW_FACTOR`]. `is_seen` is true if a
+    /// form was detected. If it is false, the lower ends of the intervals are 0.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
@@ -1002,9 +1043,11 @@ impl SampledForms {
         FormFigures { rms: interval(0), pv: interval(1), pv_998: interval(2) }
     }
 
-    /// Computes three figures of each sample, in mm: RMS and PV over the places, and PV 99.8 % over the places and the
-    /// nodes between them. `forms` and `between` have the samples at the places and at these nodes, one column for each
-    /// sample.
+    /// Computes three figures of each sample, in mm: RMS, PV and PV 99.8 %. RMS and PV are computed from the places. PV
+    /// 99.8 % is computed from the places and the nodes between them.
+    ///
+    /// `forms` has the samples at the places, `between` has the samples at the nodes; each has one column for each
+    /// sample. If `between` is `None`, PV 99.8 % is also computed from the places only.
     fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
         let rows = forms.nrows();
         let mut is_touched = vec![true; rows];
@@ -1033,9 +1076,13 @@ fn min_and_max(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// Adds form that is too narrow to be resolved to every place of each sample, as independent normal random numbers.
-/// `scatter_mm` and `narrow_mm` are, for each sample, the standard deviations of the noise and of the waves shorter
-/// than the basis functions. `stream` is the seed of the random numbers.
+/// Adds form that is too narrow to be resolved to every place of each sample: an independent normal random number with
+/// the variance that [`split_noise`] gives.
+///
+/// `forms` has one matrix for each of the two variance factors ([`HypothesisSet`]), with one column for each sample.
+/// `scatter_mm` has the standard deviation of the noise of each sample. `narrow_mm` has the standard deviation of the
+/// waves shorter than the basis functions, for each variance factor and sample. `stream` is the seed of the random
+/// numbers.
 fn add_narrow(
     forms: &mut [DMatrix<f64>; 2],
     (scatter_mm, narrow_mm): (&[f64], &[Vec<f64>; 2]),
@@ -1055,26 +1102,28 @@ fn add_narrow(
     }
 }
 
-/// Splits the noise of a sample into probe noise and form that is too narrow to be resolved. Returns both standard
-/// deviations in mm; the second includes `narrow_mm`.
+/// Splits the noise of a sample into probe noise and form that is too narrow to be resolved. Returns the standard
+/// deviations of the two, in mm.
 ///
-/// `scatter_mm` is the standard deviation of the noise, `narrow_mm` that of the waves shorter than the basis functions.
-/// The probe noise is drawn at random from [`ModelInputs::probe_noise_mm`], at most `scatter_mm`. If it is unknown, it
-/// is all of `scatter_mm`.
+/// `scatter_mm` is the standard deviation of the noise. `narrow_mm` is the standard deviation of the waves shorter than
+/// the basis functions; it always counts as narrow form. The probe noise is drawn at random from
+/// [`ModelInputs::probe_noise_mm`], and is at most `scatter_mm`. The remaining noise counts as narrow form. If the
+/// probe noise is unknown, all of `scatter_mm` is probe noise.
 fn split_noise(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut NormalGenerator) -> [f64; 2] {
     let Some([probe_mm, probe_u]) = noise_prior(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
     [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
 
-/// Subtracts from each column of `forms` its least-squares best fit by the columns of `effects`.
+/// Subtracts from each column of `forms` its best fit: the linear combination of the columns of `effects` that is
+/// closest to it in least squares. Returns the residuals.
 fn without_best_fit(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
     let base = orthonormal_base(effects.clone());
     forms -= &base * base.tr_mul(&forms);
     forms
 }
 
-/// Returns the standard deviation of each row of `forms`: that of the samples at one place, in mm.
+/// Returns the standard deviation of each row of `forms`, in mm. A row has the values of all samples at one place.
 fn row_sigmas_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
@@ -1084,18 +1133,22 @@ impl Interval {
     pub const PROBABILITIES: [f64; 15] =
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
 
-    /// Returns the standard uncertainty in mm: the width of the 95 % interval divided by 3.92, which is its width in
-    /// standard deviations for a normal distribution.
+    /// Returns the standard uncertainty in mm: the width of the 95 % interval divided by 3.92. The 95 % interval of a
+    /// normal distribution is 3.92 standard deviations wide.
     pub fn standard_uncertainty_mm(&self) -> f64 {
         const WIDTH: f64 = 2.0 * 1.96;
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Builds the credible interval of a figure from its equally probable `values`.
+    /// Builds the credible interval of a figure from `values`, its values in equally probable samples. `values` must
+    /// not be empty.
     ///
-    /// Below the median, a quantile is the smaller of the quantiles of `values` and of `lower`, if this is not empty.
-    /// Above the median, it is the largest of the quantiles of `values` and of each set in `higher`. If `has_low` is
-    /// false, the quantiles below the median are 0.
+    /// Quantiles above the median can only become larger by `higher`: each is the maximum of the quantiles of `values`
+    /// and of every set in `higher`. Quantiles below the median can only become smaller by `lower`: each is the minimum
+    /// of the quantiles of `values` and of `lower`. An empty `lower` is ignored. If `has_low` is false, all quantiles
+    /// below the median are 0.
+    ///
+    /// `inputs` has the probabilities of the bounds for decisions and for acceptance.
     pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1105,8 +1158,8 @@ impl Interval {
         Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
     }
 
-    /// Builds the interval as [`Interval::from_samples`] does, with the quantiles below the median multiplied by
-    /// `low_factor`.
+    /// Builds the credible interval of a figure from samples, with the parameters and rules of
+    /// [`Interval::from_samples`]. In addition, the quantiles below the median are multiplied by `low_factor`.
     fn with_low_factor(
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1154,8 +1207,9 @@ pub(super) struct FreeMotions {
 }
 
 impl FreeMotions {
-    /// Finds the motions that the registration was free to make: the directions in which the covariance of its pose is
-    /// not 0. `points` are the points used in the model.
+    /// Finds the motions of the part that the registration did not lock. These are the directions in which the
+    /// covariance of the pose in `registration` is not 0. `points` are the points used in the model, in the model
+    /// frame; rotations are taken about their centroid.
     pub(super) fn from_registration(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
         let n = points.clone().count() as f64;
         let centre = Point::from(points.clone().fold(Vector::zeros(), |sum, p| sum + p.coords) / n);
@@ -1169,8 +1223,8 @@ impl FreeMotions {
         Self { centre, size_mm, free }
     }
 
-    /// Returns the observations at the given points: places and deviations, with the free motions as fixed effects and
-    /// without random effects.
+    /// Returns the observations at the points `used`: the positions (x and y) and the deviations, in mm. The fixed
+    /// effects are the motions of the part that the registration did not lock. There are no random effects.
     pub(super) fn observed(&self, used: &[&Deviation]) -> Observations {
         let places = used.iter().map(|d| [d.point.x, d.point.y]).collect();
         let deviations_mm = used.iter().map(|d| d.deviation_mm).collect();
@@ -1178,11 +1232,12 @@ impl FreeMotions {
         Observations { fixed_effects, ..Observations::without_effects(places, deviations_mm) }
     }
 
-    /// Returns the random effects of the machine, its probe, the temperature and the fixture, which are common to all
-    /// points. Rotations of the fixture are about the centroid of the points.
+    /// Returns the random effects that are common to all points: errors of the machine, of the probe, of the
+    /// temperature and of the fixture. Their sizes are the standard uncertainties in `inputs`. Rotations of the fixture
+    /// are about the centroid of the points.
     ///
     /// # Errors
-    /// Returns [`ModelError::StatedUncertainty`] if a stated standard uncertainty is negative, not a number or too
+    /// Returns [`ModelError::StatedUncertainty`] if a standard uncertainty in `inputs` is negative, not a number or too
     /// large.
     pub(super) fn machine_effects(
         &self,
@@ -1198,8 +1253,12 @@ impl FreeMotions {
         Ok(MachineEffects::new(inputs.machine, of_others, datum, self.centre, model_from_machine))
     }
 
-    /// Returns the Jacobian of the deviations: one row for each point with its normal, one column for each free motion.
-    /// An element is the change of the distance of the point from the surface, in mm, for a unit of the motion.
+    /// Returns the Jacobian of the deviations with respect to the motions of the part. `points` has each point with its
+    /// unit normal. The result has one row for each point and one column for each motion that the registration did not
+    /// lock.
+    ///
+    /// An element is the change of the signed distance of the point from the surface, in mm, for a unit of the motion.
+    /// Rotations are about the centroid, and are scaled to a length in mm.
     pub(super) fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let rows: Vec<[f64; 6]> = points
             .map(|(point, normal)| {
@@ -1210,8 +1269,9 @@ impl FreeMotions {
         DMatrix::from_fn(rows.len(), 6, |r, c| rows[r][c]) * &self.free
     }
 
-    /// Converts the covariance of the free motions about the centroid to the covariance of a
-    /// [`Twist`](crate::geometry::Twist) about the origin.
+    /// Converts the covariance of the motions that the registration did not lock to the covariance of a
+    /// [`Twist`](crate::geometry::Twist) about the origin, in mm^2, mm rad and rad^2. The motions are about the
+    /// centroid of the points. Locked directions get a variance of 0.
     fn to_twist(&self, covariance: &DMatrix<f64>) -> Matrix6<f64> {
         let whole = &self.free * covariance * self.free.transpose();
         let whole = Matrix6::from_fn(|r, c| whole[(r, c)]);
@@ -1221,8 +1281,9 @@ impl FreeMotions {
     }
 }
 
-/// Returns the matrix that converts a twist about the origin to a motion about the point `centre`: the shift of
-/// `centre`, and the rotation about it times `size_mm`, which makes it a length in mm.
+/// Returns the matrix that converts a twist about the origin to a motion about the point `centre`. The first three
+/// components of the motion are the shift of `centre`, in mm. The last three are the rotation in radians times
+/// `size_mm`, so that they are also lengths in mm.
 fn motion_about(centre: Point, size_mm: f64) -> Matrix6<f64> {
     let mut about = Matrix6::identity();
     // v + omega x c

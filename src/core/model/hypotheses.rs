@@ -128,16 +128,19 @@ pub(super) struct FieldHypothesis {
     pub(super) prior: Vec<f64>,
 }
 
-/// Returns the variance ratios of field to noise for which every node is evaluated: [`VARIANCE_RATIOS`] values in equal
-/// steps of their logarithm, in ascending order.
+/// Returns the variance ratios (variance of the field divided by variance of the noise) at which every field hypothesis
+/// is evaluated. There are [`VARIANCE_RATIOS`] values in ascending order, with equal steps of their logarithm.
 pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
     let [least, most] = VARIANCE_RATIO_LIMITS.map(f64::ln);
     (0..VARIANCE_RATIOS).map(move |k| (least + (most - least) * k as f64 / (VARIANCE_RATIOS - 1) as f64).exp())
 }
 
 impl FieldHypotheses {
-    /// Prepares all field hypotheses for the observed points: solves one eigenproblem for each node, a smoothness with
-    /// a range. `kind` is the anisotropy of the field and the autocorrelation of the noise. Deviations are not used.
+    /// Prepares all hypotheses of the field for the observed points. A hypothesis (node) is one smoothness with one
+    /// range. Solves one eigenproblem for each node.
+    ///
+    /// `kind` has the anisotropy of the field and the autocorrelation of the noise. The deviations in `observed` are
+    /// not used, but they must be finite. Nodes without a solution are left out.
     ///
     /// # Errors
     /// Returns an error if the numbers of rows differ, if a number is not finite, if there are not more points than
@@ -156,9 +159,13 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// Returns the ranges of the nodes, in mm: [`RANGES`] values in equal steps of their logarithm. The shortest is the
-    /// one that the spacing of the points and the basis resolve; the longest is [`MAX_RANGE_SIZES`] sizes of the part,
-    /// but at least 1.5 times the shortest.
+    /// Returns the ranges of the nodes, in mm, in ascending order. A node is one smoothness with one range. There are
+    /// [`RANGES`] values in equal steps of their logarithm.
+    ///
+    /// The shortest range is the larger of two limits: [`MIN_RANGE_SPACINGS`] spacings of the points, and
+    /// [`MIN_RANGE_HALF_WAVELENGTHS`] half wavelengths of the shortest cosine of the basis. The longest range is
+    /// [`MAX_RANGE_SIZES`] times the size of the part (root mean square distance of the points from their centroid),
+    /// but at least 1.5 times the shortest range.
     fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
         let least_mm = (MIN_RANGE_SPACINGS * spacing_mm(&self.places))
             .max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
@@ -167,8 +174,12 @@ impl FieldHypotheses {
         (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
     }
 
-    /// Prepares what all nodes have in common: the basis functions at the points, whitened and without the fixed
-    /// effects. The errors are those of [`Self::over`].
+    /// Prepares the data that all nodes (pairs of one smoothness and one range) share, and no node yet. These data are
+    /// the basis functions at the points. They are whitened (the correlation of successive noise is removed), and their
+    /// best fit by the fixed effects is subtracted.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Self::over`].
     fn without_nodes(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
         observed.check()?;
         let places = observed.places.clone();
@@ -201,9 +212,12 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// Computes the basis functions at the points, with one coordinate for each point. They are whitened, and the part
-    /// that a best fit of the fixed effects removes is subtracted. Also returns this removed part, as Q'W phi in the
-    /// notation of the module.
+    /// Computes the whitened basis functions at the points, and subtracts their best fit by the fixed effects.
+    /// Whitening removes the correlation of the noise of successive points.
+    ///
+    /// Returns two results. The first has one coordinate (row) for each point. The second is the product Q'W phi, with
+    /// one row for each fixed effect and one column for each basis function. Here phi are the basis functions at the
+    /// points, W is the whitening, and Q is an orthonormal base of the whitened fixed effects.
     fn individual_points(&self) -> (Reduced, Mat<f64>) {
         let mut rows = self.rows_of(0..self.places.len());
         let (n, p) = self.base.shape();
@@ -213,11 +227,16 @@ impl FieldHypotheses {
         (Reduced { rows, pivots: None }, taken)
     }
 
-    /// Computes the basis functions at the points, reduced to few coordinates. For this, the products of all pairs of
-    /// whitened basis functions, summed over the points, are factorized (pivoted Cholesky) until the remaining variance
-    /// is negligible. The part that a best fit of the fixed effects removes is subtracted first.
+    /// Computes the whitened basis functions at the points, without their best fit by the fixed effects, in few
+    /// coordinates. Whitening removes the correlation of the noise of successive points.
     ///
-    /// Also returns this removed part, as Q'W phi in the notation of the module.
+    /// First the products of all pairs of basis functions are summed over the points. The part that the best fit
+    /// removes is subtracted from these sums. A pivoted Cholesky factorization of the result then gives the
+    /// coordinates, until the remaining variance is negligible.
+    ///
+    /// Returns the coordinates, and the product Q'W phi with one row for each fixed effect and one column for each
+    /// basis function. Here phi are the basis functions at the points, W is the whitening, and Q is an orthonormal base
+    /// of the whitened fixed effects.
     fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
         let (p, count) = (self.base.ncols(), self.basis.len());
         let of = |points: Range<usize>| {
@@ -232,10 +251,12 @@ impl FieldHypotheses {
         (pivoted_cholesky(&products), taken)
     }
 
-    /// Calls `of` with the indices of each block of points, in parallel, and adds up the matrices that it returns.
-    /// `shapes` are the numbers of rows and columns of these matrices.
+    /// Calls the function `of` for each block of points, in parallel, and adds up the matrices that `of` returns. The
+    /// argument of `of` is the range of point indices of the block. Each call returns `N` matrices. `shapes` are the
+    /// numbers of rows and columns of these matrices.
     ///
-    /// The blocks are added in their order, so that the sum has the same bits on any number of threads.
+    /// Returns the `N` sums. The blocks are added in the order of the points. So the sums have the same bits on any
+    /// number of threads.
     fn sum_over_blocks<const N: usize>(
         &self,
         shapes: [(usize, usize); N],
@@ -269,11 +290,12 @@ impl FieldHypotheses {
         rows
     }
 
-    /// Converts columns of point values, such as deviations, to the coordinates of [`Reduced`]. The columns are first
-    /// whitened, and their best fit by the fixed effects is subtracted.
+    /// Converts columns of point values, such as deviations, to the reduced coordinates of the basis functions (see
+    /// [`Reduced`]). `columns` has one row for each point. The columns are first whitened, and their best fit by the
+    /// fixed effects is subtracted. Whitening removes the correlation of the noise of successive points.
     ///
-    /// Returns the coordinates, one column for each given column, and the products of all pairs of the columns after
-    /// this subtraction.
+    /// Returns two results. The first has one row for each coordinate and one column for each column of `columns`. The
+    /// second has the products of all pairs of the columns, summed over the points, after the subtraction.
     pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
         let mut columns = whitened(&self.whitening, columns);
         let taken = &self.base * self.base.tr_mul(&columns);
@@ -294,8 +316,9 @@ impl FieldHypotheses {
         (coordinates, products)
     }
 
-    /// Solves the eigenproblem of one node: a field with the given smoothness and range. Returns `None` if nothing of
-    /// such a field remains at the points after the best fit, or if the eigenproblem has no solution.
+    /// Solves the eigenproblem of one node: a field with the given smoothness, and with the range `range_mm` in mm.
+    /// Returns `None` if nothing of this field remains at the points after the best fit of the fixed effects, or if the
+    /// eigenproblem has no solution.
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
         let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
         let least = MIN_SIGMA_SHARE * strengths.iter().copied().fold(0.0, f64::max);
@@ -343,9 +366,11 @@ impl FieldHypotheses {
         })
     }
 
-    /// Multiplies coordinates of the points by D C'. C has the basis functions in these coordinates
-    /// ([`Reduced::rows`]), and D the standard deviations of the coefficients in `node`. Returns one row for each basis
-    /// function, one column for each column of `coordinates`.
+    /// Multiplies `coordinates` by D C'. The matrix C has the basis functions in the reduced coordinates of the points
+    /// ([`Reduced::rows`]). D is the diagonal matrix of the standard deviations of the coefficients in `node`.
+    ///
+    /// `coordinates` has one row for each reduced coordinate. Returns one row for each basis function of `node`, and
+    /// one column for each column of `coordinates`.
     pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
@@ -359,9 +384,12 @@ impl FieldHypotheses {
         coefficients
     }
 
-    /// Multiplies coefficients, in units of their standard deviations D in `node`, by C D. C has the basis functions in
-    /// the coordinates of the points ([`Reduced::rows`]). Returns the coordinates, one column for each column of
-    /// `coefficients`.
+    /// Multiplies `coefficients` by C D. The matrix C has the basis functions in the reduced coordinates of the points
+    /// ([`Reduced::rows`]). D is the diagonal matrix of the standard deviations of the coefficients in `node`. Each
+    /// coefficient is given in units of its standard deviation.
+    ///
+    /// `coefficients` has one row for each basis function of `node`. Returns one row for each reduced coordinate, and
+    /// one column for each column of `coefficients`.
     pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
@@ -373,15 +401,20 @@ impl FieldHypotheses {
         self.base.ncols()
     }
 
-    /// Projects columns of point values onto the space of the fixed effects. Returns Q'W times the columns: W whitens
-    /// them, and Q is an orthonormal base of the whitened fixed effects.
+    /// Projects columns of point values onto the space of the fixed effects. `columns` has one row for each point.
+    /// Returns Q'W times `columns`, with one row for each fixed effect. W is the whitening, which removes the
+    /// correlation of the noise of successive points. Q is an orthonormal base of the whitened fixed effects.
     pub(super) fn project_onto_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
-    /// Returns the matrix that gives the observed coordinates for coefficients in units of their standard deviations D
-    /// in `node`. The first rows are C D, the coordinates of [`Reduced`]. One row for each fixed effect follows: Q'W
-    /// phi D, the part of the basis functions that the best fit removes.
+    /// Returns the matrix that maps coefficients of the basis functions to whitened observations. Each coefficient is
+    /// in units of its standard deviation in `node`. D is the diagonal matrix of these standard deviations.
+    ///
+    /// The first rows of the matrix are C D, with one row for each reduced coordinate (C is [`Reduced::rows`]). Then
+    /// follow the rows Q'W phi D, one for each fixed effect. They have the part of the basis functions phi that the
+    /// best fit of the fixed effects removes. W is the whitening, and Q is an orthonormal base of the whitened fixed
+    /// effects.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.removed_by_fit.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
@@ -410,13 +443,17 @@ impl FieldHypotheses {
     }
 }
 
-/// Returns the logarithm of the prior probability of each variance ratio tau for one node, up to a constant. The prior
-/// is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior).
+/// Returns the logarithm of the prior probability of each variance ratio tau, up to a constant, for one node (one
+/// smoothness with one range). tau is the variance of the field divided by the variance of the noise. The order is that
+/// of [`variance_ratios`].
 ///
-/// `values` are the eigenvalues of the node, `narrow` is the variance of waves shorter than the basis functions,
-/// `scale` the factor of [`FieldHypothesis::scale`], and `free` the degrees of freedom n - p. With l = scale
-/// (eigenvalue + narrow) and q = l tau / (1 + l tau), J^2 is (sum q^2 - (sum q)^2 / (n - p)) / 2. A field that cannot
-/// be distinguished from noise has J = 0.
+/// `values` are the eigenvalues of the node. `narrow` is the variance of waves shorter than the basis functions.
+/// `scale` is [`FieldHypothesis::scale`]. `free` is n - p, the number of points minus the number of fixed effects.
+///
+/// The prior is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior). Let l = scale
+/// (eigenvalue + narrow) and q = l tau / (1 + l tau). Then J^2 = (sum q^2 - (sum q)^2 / (n - p)) / 2. The sums have n -
+/// p terms: the eigenvalues in `values`, and 0 for all others. A field that cannot be distinguished from noise has J =
+/// 0.
 fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);
@@ -434,7 +471,7 @@ fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     variance_ratios().map(of).collect()
 }
 
-/// Adds rows' rows, the product of the transpose of `rows` and `rows`, to the lower triangle of `products`.
+/// Adds the product R'R to the lower triangle of `products`, where R is the matrix `rows` and R' is its transpose.
 fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     triangular::matmul(
         products.as_mut(),
@@ -449,8 +486,9 @@ fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     );
 }
 
-/// Computes the pivoted Cholesky factor of a symmetric matrix. Only the lower triangle of `products` is used. The
-/// factor ends before the first pivot of at most [`MIN_PIVOT_SHARE`] of the largest diagonal element.
+/// Computes the pivoted Cholesky factor of the symmetric matrix `products`. Only the lower triangle of `products` is
+/// read. The factorization ends when the next pivot would be at most [`MIN_PIVOT_SHARE`] of the largest diagonal
+/// element. Returns the columns of the factor as rows of [`Reduced`], and the indices of the pivots in their order.
 fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let count = products.nrows();
     let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
@@ -481,11 +519,13 @@ fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     Reduced { rows: Mat::from_fn(rows.len(), count, |r, c| rows[r][c]), pivots: Some(pivots) }
 }
 
-/// Returns the coefficients that make autocorrelated noise independent, with the same variance: for each point the
-/// factor of its own row, and the factor of the row before, which is subtracted.
+/// Returns the whitening coefficients, which make autocorrelated noise independent and keep its variance. There are two
+/// coefficients for each point: the factor of the row of this point, and the factor of the row of the point before. The
+/// second product is subtracted from the first.
 ///
-/// `path` is the position of each point in steps of the path; empty if there is none. `points` is the number of points,
-/// `drift` the noise autocorrelation over one step.
+/// `path` is the position of each point in steps of the path; `path` is empty if the points do not follow a path.
+/// `points` is the number of points. `drift` is the autocorrelation of the noise over one step, from 0 to below 1. With
+/// an empty `path` or `drift` = 0, the two coefficients are 1 and 0.
 fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     if drift == 0.0 || path.is_empty() {
         return vec![[1.0, 0.0]; points];
@@ -498,7 +538,9 @@ fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     (0..points).map(of).collect()
 }
 
-/// Applies the coefficients of [`whitening`] to columns with one row for each point.
+/// Whitens `columns` with the coefficients that [`whitening`] returns, so that the noise of successive points becomes
+/// independent. `columns` has one row for each point. Each row is multiplied by its first coefficient, and the row
+/// before times the second coefficient is subtracted. Returns a matrix of the same shape.
 fn whitened(whitening: &[[f64; 2]], columns: &DMatrix<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(columns.nrows(), columns.ncols(), |r, c| {
         let [own, last] = whitening[r];

@@ -57,8 +57,11 @@ struct PlaceBlock {
     across: Vec<Vec<f64>>,
 }
 
-/// Joins each place with its row of effects: the fixed effects, then the random effects. The random effects are divided
-/// by the prior standard deviation of the fixed effects, so that both have the same prior variance afterwards.
+/// Returns one [`Place`] for each element of `places`: its position in mm and its row of effects. The row has first the
+/// fixed effects, then the random effects.
+///
+/// Each random effect is divided by the prior standard deviation of the fixed effects. So one common prior variance
+/// applies to fixed and random effects. `hyperparameters` gives the standard deviation of the field for this.
 ///
 /// # Errors
 /// Returns [`ModelError::Shape`] if the numbers of rows differ, or [`ModelError::NotFinite`] if a number is not finite.
@@ -87,10 +90,12 @@ fn joined(
 }
 
 impl IncrementalPosterior {
-    /// Creates a model that predicts the deviation at `places`, before any point is observed.
+    /// Creates a model that predicts the deviation at each of `places`, before any point is observed. `places` are
+    /// positions in the plane of projection, in mm.
     ///
-    /// Both matrices of effects have one row for each place. An element is the deviation at the place, in mm, for one
-    /// unit of a fixed effect or for one standard uncertainty of a random effect.
+    /// `fixed_effects` and `random_effects` have one row for each place, and one column for each effect. An element is
+    /// a deviation at the place, in mm. It belongs to one unit of a fixed effect, or to one standard uncertainty of a
+    /// random effect.
     ///
     /// # Errors
     /// Returns an error if the numbers of rows differ, if a number is not finite, or if a hyperparameter is out of
@@ -122,12 +127,13 @@ impl IncrementalPosterior {
         Ok(growing)
     }
 
-    /// Adds observed points to the model and updates the predictions at all places.
+    /// Adds the points of `observed` to the model, and updates the prediction at every place of [`Self::at_places`].
     ///
     /// # Errors
-    /// Returns an error and adds no point if the numbers of rows or columns differ or a number is not finite. Returns
-    /// [`ModelError::NotDefinite`] if the covariance of the points is not positive definite; only some of the points
-    /// are then added.
+    /// Returns an error and adds no point if a number is not finite, if the numbers of rows differ, or if the number of
+    /// effects differs from that of the model. Returns [`ModelError::NotDefinite`] if the covariance of the points is
+    /// not positive definite. In this case a part of the points can already be added, and the predictions are not
+    /// updated.
     pub fn update(&mut self, observed: &Observations) -> Result<(), ModelError> {
         let places = self.places_of(observed)?;
         let known = self.observed_places.len();
@@ -138,10 +144,12 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Adds an imagined touch at the place with the index `place`, with exactly the predicted deviation. The means of
-    /// the predictions do not change. The standard deviations become those after a real touch, because they do not
-    /// depend on the value found (hallucinated updates, Desautels, Krause and Burdick 2014). Panics if there is no such
-    /// place.
+    /// Adds an imagined touch to the model. `place` is the index of the touched place in [`Self::at_places`]. The
+    /// deviation of this touch is exactly the predicted mean.
+    ///
+    /// The predicted means do not change. The predicted standard deviations become those after a real touch, because a
+    /// standard deviation does not depend on the value that a touch finds (hallucinated updates, Desautels, Krause and
+    /// Burdick 2014). Panics if there is no place with this index.
     ///
     /// # Errors
     /// Returns [`ModelError::NotDefinite`] if the covariance of the points is no longer positive definite.
@@ -152,19 +160,21 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Returns the prediction at each place, in the order of [`Self::at_places`]: mean and standard deviation of the
-    /// sum of field and effects, without the noise of a touch.
+    /// Returns the prediction at each place, in the order of [`Self::at_places`]. A prediction has the mean and the
+    /// standard deviation, in mm, of the sum of the field and the effects. The noise of a touch is not included.
     pub fn predictions(&self) -> impl Iterator<Item = Prediction> + '_ {
         let of =
             |(mean_mm, variance): (&f64, &f64)| Prediction { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
         self.blocks.iter().flat_map(move |block| block.mean_mm.iter().zip(&block.variance_mm2).map(of))
     }
 
-    /// Returns the standardized innovation of each observed point: its deviation minus the predicted mean, divided by
-    /// the predicted standard deviation, which includes the noise of the probe. The points are not added to the model.
+    /// Returns the standardized innovation of each point of `observed`, without a unit. It is the deviation minus the
+    /// predicted mean, divided by the predicted standard deviation. This standard deviation includes the noise of the
+    /// probe. The points are not added to the model.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows or columns differ, or if a number is not finite.
+    /// Returns an error if the numbers of rows differ, if the number of effects differs from that of the model, or if a
+    /// number is not finite.
     pub fn standardized_innovations(&self, observed: &Observations) -> Result<Vec<f64>, ModelError> {
         let places = self.places_of(observed)?;
         let of = |(place, deviation_mm): (&Place, &f64)| {
@@ -194,9 +204,12 @@ impl IncrementalPosterior {
             + (FIXED_EFFECT_SIGMAS * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
-    /// Predicts the deviation that a touch at `place` will find. Returns three values: the new row L^-1 k of the
-    /// Cholesky factor L, with the covariances k of the place with all observed points; the mean in mm; and the
-    /// standard deviation in mm, which includes the noise.
+    /// Predicts the deviation that a touch at `place` will find. Returns three values:
+    ///
+    /// - L^-1 k, the off-diagonal elements of the row that `place` would add to the Cholesky factor L. L factorizes the
+    ///   covariance of the observed points, and k are the covariances of `place` with all observed points.
+    /// - The mean of the deviation, in mm.
+    /// - The standard deviation of the deviation, in mm. It includes the noise of a touch.
     fn predicted(&self, place: &Place) -> (Vec<f64>, f64, f64) {
         let mut l: Vec<f64> = Vec::with_capacity(self.observed_places.len() + 1);
         for (told, lower) in self.observed_places.iter().zip(&self.lower) {
@@ -210,8 +223,9 @@ impl IncrementalPosterior {
         (l, mean_mm, left_mm2.max(noise_mm2).sqrt())
     }
 
-    /// Adds one point to the Cholesky factor, without an update of the predictions. If `deviation_mm` is `None`, the
-    /// point gets the predicted deviation.
+    /// Adds one point to the Cholesky factor of the covariance of the observed points. The predictions at the places
+    /// are not updated; [`Self::update_places`] does this. If `deviation_mm` is `None`, the predicted mean is used as
+    /// the deviation of the point.
     ///
     /// # Errors
     /// Returns [`ModelError::NotDefinite`] if the predicted standard deviation of the point is not a finite number
@@ -228,7 +242,8 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Updates the mean and the variance at all places with the added points from the index `from` on.
+    /// Updates the predicted mean and variance at all places of [`Self::at_places`] with the observed points from the
+    /// index `from` on. Earlier points must already be included in the predictions.
     fn update_places(&mut self, from: usize) {
         let mut blocks = std::mem::take(&mut self.blocks);
         blocks.par_iter_mut().for_each(|block| {

@@ -29,8 +29,11 @@ pub(super) struct IntermediateNodes {
 }
 
 impl IntermediateNodes {
-    /// Creates nodes between the touched `places`, on a grid along the axes u and v of the basis `waves`. Only nodes
-    /// that touched places surround are kept. Returns `None` if there is no such node, or if the places lie on a line.
+    /// Creates the nodes of a regular grid that lie between the touched `places`. The positions are in the plane of
+    /// projection, in mm. The grid is parallel to the axes u and v of the basis `waves`. Only nodes that touched places
+    /// surround are kept.
+    ///
+    /// Returns `None` if no node is kept, or if the bounding rectangle of the places along u and v has no area.
     pub(super) fn new(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
         let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.anisotropy.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
@@ -59,12 +62,14 @@ impl IntermediateNodes {
         Some(Self { grid, nodes, corners, terms })
     }
 
-    /// Interpolates values from the touched places to the nodes. `columns` has one row for each touched place; the
-    /// result has one row for each node.
+    /// Interpolates values from the touched places to the nodes of the grid. `columns` has one row for each touched
+    /// place. The result has one row for each node and the same number of columns.
     ///
-    /// Polynomials are fitted first. The residuals of this fit are interpolated by weighted means of the nearby places.
-    /// Polynomials are needed because the columns can contain motions of a curved part that are thousands of times
-    /// larger than the form. For these, the error of linear interpolation alone would be too large.
+    /// Polynomials are first fitted to the columns. The residuals of this fit are interpolated by weighted means of
+    /// three nearby touched places.
+    ///
+    /// The columns can contain motions of a curved part that are thousands of times larger than the form. For such
+    /// columns, the error of an interpolation without polynomials would be too large.
     pub(super) fn interpolate(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();
@@ -79,10 +84,12 @@ impl IntermediateNodes {
     }
 }
 
-/// Returns the indices of the three touched places nearest to `at`, and their weights for an interpolation: the inverse
-/// squared distances, with the sum 1. If `at` is itself a touched place, this place has the weight 1.
+/// Returns the indices of the three touched places nearest to the position `at`, and their weights for an
+/// interpolation. The weights are the inverse squared distances, scaled to the sum 1. If `at` is itself a touched
+/// place, this place has the weight 1.
 ///
-/// `tree` is the search tree of `places`. Returns `None` if the touched places within `near_mm` do not surround `at`.
+/// `places` are the touched places in mm, and `tree` is their search tree. `near_mm` is the largest distance of a
+/// touched place that counts as near. Returns `None` if the near places do not surround `at`.
 fn surrounding_places(
     at: [f64; 2],
     places: &[[f64; 2]],

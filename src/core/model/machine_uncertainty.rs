@@ -78,10 +78,13 @@ pub(super) struct MachineEffects {
 impl MachineEffects {
     /// Creates the random effects of a measuring machine, its probe, the temperature and the fixture.
     ///
-    /// `radius_mm` is the standard uncertainty of the radius of the probe from its qualification, and `temperature` the
-    /// relative standard uncertainty of all lengths. `datum` has the standard uncertainties of the position of the part
-    /// in its fixture: three shifts along the axes of the model in mm, and three rotations about these axes through
-    /// `centre` in rad. `model_from_machine` rotates directions from the machine frame to the model frame.
+    /// - `machine` has the standard uncertainties of the machine and of its probe.
+    /// - `radius_mm` is the standard uncertainty of the probe radius from the qualification of the probe, in mm.
+    /// - `temperature` is the relative standard uncertainty of all lengths, without a unit.
+    /// - `datum` has the standard uncertainties of the position of the part in its fixture: three shifts along the axes
+    ///   of the model in mm, then three rotations about these axes in rad.
+    /// - `centre` is the point, in the model frame, through which the axes of rotation pass.
+    /// - `model_from_machine` rotates directions from the machine frame to the model frame.
     pub(super) fn new(
         machine: MachineUncertainty,
         [radius_mm, temperature]: [f64; 2],
@@ -109,7 +112,9 @@ impl MachineEffects {
         DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].2 * all[c].1.of_unit(placed[r].0, placed[r].1))
     }
 
-    /// Returns every effect with a standard uncertainty above 0: its source, the effect, and the standard uncertainty.
+    /// Returns every random effect with a standard uncertainty above 0, in a fixed order. An entry has the source of
+    /// the uncertainty, the effect, and the standard uncertainty in the unit of the effect (mm, rad, or a relative
+    /// change of length).
     fn all(&self) -> Vec<(UncertaintySource, Effect, f64)> {
         let MachineUncertainty { scale, squareness_rad, probe_mm, .. } = self.machine;
         let radius = (UncertaintySource::Radius, Effect::Radius, self.radius_mm);
@@ -146,8 +151,9 @@ enum Effect {
 }
 
 impl Effect {
-    /// Returns the deviation at a point that one unit of the effect causes. `arm` is the vector from the centre to the
-    /// point in mm, `n` the normal at the point; both are in the machine frame.
+    /// Returns the deviation at a point, in mm, that one unit of this effect causes. A unit is 1 mm, 1 rad or a
+    /// relative change of 1. `arm` is the vector from the centre of the rotations to the point, in mm. `n` is the unit
+    /// normal at the point. Both vectors are in the machine frame.
     fn of_unit(&self, arm: Vector, n: Vector) -> f64 {
         let root = 3.0_f64.sqrt();
         match *self {
@@ -165,10 +171,11 @@ impl Effect {
     }
 }
 
-/// Returns the name and the value of the first standard uncertainty that is negative, not a number, or larger than a
-/// real machine or fixture can have; `None` if all are valid.
+/// Returns the name and the value of the first invalid standard uncertainty. It is invalid if it is negative, not a
+/// number, or larger than the limit for a real machine or fixture. Returns `None` if all are valid.
 ///
-/// `radius_mm`, `temperature` and `datum` are those of [`MachineEffects::new`].
+/// `radius_mm` (probe radius, in mm), `temperature` (relative change of length) and `datum` (pose of the part in its
+/// fixture) have the meaning of the same arguments of [`MachineEffects::new`].
 pub(super) fn invalid_uncertainty(
     machine: &MachineUncertainty,
     [radius_mm, temperature]: [f64; 2],

@@ -58,8 +58,9 @@ fn read(table: &'static Table) -> &'static [[f64; 2]] {
     table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(k as f64 / STEPS as f64)).collect())
 }
 
-/// Returns the Matern correlation M(x) for nu = 2, and its derivative M'(x) = -x^2 K_1(x) / 2. x is the distance times
-/// sqrt(8 nu) / range, and K_1 a modified Bessel function of the second kind.
+/// Returns the Matern correlation M(x) for the smoothness nu = 2, and its derivative M'(x) = -x^2 K_1(x) / 2. The
+/// argument x is the distance of two places times sqrt(8 nu) / range. K_1 is the modified Bessel function of the second
+/// kind and order 1.
 fn exact(x: f64) -> [f64; 2] {
     if x == 0.0 {
         return [1.0, 0.0];
@@ -67,8 +68,9 @@ fn exact(x: f64) -> [f64; 2] {
     [0.5 * x * x * bessel(2.0, x), -0.5 * x * x * bessel(1.0, x)]
 }
 
-/// Computes K_nu(x), the modified Bessel function of the second kind, for x above 0. The trapezoidal rule is exact to
-/// rounding here, because the integrand is analytic and falls doubly exponentially.
+/// Computes K_nu(x), the modified Bessel function of the second kind and order `nu`, for `x` above 0. The integral of
+/// the function is evaluated by the trapezoidal rule. This is exact to rounding, because the integrand is analytic and
+/// falls doubly exponentially.
 fn bessel(nu: f64, x: f64) -> f64 {
     const STEP: f64 = 0.125;
     let term = |t: f64| (-x * t.cosh()).exp() * (nu * t).cosh();

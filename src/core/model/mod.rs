@@ -162,10 +162,11 @@ fn spacing_mm(places: &[[f64; 2]]) -> f64 {
 }
 
 impl Hyperparameters {
-    /// Estimates the hyperparameters from the observations: the geometric means over their posterior distribution.
+    /// Estimates the hyperparameters from the observations. Returns the geometric mean of each hyperparameter, weighted
+    /// with the posterior probability. Only fields with the most probable smoothness are averaged.
     ///
-    /// `priors` is the prior of the range and of the ratio of noise to field. With `None`, a prior from the Fisher
-    /// information is used.
+    /// `priors` is the prior of two hyperparameters: the range of the field, and the ratio of the standard deviations
+    /// of noise and field. With `None`, a prior from the Fisher information is used.
     ///
     /// # Errors
     /// Returns an error if the numbers of rows differ, if a number is not finite, if there are not more points than

@@ -44,10 +44,12 @@ const STRONGER: f64 = 2.0;
 /// of the range and of the noise ratio, except in the search of an anisotropy.
 type Maximum = ([f64; 2], f64);
 
-/// Selects the kinds of noise and field to compare: the first without noise autocorrelation, the second with the most
-/// likely one. Each has the most likely anisotropy of the field, or none if there is too little evidence for it.
+/// Selects the two kinds of noise and field to compare. The first kind has no noise autocorrelation. The second kind
+/// has the most likely noise autocorrelation. Each kind has the most likely anisotropy of the field, or none if the
+/// points give too little evidence for an anisotropy.
 ///
-/// The second is `None` if the points do not follow a path, or if they give too little evidence for an autocorrelation.
+/// The second kind is `None` if the points do not follow a path, or if they give too little evidence for an
+/// autocorrelation.
 pub(super) fn candidates(observed: &Observations) -> (NoiseKind, Option<NoiseKind>) {
     let blocks = CompositeLikelihood::new(observed);
     let plain = blocks.find_maximum(NoiseKind::PLAIN, None);
@@ -68,8 +70,8 @@ struct CompositeLikelihood {
 }
 
 impl CompositeLikelihood {
-    /// Selects the points of the composite likelihood: some points all over the part, and blocks of neighbouring
-    /// points.
+    /// Prepares the composite likelihood (a product of likelihoods of subsets of the points). Selects the subsets: one
+    /// has points all over the part, and each of the others is a block of neighbouring points.
     fn new(observed: &Observations) -> Self {
         let mut whole: Vec<Vec<usize>> = vec![(0..observed.places.len()).collect()];
         let mut done = Vec::new();
@@ -93,11 +95,14 @@ impl CompositeLikelihood {
         Self { all, distance_mm: spacing_mm(&observed.places), priors, rms_mm: (squares / n).sqrt() }
     }
 
-    /// Returns the composite log-likelihood of a kind of noise and field, plus its log prior density. The strength of
-    /// the field and of the noise are scaled together to their most probable values.
+    /// Returns the composite log-likelihood for the noise and the anisotropy of `kind`, plus the log prior density. The
+    /// composite likelihood is a product of the likelihoods of subsets of the points.
     ///
-    /// `range` is the logarithm of the range in mm, `ratio` the logarithm of the ratio of noise to field (standard
-    /// deviations). Returns minus infinity for a range that the points cannot resolve.
+    /// `range` is the logarithm of the range in mm. `ratio` is the logarithm of the standard deviation of the noise
+    /// divided by that of the field. The standard deviations of field and noise are scaled together to their most
+    /// probable values.
+    ///
+    /// Returns minus infinity if the points cannot resolve the range, or if no subset can be fitted.
     fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
         if range < (MIN_RANGE_SPACINGS * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
@@ -126,8 +131,9 @@ impl CompositeLikelihood {
         known + likelihood + 0.5 * squares - 0.5 * free - free * sigma_mm.ln()
     }
 
-    /// Finds the maximum of [`Self::log_likelihood`] over range and noise ratio, from the maximum `near`, or from the
-    /// best of several start values.
+    /// Finds the maximum of [`Self::log_likelihood`] for the noise and the anisotropy of `kind`. The two variables are
+    /// the logarithm of the range, and the logarithm of the ratio of noise to field. The search starts at the variables
+    /// of `near`. With `None`, it starts at the best of several fixed start values.
     fn find_maximum(&self, kind: NoiseKind, near: Option<Maximum>) -> Maximum {
         let start = near.unwrap_or_else(|| {
             let starts =
@@ -137,9 +143,12 @@ impl CompositeLikelihood {
         maximize(start.0, [0.3, 0.6], 0.05, |place| self.log_likelihood(kind, place))
     }
 
-    /// Finds the most likely noise autocorrelation of an isotropic field, and the maximum of the log-likelihood with
-    /// it. `plain` is the maximum without autocorrelation. Returns `None` if the gain of the log-likelihood over it is
-    /// below [`MIN_AUTOCORRELATION_EVIDENCE`].
+    /// Finds the most likely noise autocorrelation for an isotropic field. `plain` is the maximum of the log-likelihood
+    /// without autocorrelation.
+    ///
+    /// Returns the kind of noise with this autocorrelation, and the maximum of the log-likelihood for this kind.
+    /// Returns `None` if, for the start values of the search, this maximum is less than
+    /// [`MIN_AUTOCORRELATION_EVIDENCE`] above that of `plain`.
     fn most_likely_autocorrelation(&self, plain: Maximum) -> Option<(NoiseKind, Maximum)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
@@ -163,9 +172,9 @@ impl CompositeLikelihood {
         Some((of(best.0), best.1))
     }
 
-    /// Finds the most likely anisotropy of the field for the noise of `kind`. `without` is the maximum of the
-    /// log-likelihood for an isotropic field. Returns `None` if the gain over it is at most
-    /// [`MIN_ANISOTROPY_EVIDENCE`].
+    /// Finds the most likely anisotropy of the field for the noise autocorrelation of `kind`. `without` is the maximum
+    /// of the log-likelihood for an isotropic field. Returns `None` if an anisotropy raises the log-likelihood by at
+    /// most [`MIN_ANISOTROPY_EVIDENCE`].
     fn most_likely_anisotropy(&self, kind: NoiseKind, without: Maximum) -> Option<Anisotropy> {
         // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
         // logarithm of the stretch are polar coordinates of the search plane.
@@ -198,7 +207,8 @@ fn spread(observed: &Observations) -> Observations {
     Observations { random_effects: DMatrix::zeros(chosen.len(), 0), ..observed.subset(&chosen) }
 }
 
-/// Returns the observations of the points `block`, with a plane of its own as fixed effects and without random effects.
+/// Returns the observations of the points with the indices `block`. The fixed effects of the result are a plane: a
+/// constant, x and y, relative to the centroid of the block. The result has no random effects.
 fn with_plane(observed: &Observations, block: &[usize]) -> Observations {
     let some = observed.subset(block);
     let middle = [0, 1].map(|axis| some.places.iter().map(|place| place[axis]).sum::<f64>() / block.len() as f64);

@@ -50,8 +50,9 @@ pub struct PartFit {
 }
 
 impl PartPriors {
-    /// Returns the statistics of earlier parts after passes with a correction (`is_corrected`) or without one; `None`
-    /// if there is no such part yet.
+    /// Returns the statistics of the fields of earlier parts; `None` if there is no such part yet. `is_corrected`
+    /// selects the kind of pass before the measurement: true for a pass with a correction, false for a pass without
+    /// one.
     pub fn fit(&self, is_corrected: bool) -> Option<PartFit> {
         if is_corrected { self.with_correction } else { self.without_correction }
     }
@@ -63,8 +64,9 @@ impl PartPriors {
         *lesson = Some(PartFit::updated(*lesson, hyperparameters));
     }
 
-    /// Pools the statistics of other machines, as a start for a machine without own parts. Each machine counts as one
-    /// part, because the new machine can differ from the others as much as they differ from each other.
+    /// Pools the statistics of other machines, as a start for a machine that has no parts of its own yet. Each machine
+    /// in `machines` counts as one part, because a new machine can differ from the others as much as they differ from
+    /// each other. The statistics with and without a correction are pooled separately.
     #[must_use]
     pub fn pooled(machines: &[Self]) -> Self {
         let of = |is_corrected| PartFit::pooled(machines.iter().filter_map(|of| of.fit(is_corrected)));
@@ -83,8 +85,9 @@ impl PartPriors {
 }
 
 impl PartFit {
-    /// Returns the statistics `before` with a further part added; with `None`, the statistics of this part alone. From
-    /// twenty parts on, later parts gradually replace earlier ones.
+    /// Returns the statistics `before` with one more part added. `hyperparameters` are those of the added part. If
+    /// `before` is `None`, returns the statistics of the added part alone. When the statistics already have twenty
+    /// parts, each added part gradually replaces the earlier ones.
     pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
@@ -105,8 +108,8 @@ impl PartFit {
         }
     }
 
-    /// Pools the statistics of several machines, at most twenty, with each machine counted as one part. Returns `None`
-    /// if there is no machine.
+    /// Pools the statistics of several machines into one. Only the first twenty machines are used, and each counts as
+    /// one part. Returns `None` if `machines` is empty.
     fn pooled(machines: impl Iterator<Item = Self>) -> Option<Self> {
         let machines: Vec<Self> = machines.take(MAX_PARTS as usize).collect();
         let n = machines.len() as f64;
@@ -124,8 +127,9 @@ impl PartFit {
         })
     }
 
-    /// Returns the prior of the field of the next part. Its medians are those of the earlier parts. Its factors cover
-    /// the differences between parts, and are wider while there are few parts. They are at least 2.
+    /// Returns the prior of the field of the next part: a median and a factor for the range, and for the ratio of noise
+    /// to field. A factor is one standard deviation of the logarithm. The medians are those of the earlier parts. The
+    /// factors cover the differences between parts. They are larger if the statistics have few parts, and at least 2.
     pub fn prior(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {

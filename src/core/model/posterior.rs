@@ -28,14 +28,15 @@ const LOWER_BOUND_VARIANCE_FACTOR: f64 = 1.0 / 4.0;
 /// logarithm). Used for the pose and for the hyperparameters.
 const STRONGER: f64 = 3.0;
 
-/// Selects between the two kinds of noise, without and with autocorrelation, by their marginal likelihood. Returns the
-/// field hypotheses of the more likely kind.
+/// Prepares the field hypotheses for the more likely of two kinds of noise: with or without autocorrelation. The kinds
+/// are compared by their marginal likelihood from all points. If the points give too little evidence for an
+/// autocorrelation ([`candidates`]), only the kind without it is used.
 ///
-/// The likelihood of neighbouring points alone ([`candidates`]) can mistake waves across the path for autocorrelation
-/// along it. Therefore both kinds are compared by all points.
+/// The likelihood of neighbouring points alone can mistake waves across the path for autocorrelation along the path.
+/// Therefore all points are used for the comparison.
 ///
 /// # Errors
-/// Those of [`FieldHypotheses::over`].
+/// Returns the errors of [`FieldHypotheses::over`].
 pub(super) fn select_hypotheses(observed: &Observations) -> Result<FieldHypotheses, ModelError> {
     let (plain, drifting) = candidates(observed);
     let fields = FieldHypotheses::over(observed, plain)?;
@@ -93,8 +94,10 @@ impl HypothesisSet {
         }
     }
 
-    /// Returns the two factors that multiply the variance of a field of this smoothness in the samples: 1 for the
-    /// samples of the posterior itself, and a second factor for the samples that bound the extremes.
+    /// Returns the two factors that multiply the variance of a field with the given smoothness when samples are drawn.
+    /// The first factor is 1, for samples of the posterior itself. The second factor is for the samples that give
+    /// bounds of extreme values, such as the maximum of the form. It is below 1 for the set `Smooth`, and above 1 for
+    /// the others.
     fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
@@ -117,9 +120,13 @@ pub(super) struct PosteriorSamples {
 }
 
 impl<'f> Posterior<'f> {
-    /// Computes the posterior probabilities of all nodes and variance ratios from the deviations. `priors` is the prior
-    /// of range and noise ratio; with `None`, that of the nodes is used. `probe` is the prior of the noise of the
-    /// probe.
+    /// Computes the posterior probability of every node (one smoothness with one range) at every variance ratio of
+    /// field to noise.
+    ///
+    /// - `fields` has the nodes, and `observed` has the deviations. Both must have the same points.
+    /// - `priors` is the prior of the range and of the ratio of noise to field. With `None`, the prior that is stored
+    ///   with each node is used.
+    /// - `probe` is the prior of the noise of the probe; `None` if nothing is known about it.
     pub(super) fn new(
         fields: &'f FieldHypotheses,
         observed: &'f Observations,
@@ -180,8 +187,8 @@ impl<'f> Posterior<'f> {
         sum(&mut self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
     }
 
-    /// Returns the likelihood of the standard deviation of the noise, given the node with the index `node` and the
-    /// variance ratio `tau` of field to noise.
+    /// Returns the likelihood as a function of the standard deviation of the noise. The field is given by the node
+    /// (smoothness with range) with the index `node`, and by the variance ratio `tau` of field to noise.
     fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
         let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
             (&self.fields.hypotheses[node], &self.projected[node]);
@@ -201,15 +208,16 @@ impl<'f> Posterior<'f> {
         NoiseLikelihood::new(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
-    /// Finds the most probable hypothesis. Returns the index of its node and its variance ratio; `None` if there is no
-    /// node.
+    /// Finds the most probable hypothesis. Returns the index of its node (smoothness with range), and its variance
+    /// ratio of field to noise. Returns `None` if there are no nodes.
     fn most_probable(&self) -> Option<(usize, f64)> {
         let all = self.probabilities(HypothesisSet::All);
         all.into_iter().max_by(|a, b| a.2.total_cmp(&b.2)).map(|(node, tau, _)| (node, tau))
     }
 
-    /// Finds the most probable hypothesis. Returns its node, its variance ratio, and the most probable standard
-    /// deviation of the noise for them, in mm; `None` if there is no node.
+    /// Finds the most probable hypothesis. Returns its node (smoothness with range), its variance ratio of field to
+    /// noise, and the most probable standard deviation of the noise in mm for this node and ratio. Returns `None` if
+    /// there are no nodes.
     pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
         let (number, tau) = self.most_probable()?;
         Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
@@ -231,8 +239,10 @@ impl<'f> Posterior<'f> {
         (self.squares / self.observed.places.len() as f64).max(0.0).sqrt()
     }
 
-    /// Returns the posterior probabilities of the hypotheses in the set `which`, normalised to the sum 1: for each, the
-    /// index of the node, the variance ratio, and the probability. Negligible ones are left out.
+    /// Returns the posterior probabilities of the hypotheses in the set `which`. A hypothesis is a node (smoothness
+    /// with range) at one variance ratio of field to noise. An entry has the index of the node, the variance ratio, and
+    /// the probability. The probabilities have the sum 1. Hypotheses with at most 1e-7 of the largest probability are
+    /// left out.
     fn probabilities(&self, which: HypothesisSet) -> Vec<(usize, f64, f64)> {
         let chosen =
             || self.densities.iter().enumerate().filter(|of| which.contains(self.fields.hypotheses[of.0].smoothness));
@@ -245,8 +255,9 @@ impl<'f> Posterior<'f> {
         some.into_iter().map(|(node, tau, weight)| (node, tau, weight / whole)).collect()
     }
 
-    /// Returns the hyperparameters of the hypothesis with the node `node` and the variance ratio `tau`, with the most
-    /// probable noise for it.
+    /// Returns the hyperparameters of one hypothesis: the node (smoothness with range) with the index `node`, at the
+    /// variance ratio `tau` of field to noise. The noise is set to its most probable standard deviation for this
+    /// hypothesis.
     fn hyperparameters(&self, node: usize, tau: f64) -> Hyperparameters {
         let FieldHypothesis { smoothness, range_mm, scale, .. } = &self.fields.hypotheses[node];
         // If every deviation is zero, the noise is zero too: a positive minimum keeps the hyperparameters valid.
@@ -260,19 +271,22 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// Returns a weight for a field with these hyperparameters: 1 if its standard deviation is at most the RMS of the
-    /// residuals, and the less, the more it exceeds the RMS. The points would show almost nothing of a field that is
-    /// much stronger.
+    /// Returns a weight, from 0 to 1, for a field with the given hyperparameters. The weight is 1 if the standard
+    /// deviation of the field is at most the RMS of the residuals. Above this RMS, the weight falls with the standard
+    /// deviation. A field that is much stronger than the residuals is improbable, because the points would show almost
+    /// nothing of this field.
     fn strength_weight(&self, hyperparameters: &Hyperparameters) -> f64 {
         let beyond =
             (hyperparameters.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         (-0.5 * beyond * beyond).exp()
     }
 
-    /// Returns hyperparameters with their relative probabilities: one entry for each node, at its most probable
-    /// variance ratio. The most probable entry comes first and has the weight 1.
+    /// Returns the hyperparameters of each node (smoothness with range) at its most probable variance ratio, with a
+    /// relative weight. The weight is the posterior probability of the node, lowered for fields that are much stronger
+    /// than the residuals. The entry with the largest weight comes first and has the weight 1. The others follow in
+    /// descending order.
     ///
-    /// Only nodes are included for whose smoothness `is_of` returns true.
+    /// Only nodes for whose smoothness `is_of` returns true are included.
     pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
             let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
@@ -290,10 +304,12 @@ impl<'f> Posterior<'f> {
         all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
     }
 
-    /// Returns single values of the hyperparameters: the geometric means over the nodes, weighted with their
-    /// probabilities. Only nodes with the smoothness of the most probable node are included.
+    /// Returns one value for each hyperparameter: the weighted geometric mean over the nodes (smoothness with range).
+    /// The weights are those of [`Self::weighted_hyperparameters`]. Only nodes with the smoothness of the most probable
+    /// node are averaged.
     ///
-    /// Rough fields are left out, because their variance cannot be separated from the noise.
+    /// Rough fields are not used, because their variance cannot be separated from the noise. If there is no smooth
+    /// field, the standard deviations of field and noise are both the RMS of the residuals, and the range is 1 mm.
     pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
         let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Exponential);
         let Some((first, _)) = likely.first().copied() else {
@@ -314,8 +330,9 @@ impl<'f> Posterior<'f> {
         Hyperparameters { field, noise_sigma_mm: mean(|of| of.noise_sigma_mm), ..first }
     }
 
-    /// Draws `count` samples from the posterior, with fields of the set `which`: coefficients of the basis functions,
-    /// noise, and random effects. The same `seed` gives the same samples. If the set has no field, the result is empty.
+    /// Draws `count` samples from the posterior. Only fields in the set `which` are used. A sample has the coefficients
+    /// of the basis functions, the standard deviation of the noise, and the random effects. The same `seed` gives the
+    /// same samples. The result is empty if the set has no field.
     pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
         let probabilities = self.probabilities(which);
         // Equal steps through the cumulative probability: the count of each field is within one of its expected value.
@@ -359,11 +376,12 @@ impl<'f> Posterior<'f> {
         draws
     }
 
-    /// Draws samples from the posterior for the node with the index `number`. `chosen` has an entry for each sample:
-    /// the node, the variance ratio, and the number of the sample, which selects its stream of random numbers.
+    /// Draws posterior samples for one node (smoothness with range). `number` is the index of this node. `chosen` has
+    /// one entry for each sample: the node, the variance ratio of field to noise, and the number of the sample. The
+    /// number of the sample and `seed` select the sequence of random numbers. `which` selects the two variance factors.
     ///
-    /// A sample z0 of the prior is drawn first. It is then corrected so that its projections on the eigenvectors of the
-    /// node have values drawn from the posterior (Matheron's rule). `which` selects the variance factors.
+    /// First a sample z0 of the prior is drawn. Then z0 is corrected so that its projections on the eigenvectors of the
+    /// node get values drawn from the posterior (Matheron's rule).
     fn samples_of(
         &self,
         number: usize,
@@ -420,8 +438,9 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// Returns the posterior mean for the most probable hypothesis: the coefficients of the basis functions, and the
-    /// random effects in units of their standard uncertainties. All are 0 if there is no hypothesis.
+    /// Returns the posterior mean for the most probable hypothesis. The first result has the coefficients of the basis
+    /// functions. The second result has the random effects in units of their standard uncertainties. All values are 0
+    /// if there is no hypothesis.
     pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
         let mut waves = vec![0.0; self.fields.basis.len()];
         let Some((number, tau)) = self.most_probable() else {
@@ -442,12 +461,13 @@ impl<'f> Posterior<'f> {
         (waves, stated)
     }
 
-    /// Averages two quantities over all hypotheses: the covariance of the given weighted sums of the field, and the
-    /// variance of the noise, both in mm^2. `sums` has one row for each sum, one column for each basis function
-    /// ([`FieldHypotheses::sums`]).
+    /// Returns two posterior averages over all hypotheses, both in mm^2: the covariance matrix of weighted sums of the
+    /// field, and the variance of the noise. `sums` comes from [`FieldHypotheses::sums`] and has one row for each sum,
+    /// one column for each basis function.
     ///
-    /// The covariance is that of the cosines alone, without the polynomials. The variance of the noise includes the
-    /// waves shorter than the basis functions. A field that is stronger than the residuals has less weight.
+    /// The covariance includes only the cosines of the basis, not its polynomials. The variance of the noise includes
+    /// the waves shorter than the basis functions. A field that is stronger than the residuals has less weight. Without
+    /// any hypothesis, the covariance is 0 and the variance is the mean square of the residuals.
     pub(super) fn mean_covariance(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
@@ -493,8 +513,14 @@ struct NoiseLikelihood {
 }
 
 impl NoiseLikelihood {
-    /// Prepares the likelihood. `products` are the products a'K0^-1 b of all pairs of the deviations and the random
-    /// effects, in this order; `logs` is the logarithm of the determinant of K0, and `free` the degrees of freedom.
+    /// Prepares the likelihood of the standard deviation of the noise. K0 is the covariance of field and noise for
+    /// noise of variance 1, without the random effects.
+    ///
+    /// - `products` has the products a'K0^-1 b for all pairs a, b of columns. The first column is the deviations, the
+    ///   others are the random effects.
+    /// - `logs` is the logarithm of the determinant of K0.
+    /// - `free` is the number of degrees of freedom: points minus fixed effects.
+    /// - `probe` is the prior of the noise of the probe; `None` if nothing is known about it.
     fn new(products: &DMatrix<f64>, logs: f64, free: f64, probe: NoisePrior) -> Self {
         let stated = products.nrows() - 1;
         let (by_stated, axes) = if stated == 0 {
@@ -515,8 +541,8 @@ impl NoiseLikelihood {
         }
     }
 
-    /// Returns the logarithm of the density of ln s at ln s = `log_mm`, up to a constant. s is the standard deviation
-    /// of the noise in mm; the prior of the noise of the probe is included.
+    /// Returns the logarithm of the posterior density of ln s at the value `log_mm`, up to a constant. Here s is the
+    /// standard deviation of the noise in mm. The prior of the noise of the probe is included if there is one.
     fn density(&self, log_mm: f64) -> f64 {
         let s2 = (2.0 * log_mm).exp();
         let mut value = 2.0 * self.degrees_of_freedom * log_mm + self.logs;
@@ -531,8 +557,9 @@ impl NoiseLikelihood {
         -0.5 * (value + below * below)
     }
 
-    /// Evaluates the density of ln s on a grid that covers all of the distribution. Returns the first ln s, the step,
-    /// and the logarithm of the density at each step. s is the standard deviation of the noise in mm.
+    /// Evaluates the posterior density of ln s on a grid of equal steps that covers practically the whole distribution.
+    /// Here s is the standard deviation of the noise in mm. Returns the first value of ln s, the step of ln s, and the
+    /// logarithm of the density at each grid point.
     fn steps(&self) -> (f64, f64, Vec<f64>) {
         const COARSE: usize = 24;
         const FINE: usize = 41;

@@ -17,8 +17,9 @@ const UNKNOWN_PART_FACTORS: [f64; 2] = [6.0, 20.0];
 const DISSIMILAR_SHARE: f64 = 0.2;
 
 impl Prior {
-    /// Returns a wide prior for a part of which only the size is known: the median of the range is a third of
-    /// `size_mm`, that of the noise is a twentieth of the field.
+    /// Returns a wide prior for a part of which only the size is known. `size_mm` is the size of the part in mm. The
+    /// median of the range is a third of `size_mm`. The median of the ratio of noise to field (standard deviations) is
+    /// 0.05.
     pub fn for_size(size_mm: f64) -> Self {
         Self { range_mm: [size_mm / 3.0, UNKNOWN_PART_FACTORS[0]], noise_ratio: [0.05, UNKNOWN_PART_FACTORS[1]] }
     }
@@ -36,12 +37,12 @@ impl Prior {
         Ok(())
     }
 
-    /// Returns the logarithm of the prior density, up to a constant. `range_mm` is the range of the field, `ratio` the
-    /// ratio of noise to field.
+    /// Returns the logarithm of the prior density, up to a constant. `range_mm` is the range of the field in mm.
+    /// `ratio` is the standard deviation of the noise divided by that of the field.
     ///
-    /// The density is a mixture of this prior and of a wide one with a small weight, for parts that resemble no earlier
-    /// part (robust prior, Schmidli and others 2014). Beyond one factor from the median, both fall only exponentially
-    /// in the logarithm (Huber 1964).
+    /// The density is a mixture of two priors: this prior, and a wider prior with a small weight. The wider prior is
+    /// for parts that resemble no earlier part (robust prior, Schmidli and others 2014). Each prior falls like a normal
+    /// density of the logarithm up to one factor from the median, and only exponentially beyond (Huber 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, median: f64, factor: f64| {
             let off = ((value / median).ln() / factor.ln()).abs();

@@ -75,10 +75,11 @@ const STEP: f64 = 0.1;
 const MIN_DEGREES_OF_FREEDOM: f64 = 2.0;
 
 impl Sessions {
-    /// Joins observed points with sessions. `of` has the session number of each point.
+    /// Combines observed points with their sessions. A session is everything that is measured in one setup. `of` has
+    /// the session number of each point, in the order of the points.
     ///
     /// # Errors
-    /// Returns an error if the numbers of rows or of session numbers differ from the number of points, if there are not
+    /// Returns an error if the number of rows or of session numbers differs from the number of points, if there are not
     /// more points than fixed effects, or if a number is not finite.
     pub fn new(observed: Observations, of: Vec<u32>) -> Result<Self, ModelError> {
         observed.check()?;
@@ -88,12 +89,15 @@ impl Sessions {
         Ok(Self { observed, session_numbers: of })
     }
 
-    /// Joins the inliers ([`PointStatus::Inlier`]) of several registrations. Each registration comes with the session
-    /// number of every measured point, outliers included. The motions that a registration was free to make become fixed
-    /// effects of its points alone.
+    /// Combines the inliers ([`PointStatus::Inlier`]) of several registrations, and the session (setup) of each inlier.
+    /// Each element of `registrations` has a registration and the session numbers of all its measured points, outliers
+    /// included.
+    ///
+    /// The fixed effects are the free motions of each registration. They act only on the points of this registration.
     ///
     /// # Errors
-    /// Those of [`Sessions::new`]; also if a registration has no inlier.
+    /// Returns the errors of [`Sessions::new`]. Also returns an error if a registration has no inlier, or if its number
+    /// of session numbers differs from its number of points.
     pub fn from_registrations(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
         let (mut parts, mut of) = (Vec::new(), Vec::new());
         for (registration, sessions) in registrations {
@@ -118,12 +122,13 @@ impl Sessions {
         &self.observed.deviations_mm
     }
 
-    /// Estimates two fields and the noise by restricted likelihood: the field that all sessions have in common, and the
-    /// additional field of each single session. `priors` is the prior of the common field.
+    /// Estimates two fields and the noise by restricted likelihood. The first field is common to all sessions (setups).
+    /// The second is the additional field of each single session. `priors` is the prior of the common field. If there
+    /// are more than 300 points, 300 of them are used.
     ///
     /// # Errors
-    /// Returns an error if there are fewer than two sessions or the prior is invalid; otherwise those of
-    /// [`DensePosterior::fit`].
+    /// Returns an error if there are fewer than two sessions or if the prior is invalid. Otherwise returns the errors
+    /// of [`DensePosterior::fit`].
     pub fn between_session_variance(&self, priors: &Prior) -> Result<BetweenSessionVariance, ModelError> {
         priors.check()?;
         let mut numbers = self.session_numbers.clone();
@@ -152,9 +157,12 @@ impl Sessions {
         })
     }
 
-    /// Searches the most probable hyperparameters. It starts from the best of several start values, and varies in turns
-    /// those of the common field and those of the field of a session. Returns the two pairs of arguments of
-    /// [`Self::scaled`] at the maximum, and the log density there.
+    /// Searches the most probable hyperparameters. The search starts at the best of several start values. It alternates
+    /// between the hyperparameters of the common field with the noise, and those of the field of a session. `priors` is
+    /// the prior of the common field.
+    ///
+    /// Returns the maximum as the two pairs of logarithms that [`Self::scaled`] takes, and the logarithm of the
+    /// posterior density at the maximum.
     fn search_maximum(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
@@ -180,12 +188,18 @@ impl Sessions {
         best
     }
 
-    /// Returns the hyperparameters of the common field, the field of a session, and the logarithm of their posterior
-    /// density. The strengths of both fields and of the noise are scaled together to their most probable values.
+    /// Returns three values for the given hyperparameters: the hyperparameters of the common field with the noise, the
+    /// field of a session, and the logarithm of the posterior density. The standard deviations of both fields and of
+    /// the noise are multiplied by one common factor, so that the density is largest.
     ///
-    /// All arguments are logarithms. `range` is the range of the common field and `ratio` the noise; `share` is the
-    /// strength and `own_range` the range of the field of a session. Ranges are in mm; `ratio` and `share` are relative
-    /// to the strength of the common field.
+    /// The first four arguments are natural logarithms:
+    ///
+    /// - `range`: range of the common field, in mm.
+    /// - `ratio`: standard deviation of the noise divided by that of the common field.
+    /// - `share`: standard deviation of the field of a session divided by that of the common field.
+    /// - `own_range`: range of the field of a session, in mm.
+    ///
+    /// `priors` is the prior of the common field. Returns an error if the model cannot be fitted.
     fn scaled(
         &self,
         [[range, ratio], [share, own_range]]: [[f64; 2]; 2],
@@ -213,7 +227,9 @@ impl Sessions {
         ))
     }
 
-    /// Fits the model with the field `own` as an additional covariance between points of the same session.
+    /// Fits the model to all points, with an additional field `own` for each session (setup). Two points of the same
+    /// session have the additional covariance of `own`. Points of different sessions have none. `hyperparameters` are
+    /// those of the common field and of the noise.
     fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
         let own = own.pair_covariance();
@@ -236,8 +252,9 @@ impl Sessions {
     }
 }
 
-/// Joins the observations of several registrations, one after another. The fixed effects of each registration become
-/// separate columns, with 0 at the points of the others. Random effects and paths are left out.
+/// Appends the observations of several registrations to each other. The fixed effects of each registration become
+/// separate columns. In these columns, the points of all other registrations have the value 0. The result has no random
+/// effects and no path.
 fn joined(parts: &[Observations]) -> Observations {
     let rows = parts.iter().map(|part| part.places.len()).sum();
     let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.fixed_effects.ncols()).sum());
@@ -252,15 +269,17 @@ fn joined(parts: &[Observations]) -> Observations {
 }
 
 impl BetweenSessionVariance {
-    /// Predicts the deviations that the sessions of `unseen` will find at their places, from the points `known`. Only
-    /// the places, the fixed effects and the grouping into sessions of `unseen` are used, not its deviations. Each of
-    /// its sessions counts as new, even if it has the number of a known session.
+    /// Predicts the deviations that new sessions (setups) will find, from the points `known`. Returns one prediction
+    /// for each point of `unseen`, in the order of the points.
     ///
-    /// The predictions are those after the best fit of `unseen` itself. The cost is cubic in the number of points. If
-    /// there are more than 1,500 known points, 1,500 of them are used.
+    /// Only the places, the fixed effects and the sessions of `unseen` are used, not its deviations. Every session of
+    /// `unseen` counts as new, even if its number also occurs in `known`. The prediction is for the deviations after
+    /// the best fit by the fixed effects of `unseen`.
+    ///
+    /// If there are more than 1,500 known points, 1,500 of them are used. The cost is cubic in the number of points.
     ///
     /// # Errors
-    /// Those of [`DensePosterior::fit`].
+    /// Returns the errors of [`DensePosterior::fit`].
     pub fn predict(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<PredictionInterval>, ModelError> {
         let model = known.thinned(MAX_KNOWN_POINTS).fit(self.hyperparameters, self.session_field)?;
         let Observations { places, fixed_effects: effects, .. } = &unseen.observed;
@@ -326,21 +345,22 @@ impl BestFitBasis {
         Self { q: orthonormal_base(effects.clone()) }
     }
 
-    /// Subtracts from `values`, one for each point, their least-squares best fit by the effects.
+    /// Returns `values` minus their least-squares fit by the effects. `values` has one value for each point.
     fn after_best_fit(&self, values: &[f64]) -> Vec<f64> {
         let taken = self.q.tr_mul(&nalgebra::DVector::from_column_slice(values));
         let fitted = &self.q * taken;
         values.iter().zip(fitted.iter()).map(|(value, fitted)| value - fitted).collect()
     }
 
-    /// Returns the share of the variance at the point with the index `point` that remains after the best fit, for
-    /// independent noise: 1 minus its leverage.
+    /// Returns the share (0 to 1) of the variance of independent noise that remains at one point after the best fit by
+    /// the effects. `point` is the index of the point. The share is 1 minus the leverage of the point.
     fn remaining_share(&self, point: usize) -> f64 {
         1.0 - self.q.row(point).norm_squared()
     }
 
-    /// Returns the variance of each point after the best fit, for values with the given covariance: the diagonal of P V
-    /// P. V is `covariance` and P the projection that removes the effects.
+    /// Returns the variance of the value at each point after the best fit by the effects. `covariance` is the
+    /// covariance matrix V of the values before the fit. The result is the diagonal of P V P, where P is the projection
+    /// that removes the effects.
     fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
         let (n, p) = self.q.shape();
         let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);

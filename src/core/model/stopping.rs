@@ -126,14 +126,17 @@ pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     chosen
 }
 
-/// Decides whether the touches so far are enough. Returns the form estimated from them, the reason of the decision, and
-/// the targets to touch next; these are empty if the measurement ends.
+/// Decides whether the touches so far are enough. Returns the estimated form, the reason of the decision, and the
+/// indices of the targets to touch next. There is no next target if the measurement ends.
 ///
-/// `registration` has the deviations of the touches, `so_far` assigns them to the targets. `purpose` has the limits of
-/// the figures and the accuracy that a correction needs. `seed` selects the random targets among the next ones.
+/// - `registration` has the deviation of each touch.
+/// - `so_far` has all targets, and the target that belongs to each touch.
+/// - `purpose` has the limits of the figures (PV, PV 99.8 %, RMS) and the accuracy that a correction needs.
+/// - `seed` selects the random targets among the next targets.
 ///
 /// # Errors
-/// Those of [`Form::estimate_at`]; also if the covariance of the touches is not positive definite.
+/// Returns the errors of [`Form::estimate_at`]. Also returns an error if the covariance of the touches is not positive
+/// definite.
 pub fn decide(
     registration: &Registration,
     inputs: &ModelInputs,
@@ -181,8 +184,9 @@ pub fn decide(
     Ok(StoppingDecision { form, next, reason: why })
 }
 
-/// Returns the reason to end or to continue that follows from the figures of the form, their limits in `purpose`, and
-/// the uncertainty of the form. `count` is the number of touches so far, `pattern` the number of all targets.
+/// Returns the reason to end or to continue the measurement. The reason follows from the figures of the form (PV, PV
+/// 99.8 %, RMS), from their limits in `purpose`, and from the uncertainty of the form. `count` is the number of touches
+/// so far. `pattern` is the number of all targets, touched or not.
 fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
@@ -217,13 +221,16 @@ struct ExpectedTouches {
 }
 
 impl ExpectedTouches {
-    /// Builds the posterior of the touches so far, with the hyperparameters of `form`. The touches of the last batch
-    /// are compared with the prediction from all earlier batches (standardized innovations), and then added to the
-    /// posterior too.
+    /// Builds the posterior of all touches so far, with the hyperparameters of `form`. First all batches before the
+    /// last batch are added. The touches of the last batch are compared with the prediction from these earlier batches
+    /// (standardized innovations). Then the last batch is added too.
+    ///
+    /// `registration` has the deviation of each touch, `inputs` has the known uncertainties, and `so_far` assigns the
+    /// touches to the targets.
     ///
     /// # Errors
-    /// Returns an error if a stated uncertainty in `inputs` is invalid, if a number is not finite, or if the covariance
-    /// of the touches is not positive definite.
+    /// Returns an error if an uncertainty in `inputs` is invalid, if a number is not finite, or if the covariance of
+    /// the touches is not positive definite.
     fn new(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -259,8 +266,10 @@ impl ExpectedTouches {
         Ok(Self { posterior: growing, last_innovations: of_targets.into_iter().zip(off).collect(), outliers })
     }
 
-    /// Returns true if the innovations of the last batch are larger than chance explains: their mean square exceeds the
-    /// 99.9 % quantile of chi-squared, divided by its degrees of freedom. Outliers are left out.
+    /// Returns true if the innovations of the last batch (deviations minus predictions, standardized) are larger than
+    /// chance explains. The test: their mean square exceeds the 99.9 % quantile of chi-squared divided by its degrees
+    /// of freedom. Innovations of at least [`OUTLIER_SIGMAS`] standard deviations are not counted. Returns false if no
+    /// innovation is left.
     fn has_large_innovations(&self) -> bool {
         let squares: Vec<f64> =
             self.last_innovations.iter().filter(|(_, z)| z.abs() < OUTLIER_SIGMAS).map(|(_, z)| z * z).collect();
@@ -270,15 +279,17 @@ impl ExpectedTouches {
         n > 0.0 && squares.iter().sum::<f64>() / n > (1.0 - ninth + INNOVATION_QUANTILE * ninth.sqrt()).powi(3)
     }
 
-    /// Returns the targets with outliers: first those of large innovations in the last batch, then those that the
-    /// registration found.
+    /// Returns the indices of the targets whose touches are outliers. First come the touches of the last batch with an
+    /// innovation of at least [`OUTLIER_SIGMAS`] standard deviations. Then come the outliers of the registration. A
+    /// target can occur twice.
     fn all_outliers(&self) -> impl Iterator<Item = usize> + '_ {
         let off = self.last_innovations.iter().filter(|(_, z)| z.abs() >= OUTLIER_SIGMAS).map(|(target, _)| *target);
         off.chain(self.outliers.iter().copied())
     }
 
-    /// Returns the untried neighbours of outliers, without duplicates. Outliers with at least [`MIN_TRIED_NEIGHBOURS`]
-    /// tried neighbours are skipped.
+    /// Returns the indices of the untried targets next to outliers, in ascending order and without duplicates. An
+    /// outlier is skipped if at least [`MIN_TRIED_NEIGHBOURS`] of its nearest targets were tried. `so_far` has the
+    /// targets and says which of them were tried.
     fn untried_neighbours(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.all_outliers() {
@@ -292,19 +303,21 @@ impl ExpectedTouches {
         around
     }
 
-    /// Returns true if two neighbouring targets are both outliers of the registration. This indicates a narrow feature
-    /// of the part; a particle of dust causes only one outlier.
+    /// Returns true if two neighbouring targets are both outliers of the registration. Two such outliers indicate a
+    /// narrow feature of the part. A particle of dust causes only one outlier. `so_far` has the positions of the
+    /// targets.
     fn has_feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
-    /// Chooses the targets to touch next. Returns the indices of `wanted` targets that are not tried yet: more if
-    /// `around` has more, and fewer if no more are left.
+    /// Chooses the targets to touch next, and returns their indices. Only targets that were not tried yet are chosen.
+    /// The number of chosen targets is `wanted`. It is larger if `around` alone has more untried targets, and smaller
+    /// if fewer untried targets exist.
     ///
-    /// First come the targets `around` (neighbours of outliers), then random targets with `seed`, then those with the
-    /// largest posterior variance, weighted as in [`Self::max_variance_target`]. For the variance, every target chosen
-    /// before counts as touched.
+    /// The targets are chosen in three steps. First come the targets `around`, the neighbours of outliers. Then come
+    /// random targets, which `seed` selects. Last come the targets with the largest weighted posterior variance
+    /// ([`Self::max_variance_target`]). For this variance, every target that is already chosen counts as touched.
     ///
     /// # Errors
     /// Returns [`ModelError::NotDefinite`] if the covariance of the touches is not positive definite.
@@ -339,9 +352,10 @@ impl ExpectedTouches {
         Ok(chosen)
     }
 
-    /// Returns the index of the target with the largest posterior variance times a weight. Only targets that are true
-    /// in `open` count; `None` if there is none. The weight is 2 where the maximum or the minimum of the form can lie,
-    /// otherwise 1.
+    /// Returns the index of the target with the largest product of posterior variance and weight. The weight is 2 if
+    /// the maximum or the minimum of the form can lie at the target, within two standard deviations; otherwise 1.
+    /// `open` has one value for each target: true if the target may be chosen. Returns `None` if no target may be
+    /// chosen.
     fn max_variance_target(&self, open: &[bool]) -> Option<usize> {
         let known: Vec<Prediction> = self.posterior.predictions().collect();
         let surely =
@@ -358,8 +372,8 @@ impl ExpectedTouches {
     }
 }
 
-/// Returns the indices of the [`NEIGHBOURS`] targets nearest to the target with the index `of`, in any order, without
-/// this target itself; of all others if there are fewer.
+/// Returns the indices of the [`NEIGHBOURS`] targets that are nearest to the target with the index `of`. This target
+/// itself is not included. The order is arbitrary. If there are fewer other targets, all of them are returned.
 fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     let apart = |k: usize| (targets[k].0 - targets[of].0).norm_squared();
     let mut others: Vec<usize> = (0..targets.len()).filter(|&k| k != of).collect();

@@ -47,8 +47,8 @@ impl Correspondence {
         }
     }
 
-    /// Returns true if the projection of the point is beyond the edge of the nominal surface. The surface is unknown
-    /// there, however near the point is.
+    /// Returns true if the projection of the point lies beyond the edge of the nominal surface by more than rounding.
+    /// Such a point cannot be compared with the surface, even if it is near the edge.
     pub(crate) fn is_off_part(&self) -> bool {
         self.beyond_steps > EDGE_TOLERANCE_STEPS
     }
@@ -57,12 +57,15 @@ impl Correspondence {
         Self { facet: FacetIndex::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
 }
 
-/// Projects all `measured` points under the pose `cmm_from_model`, and returns the normal equations of the next
-/// least-squares step of the pose, see [`Sums`].
+/// Projects all `measured` points onto the surface under the pose `cmm_from_model`. Returns the normal equations of the
+/// next least-squares step of the pose (see [`Sums`]).
 ///
-/// Updates the facet, the distance and the edge distance of each entry of `correspondences`. Only points with `in_fit`
-/// enter the sums. Threads share the points in chunks, and the sums of the chunks are added in order. So the result
-/// depends neither on the number of threads nor on the vector instructions of the machine.
+/// Updates the facet, the distance and the distance beyond the edge in each entry of `correspondences`, which has one
+/// entry for each point. Only points whose entry has `in_fit` set contribute to the normal equations. `residual`
+/// converts a distance to a weight, and `scaling` defines the coordinates of the step.
+///
+/// Several threads process the points in chunks. The results of the chunks are added in order. So the result depends
+/// neither on the number of threads nor on the vector instructions of the processor.
 pub(crate) fn correspond(
     surface: &OffsetSurface,
     residual: &ResidualModel,
@@ -92,7 +95,8 @@ impl pulp::NullaryFnOnce for Chunk<'_> {
     type Output = Sums;
 
     // Inlined into the caller that uses the vector instructions: a called function would be compiled without them.
-    /// Projects the points of the chunk and returns their sums for the normal equations.
+    /// Projects the points of this chunk onto the surface, and returns their contribution to the normal equations of
+    /// the pose.
     #[inline(always)]
     fn call(self) -> Sums {
         self.projection_pass.sum_chunk(self.points, self.correspondences)
@@ -108,9 +112,9 @@ struct ProjectionPass<'a> {
 }
 
 impl ProjectionPass<'_> {
-    /// Projects one chunk of points, updates `correspondences`, and returns the sums of the chunk for the normal
-    /// equations. Projects four points together if they stay on their facets or move to new facets together, and single
-    /// points otherwise.
+    /// Projects one chunk of `points` onto the surface, updates their `correspondences`, and returns the contribution
+    /// of the chunk to the normal equations of the pose. Four points are projected together if the surface supports
+    /// this. If one of the four is beyond the edge or too far from its start facet, they are projected one by one.
     #[inline(always)]
     fn sum_chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
@@ -150,9 +154,9 @@ impl ProjectionPass<'_> {
         sums
     }
 
-    /// Returns a start facet for each of four points: the facet of its last projection. If one of these is unknown,
-    /// extrapolates from `recent`, the facets of the eight points before. Returns `None` if
-    /// [`OffsetSurface::extrapolate_x4`] gives no extrapolation.
+    /// Returns the facets at which the projection of four points starts: the facets of their last projections. If one
+    /// of these facets is unknown, all four are extrapolated from `recent`, the facets of the eight points before.
+    /// Returns `None` if this extrapolation is not possible ([`OffsetSurface::extrapolate_x4`]).
     #[inline(always)]
     fn start(
         &self,
@@ -167,8 +171,11 @@ impl ProjectionPass<'_> {
         self.surface.extrapolate_x4(&recent[0], &recent[1])
     }
 
-    /// Projects four points together, each from its start facet in `places`, and adds the points in the fit to `sums`.
-    /// Returns false and changes nothing if one of the points is beyond the edge or too far from its start facet.
+    /// Projects four points together onto the surface. Each search starts at the facet of the point in `places`.
+    /// Updates the four `correspondences`, and adds the points that are in the fit to `sums`.
+    ///
+    /// Returns true if all four were projected. Returns false and changes nothing if one of the points is beyond the
+    /// edge or too far from its start facet.
     #[inline(always)]
     fn project_x4(
         &self,
@@ -194,8 +201,9 @@ impl ProjectionPass<'_> {
         true
     }
 
-    /// Projects one point, updates its `correspondence`, and adds it to `sums` if it is in the fit. The search starts
-    /// at the facet of its last projection, or at the facet `last` if that is unknown. Sets `last` to the facet found.
+    /// Projects one point onto the surface, and updates its `correspondence`. Adds the point to `sums` if it is in the
+    /// fit. The search starts at the facet of the last projection of this point. If this facet is unknown, the search
+    /// starts at the facet `last`. At the end `last` is set to the facet of the new projection.
     #[inline]
     fn project_one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut FacetIndex, sums: &mut Sums) {
         let p = self.model_from_cmm.transform_point(point); // g^-1 Y
@@ -213,9 +221,11 @@ impl ProjectionPass<'_> {
     }
 }
 
-/// Returns the distance of `foot`, the projection of the point `p`, beyond the edge of the surface; 0 on the part. The
-/// unit is the step of the nominal sampling. If the contact point of `p` lies outside the outline, returns at least 1,
-/// because the outline can end the part before the nominal points end.
+/// Returns the distance of a projection beyond the edge of the surface, in steps of the nominal sampling; 0 on the
+/// part. `foot` is the projection of the point `p` onto the surface.
+///
+/// If the contact point of `p` lies outside the outline of the part, returns at least 1. The reason: the nominal points
+/// can extend beyond the outline.
 pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProjection) -> f32 {
     let is_outside = surface.nominal().outline().is_some_and(|outline| {
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
@@ -225,7 +235,7 @@ pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProje
     if is_outside { steps.max(1.0) } else { steps }
 }
 
-/// Returns the four points `w`, one per lane, transformed by a pose.
+/// Applies a pose to the four points `w`. Each of the four lanes (elements of a vector register) holds one point.
 #[inline(always)]
 fn transform_x4(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     let (r, t) = (&pose.rotation, &pose.translation_mm);
@@ -252,16 +262,18 @@ pub(crate) trait ProjectionReporter: Sync {
     /// Initial value of an item.
     const BLANK: Self::Item;
 
-    /// Converts four measured points and their final projections `at` to the four items to report. Inlined, so that it
-    /// is compiled with the caller's vector instructions.
+    /// Converts four measured points to the four items to report. `correspondences` has the state of each point, such
+    /// as its facet and whether it is in the fit. `at` has the final projections of the points. The function must be
+    /// inlined, so that it is compiled with the vector instructions of its caller.
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Self::Item; LANES];
 }
 
 /// Groups of four points per task of [`report_projections`].
 const GROUPS_PER_TASK: usize = 8;
 
-/// Projects all points once more under the final pose `cmm_from_model`. Returns the item that `report` makes from each
-/// point, in the order of the points.
+/// Projects all `measured` points once more onto the surface, under the final pose `cmm_from_model`. Returns one item
+/// for each point, in the order of the points. `report` makes the item from the point and its projection.
+/// `correspondences` has the start facet of each point.
 pub(crate) fn report_projections<R: ProjectionReporter>(
     surface: &OffsetSurface,
     measured: &[Point],
@@ -320,8 +332,8 @@ impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
 }
 
 impl<R: ProjectionReporter> FinalPass<'_, R> {
-    /// Returns the items to report for the four points from the index `first` on. Past the end of the list it repeats
-    /// the last point.
+    /// Returns the items to report for four successive points. `first` is the index of the first of them. If fewer than
+    /// four points are left, the last point of the list is repeated.
     #[inline(always)]
     fn report_group(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
@@ -343,7 +355,9 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
         )
     }
 
-    /// Projects four points one by one, each from the facet of its last projection. Returns the projections in lanes.
+    /// Projects four points one by one onto the surface. Each search starts at the facet of the last projection of the
+    /// point. `centre` has the four points in the model frame. Each of the four lanes (elements of a vector register)
+    /// of `centre` and of the result holds one point.
     #[cold]
     fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> ProjectionX4 {
         let foot = |l: usize| {

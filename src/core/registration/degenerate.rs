@@ -24,11 +24,14 @@ const MAX_EXAMINED: usize = 600;
 /// Width, as a share of the length, above which a cloud is not narrow, however few points it has.
 const MIN_WIDE_RATIO: f64 = 0.2;
 
-/// Rejects points that follow each other along one line, straight or bent. Runs before any pose is tried.
+/// Rejects points that follow each other along one line, straight or bent. The check runs before any pose is tried.
+///
+/// A line does not determine two coordinates of the pose: the rotation about the line, and the shift across it. Such
+/// points are accepted if `options` lock both coordinates.
 ///
 /// # Errors
-/// Returns [`RegistrationError::Narrow`] if the points follow a line and the two coordinates that a line does not
-/// determine are not both locked: the rotation about it, and the shift across it.
+/// Returns [`RegistrationError::Narrow`] if the points follow a line and at least one of the two coordinates is not
+/// locked.
 pub(super) fn check_scan_line(measured: &[Point], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MAX_EXAMINED)).copied().collect();
     let Some(_) = ScanLine::detect(few) else { return Ok(()) };
@@ -72,12 +75,12 @@ impl ScanLine {
     }
 }
 
-/// Rejects inliers whose contact points form a narrow strip: less than 2.5 times as wide as the distance between
-/// neighbouring points, and at most a fifth as wide as long.
+/// Rejects a fit whose inliers form a narrow strip on the surface. A strip is narrow if it is less than 2.5 times as
+/// wide as the distance between neighbouring points, and at most a fifth as wide as long. It is accepted if `options`
+/// lock two coordinates of the pose: the rotation about the strip, and the shift across it.
 ///
 /// # Errors
-/// Returns [`RegistrationError::Narrow`] for such a strip, unless the rotation about it and the shift across it are
-/// both locked.
+/// Returns [`RegistrationError::Narrow`] if the strip is narrow and at least one of the two coordinates is not locked.
 pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOptions) -> Result<(), RegistrationError> {
     let used = || deviations.iter().filter(|d| d.status == PointStatus::Inlier);
     let normal = used().map(|d| d.normal).sum::<Vector>();

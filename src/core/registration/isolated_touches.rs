@@ -29,9 +29,11 @@ const MIN_HEIGHT_SHARE: f64 = 0.1;
 /// measured from the surface. It is larger because a neighbour on a hump is above the surface too.
 const MIN_SURFACE_HEIGHT_SHARE: f64 = 0.25;
 
-/// Changes each outlier into an inlier if a near neighbour deviates to the same side of the surface: the deviation is
-/// then form of the part, not a faulty touch. Adds these points to the number of inliers, the objective, RMS and PV of
-/// `verdict`. `outlier_sigmas` is the limit for an outlier in robust standard deviations.
+/// Changes an outlier into an inlier if a near neighbour deviates to the same side of the surface. Such a deviation is
+/// form of the part, not a faulty touch. All outliers are examined.
+///
+/// Updates `verdict` for the new inliers: their number, the objective, the RMS and the PV. Changes nothing if no
+/// outlier is confirmed. `outlier_sigmas` is the limit for an outlier, in robust standard deviations of the deviations.
 pub(super) fn count_confirmed_outliers(
     deviations: &mut [Deviation],
     verdict: &mut RegistrationQuality,
@@ -60,8 +62,8 @@ pub(super) fn count_confirmed_outliers(
     verdict.rms_mm = (verdict.objective_mm2 / verdict.inliers as f64).sqrt();
 }
 
-/// Returns the number of points on the part that are not in the fit although more than half of their eight nearest
-/// neighbours are.
+/// Counts the points that their neighbours contradict, and returns their number. Such a point is on the part and not in
+/// the fit, but more than half of its eight nearest neighbours are in the fit.
 pub(super) fn count_contradicted(deviations: &[Deviation]) -> usize {
     let around = NeighbourIndex::new(deviations, 0.0);
     let is_left = |k: &usize| !deviations[around.indices[*k]].in_fit;
@@ -108,9 +110,9 @@ impl NeighbourIndex {
         }
     }
 
-    /// Returns true if the measured point with index `k` deviates from the median of its neighbours by more than half
-    /// the limit for an outlier, and no near neighbour deviates to the same side. Also returns true if the point is off
-    /// the part or has no neighbours.
+    /// Returns true if no neighbour confirms the deviation of the measured point with the index `k`. This is so if the
+    /// point deviates from the median of its neighbours by more than half the limit for an outlier, and no near
+    /// neighbour deviates to the same side. Also returns true if the point is off the part or has no neighbours.
     fn is_isolated(&self, k: usize) -> bool {
         let Ok(own) = self.indices.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self

@@ -86,15 +86,16 @@ struct BallStep {
 }
 
 impl Problem<'_> {
-    /// Minimises the objective from the pose `start` by ball-constrained Gauss-Newton steps (a trust-region method), to
-    /// the nearest minimum. A step that raises the objective is undone, eq. (14) of the paper.
+    /// Minimises the objective from the pose `start` to the nearest minimum, by ball-constrained Gauss-Newton steps (a
+    /// trust-region method). A step that raises the objective is undone, eq. (14) of the paper.
     ///
-    /// `known` are the sums at `start`, `None` if they are not yet computed. Appends one entry per step to `trace`. At
-    /// the end `correspondences` and the sums belong to the returned pose. If the steps run out before the minimum,
-    /// `converged` of the result is false.
+    /// `known` has the normal equations at `start`, or is `None` if they are not computed yet. One entry for each step
+    /// is appended to `trace`. At the end, `correspondences` and the sums of the result belong to the returned pose. If
+    /// the maximum number of steps is reached before the minimum, `converged` of the result is false.
     ///
     /// # Errors
-    /// Returns [`RegistrationError::TooFewUsed`] if fewer points are in the fit than coordinates of the pose are free.
+    /// Returns [`RegistrationError::TooFewUsed`] if the number of points in the fit is smaller than the number of free
+    /// coordinates of the pose.
     pub(crate) fn descend(
         &self,
         start: Pose,
@@ -142,18 +143,20 @@ impl Problem<'_> {
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
-    /// Projects all points under a pose, updates `correspondences`, and returns the pose with the normal equations of
-    /// the step from it.
+    /// Projects all points onto the surface under `pose`, and updates `correspondences`, which has one entry for each
+    /// point. Returns the pose together with the normal equations of the next step.
     fn linearize_at(&self, pose: Pose, correspondences: &mut [Correspondence]) -> LinearizedPose {
         let scaling = self.scaling_at(&pose);
         LinearizedPose { pose, scaling, sums: self.project_all(correspondences, &pose, &scaling) }
     }
 
-    /// Returns the least-squares step from the pose `at` whose length in scaled coordinates is at most `ball_radius`,
-    /// eq. (15) of the paper. Directions that are locked, or that the surface does not determine, do not change.
+    /// Returns the least-squares step from the pose `at`, eq. (15) of the paper. The length of the step is at most
+    /// `ball_radius`. It is measured in scaled coordinates: translations in units of the size of the cloud, rotations
+    /// in radians. The step does not move in directions that are locked or that the surface does not determine.
     ///
     /// # Errors
-    /// Returns [`RegistrationError::TooFewUsed`] if fewer points are in the fit than coordinates of the pose are free.
+    /// Returns [`RegistrationError::TooFewUsed`] if the number of points in the fit is smaller than the number of free
+    /// coordinates of the pose.
     fn step_within(&self, ball_radius: f64, at: &LinearizedPose) -> Result<BallStep, RegistrationError> {
         let sums = &at.sums;
         if sums.points < self.locked.iter().filter(|locked| !**locked).count() {
@@ -177,8 +180,8 @@ impl Problem<'_> {
         step.length < MIN_STEP || sums.objective_mm2 == 0.0 || little
     }
 
-    /// Returns the scaling for a step from a pose: the centroid of the cloud in the model frame, and the size of the
-    /// cloud.
+    /// Returns the scaling of a step from `pose`: the centroid of the measured points in the model frame, and their
+    /// size (rms distance from the centroid, in mm).
     pub(crate) fn scaling_at(&self, pose: &Pose) -> Scaling {
         Scaling { centre: pose.inverse().transform_point(&self.centroid), size_mm: self.size_mm }
     }
@@ -190,8 +193,9 @@ impl Problem<'_> {
     }
 }
 
-/// Returns the orthogonal projector onto the steps, in scaled coordinates, that leave the `locked` coordinates of the
-/// twist at zero. `locked` is in the order x, y, z, rx, ry, rz.
+/// Returns the orthogonal projector onto the steps that do not move the `locked` coordinates of the pose. The projector
+/// acts on steps in the scaled coordinates of `scaling`. `locked` is in the order x, y, z, rx, ry, rz of the model
+/// frame; true means locked.
 pub(crate) fn free_projector(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
     let to_twist = scaling.to_twist();
     let mut projector = Matrix6::identity();

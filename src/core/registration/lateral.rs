@@ -55,16 +55,17 @@ pub struct LateralError {
     pub error_mm: f64,
 }
 
-/// Returns the lateral error of the pose of `found`, and the error that it causes in a map of the deviations. Lateral
-/// means along the surface: a map in this pose has the right shape at a displaced place.
+/// Returns the lateral error of the pose of `found`, and the error that it causes in a map of the deviations, both in
+/// mm. Lateral means along the surface. With a lateral error, the map has the right shape but lies at a displaced
+/// position on the part.
 ///
-/// `covariance` is that of the twist [v; omega] of the pose, in mm and radians. The covariance in `found.quality` gives
-/// the repeatability of the pose. The covariance of [`crate::model::Form`] also includes the effect of form error on
-/// the pose. `coverage_factor` multiplies the standard uncertainty.
+/// `covariance` is the covariance of the twist [v; omega] of the pose, in mm and radians. The covariance in
+/// `found.quality` gives the repeatability of the pose. The covariance of [`crate::model::Form`] also includes the
+/// effect of form error on the pose. `coverage_factor` multiplies the standard uncertainty.
 ///
-/// Equation: for the twist [v; omega] of covariance C a point p moves by v + omega x p. The covariance of this motion
-/// is J C J^T with J = [1, -p^], where p^ is the cross-product matrix of p. It is projected onto the tangent plane; the
-/// square root of its largest eigenvalue is the lateral uncertainty.
+/// Equation: for the twist [v; omega] with covariance C, a point p moves by v + omega x p. The covariance of this
+/// motion is J C J^T with J = [1, -p^], where p^ is the cross-product matrix of p. This covariance is projected onto
+/// the tangent plane. The square root of its largest eigenvalue is the lateral uncertainty.
 pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_factor: f64) -> LateralError {
     let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier).collect();
     let lateral_mm = used.iter().map(|d| lateral_sigma(covariance, d)).fold(0.0, f64::max);
@@ -72,10 +73,12 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
 }
 
-/// Returns a message that explains why no map may be made from the registration `found`; `None` if a map is allowed.
+/// Returns a message that explains why the registration `found` must not be used for a map of the deviations. Returns
+/// `None` if a map is allowed.
 ///
-/// A map is not allowed if its lateral error exceeds `limits.max_lateral_mm`, or if the error that this causes exceeds
-/// `limits.max_error_share` of the rms deviation. `covariance` is that of the twist, as for [`lateral_error`].
+/// A map is not allowed in two cases. Its lateral error (along the surface) exceeds `limits.max_lateral_mm`. Or the
+/// error of the map that the lateral error causes exceeds `limits.max_error_share` times the rms deviation.
+/// `covariance` is the covariance of the twist of the pose, in mm and radians (see [`lateral_error`]).
 pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
     let rms_mm = found.quality.rms_mm;
@@ -102,8 +105,9 @@ pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &Ma
     ))
 }
 
-/// Returns the standard uncertainty of a point along the surface, in mm, in the tangent direction in which it is
-/// largest. `c` is the covariance of the twist of the pose.
+/// Returns the standard uncertainty of the position of a point along the surface, in mm. It is the value in the tangent
+/// direction with the largest uncertainty. `c` is the covariance of the twist of the pose, in mm and radians.
+/// `deviation` has the point and its normal.
 fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     let hat = deviation.point.coords.cross_matrix();
     let block = |i: usize, j: usize| -> Matrix3<f64> { c.fixed_view::<3, 3>(i, j).into_owned() };

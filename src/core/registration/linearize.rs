@@ -18,8 +18,8 @@ pub(crate) struct Scaling {
 }
 
 impl Scaling {
-    /// Converts scaled coordinates of a step to a twist in the model frame, in mm and radians. Scaled coordinates are a
-    /// translation in units of `size_mm`, and a rotation about `centre` in radians.
+    /// Converts a step in scaled coordinates to a twist in the model frame, in mm and radians. The scaled coordinates
+    /// are three translations in units of `size_mm`, then three rotations about `centre` in radians.
     pub(crate) fn twist(&self, scaled: &Vector6<f64>) -> Twist {
         let omega: Vector = scaled.fixed_rows::<3>(3).into();
         let shift: Vector = scaled.fixed_rows::<3>(0) * self.size_mm;
@@ -37,8 +37,9 @@ impl Scaling {
         }))
     }
 
-    /// Returns the row of the Jacobian A for the point `p` with the unit normal at its projection, eq. (12) of the
-    /// paper: the decrease of the distance of the point with each scaled coordinate of the step.
+    /// Returns the row of the Jacobian A for the point `p`, eq. (12) of the paper. `normal` is the unit normal of the
+    /// surface at the projection of `p`. The six elements are the decrease of the distance of the point from the
+    /// surface, in mm, for each scaled coordinate of the step. Point and normal are in the model frame.
     #[inline]
     pub(crate) fn row(&self, p: &Point, normal: &Vector) -> [f64; 6] {
         let arm = (p - self.centre).cross(normal);
@@ -48,7 +49,8 @@ impl Scaling {
 }
 
 impl Scaling {
-    /// Returns the rows of the Jacobian A for four points, one point per lane, see [`Self::row`].
+    /// Returns the rows of the Jacobian A for four points at once. [`Self::row`] defines the row of one point. Each
+    /// lane (element of a vector register) of `p`, `normal` and the result holds one point.
     #[inline(always)]
     pub(crate) fn four_rows(&self, p: &Vector3x4, normal: &Vector3x4) -> [F64x4; 6] {
         let centre = [F64x4::splat(self.centre.x), F64x4::splat(self.centre.y), F64x4::splat(self.centre.z)];
@@ -73,9 +75,12 @@ impl FourSums {
         Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
     }
 
-    /// Adds four points, one per lane: their rows of the Jacobian A, their distances in mm, their weights, and their
-    /// contributions to the objective. `used` is the number of these points that are in the fit; the others must have
-    /// weight 0 and loss 0.
+    /// Adds four points to the normal equations. Each of the four lanes (elements of a vector register) holds one
+    /// point. `row` has the rows of the Jacobian A, `distance` the distances in mm, `weight` the weights, and
+    /// `loss_mm2` the contributions to the objective.
+    ///
+    /// `used` is the number of these points that are in the fit. A point that is not in the fit must have weight 0 and
+    /// loss 0.
     #[inline(always)]
     pub(crate) fn add(&mut self, row: &[F64x4; 6], distance: F64x4, weight: F64x4, loss_mm2: F64x4, used: usize) {
         let mut k = 0;
@@ -91,7 +96,8 @@ impl FourSums {
         self.points += used;
     }
 
-    /// Adds the sums of the four lanes to `sums`, in the order of the lanes.
+    /// Adds the normal equations of the four lanes (elements of a vector register, one point each) to `sums`, in the
+    /// order of the lanes.
     pub(crate) fn add_to(&self, sums: &mut Sums) {
         for l in 0..LANES {
             for (a, b) in sums.gram.iter_mut().zip(&self.gram) {
@@ -164,8 +170,8 @@ impl Sums {
         })
     }
 
-    /// Returns the right side A^T W b of the normal equations, where b are the distances of the points in mm; eq. (13)
-    /// of the paper.
+    /// Returns the right side A^T W b of the normal equations, eq. (13) of the paper. A is the Jacobian with one row
+    /// for each point, W is the diagonal matrix of the weights, and b has the distances of the points in mm.
     pub(crate) fn right(&self) -> Vector6<f64> {
         Vector6::from(self.right)
     }

@@ -81,11 +81,13 @@ pub fn register(
     Ok(registration)
 }
 
-/// Estimates the pose and the deviations. Does not check whether the points fit well enough; [`check_fit`] does that.
+/// Estimates the pose of `part` and the deviation of each point of `measured`. Does not check whether the points fit
+/// well enough; [`check_fit`] does that.
 ///
 /// # Errors
-/// Returns an error if the probe does not fit into a concave place, if the given side is wrong, if too few points lie
-/// on the part, if no direction of the pose is determined, or if the iteration does not converge.
+/// Returns an error if the probe ball does not fit into a concave area of the surface, or if the points fit the other
+/// side of the surface much better than the side in `options`. Returns an error if fewer than half of the points take
+/// part in the fit, if no direction of the pose is determined, or if the iteration does not converge.
 fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.side() {
         part.check_fold(options, side)?;
@@ -104,9 +106,10 @@ fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result
     build_registration(part, &problem, descent, correspondences, trace, &initial, options)
 }
 
-/// Returns [`RegistrationError::Mirrored`] in place of `error` if only the mirrored cloud fits.
+/// Explains `error`, the error of a failed registration. Returns [`RegistrationError::Mirrored`] if only the mirror
+/// image of the measured points fits the part. Otherwise returns `error` unchanged.
 ///
-/// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
+/// The mirror image is tested only for the errors `TooFewUsed`, `NotConverged`, `WrongSide` and `Undetermined`.
 fn explain_by_mirror_image(
     part: &Part,
     measured: &[Point],
@@ -123,12 +126,13 @@ fn explain_by_mirror_image(
     }
 }
 
-/// Builds the reported registration from `descent`, the last descent of the iteration: quality, deviations, coverage
-/// and trace.
+/// Builds the registration that is reported: pose, deviations, trace and quality with coverage. `descent` is the result
+/// of the last minimisation. `correspondences` contains the projection of each measured point. `trace` contains the
+/// steps of all minimisations. `initial` gives the side of the probe and the other poses that fit.
 ///
 /// # Errors
-/// Returns [`crate::surface::SurfaceError::OffsetFolds`] if the offset surface folds at a facet that a point projects
-/// to.
+/// Returns [`crate::surface::SurfaceError::OffsetFolds`] if a point projects to a facet at which the offset surface
+/// folds: there the probe ball is larger than the concave radius of curvature.
 fn build_registration(
     part: &Part,
     problem: &Problem,
@@ -155,8 +159,12 @@ fn build_registration(
 /// Difference of two distances that is only rounding, in mm.
 const ROUNDING_MM: f64 = 1e-12;
 
-/// Returns `trace` with the reported state as its last entry. Appends an entry with step 0 if the last step was undone,
-/// or if the number of points or the objective of `verdict` differs from that of the last accepted step.
+/// Returns `trace`, the steps of the iteration, with the reported state as its last entry. `verdict` is the reported
+/// quality.
+///
+/// Appends an entry with step 0 in two cases: the last step was undone, or the last accepted step differs from
+/// `verdict` in the number of points or in the objective. The entry takes the radius of the ball from the last step, or
+/// from `options` if `trace` is empty.
 fn with_final_state(
     mut trace: Vec<Iteration>,
     verdict: &RegistrationQuality,
@@ -177,11 +185,13 @@ fn with_final_state(
     trace
 }
 
-/// Rejects a fit that is too poor to be this part, or that leaves the pose undetermined across a strip.
+/// Rejects the registration `found` if its fit is too poor, or if its inliers form a strip too narrow to determine the
+/// pose.
 ///
 /// # Errors
-/// Returns [`RegistrationError::Narrow`] for a strip of points that is too narrow, [`RegistrationError::Mirrored`] if
-/// the mirrored cloud fits much better, and [`RegistrationError::DoesNotFit`] if the rms exceeds its limit.
+/// Returns [`RegistrationError::Narrow`] for a strip of points that is too narrow. Returns
+/// [`RegistrationError::Mirrored`] if the mirror image of the points fits within the rms limit, with less than 0.3
+/// times the rms of the points. Returns [`RegistrationError::DoesNotFit`] if the rms deviation exceeds the limit.
 fn check_fit(
     part: &Part,
     found: &Registration,

@@ -49,7 +49,8 @@ pub enum ProbeSide {
 }
 
 impl ProbeSide {
-    /// Returns the side that was chosen; `None` for [`ProbeSide::Auto`], which leaves the choice to the registration.
+    /// Returns the given side of the nominal surface. Returns `None` for [`ProbeSide::Auto`]: the registration then
+    /// determines the side from the points.
     pub fn side(self) -> Option<Side> {
         match self {
             Self::Auto => None,

@@ -29,12 +29,14 @@ pub(super) struct Part<'a> {
 }
 
 impl<'a> Part<'a> {
-    /// Checks the input before any pose is tried. Returns the nominal surface with the probe offset, and the centre and
-    /// size of the cloud.
+    /// Checks the input before any pose is tried. Returns the nominal surface with its offset (the probe radius), and
+    /// with the centroid and the rms size of the measured points.
     ///
     /// # Errors
-    /// Returns an error for a fully locked pose without a start pose, for too few, non-finite, collinear or repeated
-    /// points, for a cloud of the wrong size, and for a probe radius outside its limits.
+    /// Returns an error if all coordinates are locked and `options` contains no start pose. Returns an error if the
+    /// points are too few, not finite, on one line or repeated, or if their rms size does not fit the nominal surface.
+    /// Returns an error if the probe radius is not positive, or is at least half of the rms size of the nominal
+    /// surface; contact points need no radius.
     pub(super) fn new(
         nominal: &'a Nominal,
         measured: &[Point],
@@ -87,10 +89,11 @@ impl<'a> Part<'a> {
             .with_lookup(lookup)
     }
 
-    /// Rejects a probe ball that does not fit into a concave place of the surface.
+    /// Checks that the probe ball fits into all concave areas of the surface on the given side.
     ///
     /// # Errors
-    /// Returns [`crate::surface::SurfaceError::OffsetFolds`] with the worst place.
+    /// Returns [`crate::surface::SurfaceError::OffsetFolds`] with the most concave place if the offset surface folds:
+    /// there the probe radius is larger than the concave radius of curvature.
     pub(super) fn check_fold(&self, options: &RegistrationOptions, side: Side) -> Result<(), RegistrationError> {
         match self.surface(options, side).find_fold() {
             Some(fold) => Err(fold.into()),
@@ -118,17 +121,19 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// Returns the largest accepted rms deviation in mm: the value of `options`, or 0.2 mm plus 1e-4 of the rms size of
-    /// the cloud.
+    /// Returns the largest accepted rms deviation in mm. This is `options.rms_limit_mm` if it is given; otherwise 0.2
+    /// mm plus 1e-4 of the rms size of the measured points.
     pub(super) fn rms_limit_mm(&self, options: &RegistrationOptions) -> f64 {
         options.rms_limit_mm.unwrap_or(0.2 + 1e-4 * self.size_mm)
     }
 }
 
-/// Rejects a cloud if more than one in a hundred of the examined points repeats another point exactly.
+/// Rejects measured points of which too many occur twice, with exactly equal coordinates. Examines all points, or about
+/// 8000 of a larger number. A hash of the coordinates selects these points. So two equal points are either both
+/// examined or both not.
 ///
-/// A hash of the coordinates selects a sample of some thousand points, for any size of the cloud. Two equal points are
-/// therefore either both in the sample or both not.
+/// # Errors
+/// Returns [`RegistrationError::Repeated`] if more than 1 % of the examined points repeat another point.
 fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     const MAX_EXAMINED: usize = 8192;
     let mixed = |p: &Point| {
@@ -149,8 +154,9 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     Ok(())
 }
 
-/// Explains an `error` about the size of the cloud. Returns an error that names one point far from all others, measured
-/// or nominal, if there is such a point. Otherwise returns `error` unchanged.
+/// Explains `error`, which reports that the sizes of the measured points and of the nominal surface do not agree.
+/// Searches for one measured point far from all other measured points, then for one nominal point far from all other
+/// nominal points. Returns an error that names the first such point, or `error` unchanged if there is none.
 fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
     if let Some((index, distance_mm)) = find_far_off(measured) {
         return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };
@@ -162,10 +168,11 @@ fn explain_by_far_point(nominal: &Nominal, measured: &[Point], error: Registrati
     }
 }
 
-/// Rejects two clouds if the measured rms size is less than 0.06 times or more than 3 times the nominal rms size.
+/// Compares the rms size of the measured points, `measured_mm`, with the rms size of the nominal points, `nominal_mm`.
 ///
 /// # Errors
-/// Returns [`RegistrationError::Size`] with a remedy that names the likely wrong unit.
+/// Returns [`RegistrationError::Size`] if the measured size is less than 0.06 times or more than 3 times the nominal
+/// size, or if a size is 0 or not finite. The error contains a remedy that names the likely wrong unit.
 fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationError> {
     let ratio = measured_mm / nominal_mm;
     let remedy = match ratio {

@@ -43,7 +43,9 @@ const MAX_OUTLIER_SHARE: f64 = 0.05;
 const MAX_OFF_PART_SHARE: f64 = 0.2;
 const MIN_COVERAGE: f64 = 0.5;
 
-/// Returns warnings about the points, the nominal surface and the probe radius.
+/// Returns the warnings, one text each, about the successful registration `found`. The warnings concern rejected
+/// points, points that cover too little of the surface, noise of the nominal points, and a doubtful probe radius.
+/// Returns an empty list if there are none.
 pub(super) fn plausibility_warnings(
     part: &Part,
     found: &Registration,
@@ -56,7 +58,9 @@ pub(super) fn plausibility_warnings(
     doubts
 }
 
-/// Returns warnings about many rejected points, and about points that cover little of the surface.
+/// Returns warnings about the points of the registration `found`, one text each. It warns about any outlier, about more
+/// than 5 % outliers, and about points that contradict their neighbours. It also warns about more than 20 % points
+/// beyond the edge, about points over a gap of the nominal surface, and about a coverage below 50 %.
 fn point_warnings(found: &Registration) -> Vec<String> {
     let points = found.deviations.len();
     let StatusCounts { outliers, off_part, .. } = StatusCounts::count(&found.deviations);
@@ -99,8 +103,11 @@ fn point_warnings(found: &Registration) -> Vec<String> {
     doubts
 }
 
-/// Estimates how many of the `off_part` points lie over a gap of the nominal surface, not outside its edge. A point
-/// lies over a gap if there are points on the part in all eight sectors of the xy plane around it.
+/// Estimates how many of the `off_part` points (points whose projection is beyond the edge of the nominal surface) lie
+/// over a gap inside the surface. The others lie outside its outer edge.
+///
+/// A point lies over a gap if all eight sectors of the xy plane around the point contain points on the part. Examines
+/// at most 2000 points of each kind, and scales the result to `off_part` points.
 fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;
@@ -125,10 +132,12 @@ fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
 }
 
 impl Registration {
-    /// Returns a message that explains why these points allow no verdict; `None` if they allow one.
+    /// Returns a message that explains why the measured points allow no verdict about the part. Returns `None` if a
+    /// verdict is possible.
     ///
-    /// They allow none if more than 10 % of the points on the part contradict their neighbours: they were excluded from
-    /// the fit although most of their neighbours were fitted. It is then unknown which of the two groups is the part.
+    /// No verdict is possible if more than 10 % of the points on the part contradict their neighbours. Such a point was
+    /// excluded from the fit, although most of its eight nearest neighbours were fitted. It is then unknown which of
+    /// the two groups of points shows the part.
     pub fn unjudgeable_reason(&self) -> Option<String> {
         /// Maximum number of contradicting points, as a share of the points on the part.
         const MAX_CONTRADICTED_SHARE: f64 = 0.1;
@@ -175,8 +184,8 @@ fn nominal_noise_warning(part: &Part, found: &Registration) -> Option<String> {
     })
 }
 
-/// Returns a warning that names the first outliers and gives RMS and PV with all outliers; `None` if there are no
-/// outliers.
+/// Returns a warning that lists the first five outliers, and gives RMS and PV of all points on the part including the
+/// outliers. Returns `None` if there are no outliers.
 fn outlier_warning(found: &Registration) -> Option<String> {
     let FiguresWithOutliers { outliers: points, rms_mm, pv_mm, description: places } = found.figures_with_outliers()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
@@ -188,8 +197,9 @@ fn outlier_warning(found: &Registration) -> Option<String> {
     ))
 }
 
-/// Returns a warning if the points fit another probe radius, or no radius (contact points), much better than the given
-/// radius; otherwise `None`.
+/// Returns a warning if another probe radius fits the points much better than the given radius. Also tests the radius
+/// zero: the points are then contact points, not probe centres. Returns `None` if the given radius is plausible, or if
+/// the points cannot test the radius.
 pub(super) fn radius_warning(
     part: &Part,
     found: &Registration,
@@ -230,8 +240,11 @@ pub(super) fn radius_warning(
     })
 }
 
-/// Registers `sample`, some of the points, with another probe radius in mm. A negative radius is a ball on the other
-/// side of the surface. A magnitude below 0.1 mm means contact points. Returns `None` if the registration fails.
+/// Registers the points `sample` again, with the probe radius `radius_mm` in place of the radius in `given`. Starts at
+/// the pose of the registration `found`.
+///
+/// A negative `radius_mm` means a ball on the other side of the surface. A magnitude below 0.1 mm means contact points.
+/// Returns `None` if the registration fails.
 fn refit_with_radius(
     part: &Part,
     found: &Registration,
@@ -251,16 +264,21 @@ fn refit_with_radius(
     super::fit(&part, sample, &options).ok()
 }
 
-/// Returns true if `other_rms_mm`, the rms with another radius, is so much smaller than `rms_mm` that form error cannot
-/// explain the difference.
+/// Returns true if `other_rms_mm`, the rms deviation with another probe radius, is much smaller than `rms_mm`, the rms
+/// deviation with the given radius. The ratio must be at most 0.65. The decrease of the squared rms must be at least
+/// the square of 2e-4 times the rms size of the measured points. Form error of the part does not explain such a
+/// decrease.
 fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
     let taken2 = rms_mm * rms_mm - other_rms_mm * other_rms_mm;
     other_rms_mm <= MAX_RMS_SHARE * rms_mm && taken2 >= (MIN_RMS_PER_SIZE * part.size_mm).powi(2)
 }
 
-/// Returns true if it is worth fitting another radius. The linear estimate of the radius must promise a much smaller
-/// rms, and must be more than five of its standard uncertainties from the given radius. Returns false for contact
-/// points, locked coordinates or too few points.
+/// Returns true if a registration with another probe radius is worth its time. The linear estimate of the radius must
+/// promise a much smaller rms deviation. The estimated radius must also differ from the given radius by more than five
+/// standard uncertainties of the estimate, and by about 35 % of the given radius or more.
+///
+/// Returns false for contact points, for a radius below 0.1 mm, if a coordinate is locked, for fewer than 27 inliers,
+/// or if the rms deviation is already very small.
 fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationOptions) -> bool {
     /// Margin of this test over the final test. The model is linear and a wrong radius is far off, so this test is less
     /// strict.
@@ -280,12 +298,12 @@ fn is_radius_testable(part: &Part, found: &Registration, options: &RegistrationO
     })
 }
 
-/// Estimates the probe radius iteratively, and returns it in mm. Starts at `first_mm`. Each round registers the points
-/// with the last radius by `refit`, and corrects the radius by [`Registration::estimate_radius`]. Ends when the change
-/// is below 1 % of `given_mm`, or after five rounds.
+/// Estimates the probe radius iteratively, and returns it in mm. Starts at `first_mm`. In each round `refit` registers
+/// the points with the last radius, and [`Registration::estimate_radius`] gives the correction of the radius. The
+/// iteration ends after five rounds, or if a correction is below 1 % of `given_mm`, the given radius.
 ///
-/// A negative radius means a ball on the other side of the surface. Returns `None` if a registration fails or gives no
-/// estimate.
+/// A negative radius means a ball on the other side of the surface. A magnitude below 0.1 mm counts as 0. Returns
+/// `None` if a registration fails or gives no estimate.
 fn converged_radius_mm(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
     const MAX_ITERATIONS: usize = 5;
     let mut radius_mm = first_mm;

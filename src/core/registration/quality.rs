@@ -67,8 +67,11 @@ pub struct WeakDirection {
     pub sigma_mm: Option<f64>,
 }
 
-/// Returns the quality of the pose that `descent` found: figures, covariance, weak directions and warnings.
-/// `iterations` is the number of steps. The coverage is 0; the caller sets it.
+/// Returns the quality of the pose in `descent`, the result of the last minimisation: figures, covariance, weak
+/// directions, other poses and warnings. `correspondences` contains the distance of each point. `initial` contains the
+/// result of the search for the start pose. `iterations` is the number of steps, including steps that were undone.
+///
+/// Sets the coverage to 0. The caller computes the coverage later.
 pub(crate) fn assess_quality(
     problem: &Problem,
     descent: &Descent,
@@ -128,7 +131,8 @@ struct DistanceSummary {
 impl DistanceSummary {
     const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
 
-    /// Returns number, sum of squares, minimum and maximum of the distances of the points in the fit.
+    /// Returns the number, the sum of squares (mm^2), the minimum and the maximum (mm) of the distances of the points
+    /// in the fit. If no point is in the fit, the minimum is +infinity and the maximum is -infinity.
     fn summarize(correspondences: &[Correspondence]) -> Self {
         let add = |sum: Self, d: f64| Self {
             used: sum.used + 1,
@@ -148,8 +152,9 @@ impl DistanceSummary {
     }
 }
 
-/// Returns warnings about doubts that the figures do not show: the side of the probe is assumed, other poses fit as
-/// well, or the deviations are as large as the relief of the part.
+/// Returns warnings, one text each, about doubts that the numbers of the quality do not show. It warns in three cases:
+/// the side of the probe is assumed; `alternatives`, other poses that fit about as well, is not empty; or `rms_mm`
+/// exceeds half of the relief (rms distance of the nominal points from their best-fit plane).
 fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
     if !initial.side_known {
@@ -177,8 +182,12 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     warnings
 }
 
-/// Returns the covariance of the pose in scaled coordinates, `variance` (A^T A)^-1, where A is the Jacobian of the
-/// distances. Includes only the first `rank` directions of `spectrum`, which the surface determines.
+/// Returns the covariance of the pose, `variance` (A^T A)^-1, in scaled coordinates (translation in units of the rms
+/// size of the points, rotation about their centroid in radians). A is the Jacobian of the distances, and `variance` is
+/// the residual variance in mm^2.
+///
+/// `spectrum` contains the singular values and directions of A. Includes only the first `rank` directions, which the
+/// surface determines.
 fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6<f64> {
     (0..rank)
         .map(|k| {
@@ -189,7 +198,12 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
 }
 
 /// Describes the motions of the part that change no distance: shifts along a direction, and rotations about an axis.
-/// The columns of `basis` are motions in scaled coordinates; they span `count` dimensions.
+/// Returns one entry for all shifts together, and one for each rotation axis or one for all rotations about a point.
+/// Returns an empty list if `count` is 0.
+///
+/// The columns of `basis` are motions in scaled coordinates (translation in units of the rms size of the points,
+/// rotation about their centroid in radians). They span a space of `count` dimensions. `scaling` contains the centroid
+/// and the rms size.
 fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Scaling) -> Vec<WeakDirection> {
     if count == 0 {
         return Vec::new();
@@ -229,8 +243,9 @@ fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scali
         .collect()
 }
 
-/// Returns an orthonormal basis of the motions in `span` that are perpendicular to `rotations`: shifts without
-/// rotation. The columns of `span` are motions in scaled coordinates.
+/// Returns an orthonormal basis of the shifts without rotation in the space `span`: all motions in this space that are
+/// perpendicular to `rotations`. The columns of `span` and the vectors are motions in scaled coordinates (translation
+/// in units of the rms size of the points, rotation about their centroid in radians).
 fn pure_shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
     let mut basis: Vec<Vector6<f64>> = rotations.to_vec();
     let mut found = Vec::new();
@@ -250,8 +265,9 @@ fn pure_shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f
     found
 }
 
-/// Returns the point, in the model frame, that three `rotations` about independent axes leave fixed. Each rotation is a
-/// motion in scaled coordinates.
+/// Returns the point in the model frame, in mm, that three `rotations` about independent axes leave fixed. Each
+/// rotation is a motion in scaled coordinates (translation in units of the rms size of the points, rotation about their
+/// centroid in radians). `scaling` contains the centroid and the rms size. The point is a least-squares solution.
 fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     let (mut gram, mut right) = (nalgebra::Matrix3::zeros(), Vector::zeros());
     for r in rotations {
@@ -264,13 +280,16 @@ fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     scaling.centre + gram.lu().solve(&right).unwrap_or_default()
 }
 
-/// Splits a motion in scaled coordinates into the shift of the centre in mm and the rotation in radians.
+/// Splits the motion `scaled` into the translation of the centroid in mm and the rotation in radians. The first three
+/// components of `scaled` are the translation in units of the rms size in `scaling`, the last three the rotation.
 fn shift_and_rotation(scaled: &Vector6<f64>, scaling: &Scaling) -> (Vector, Vector) {
     let v: Vector = scaled.fixed_rows::<3>(0) * scaling.size_mm;
     (v, scaled.fixed_rows::<3>(3).into())
 }
 
-/// Describes the axis of a rotation, given in scaled coordinates: its direction and a point on it, in the model frame.
+/// Returns a text that describes the axis of a rotation: its direction, and a point on the axis in mm in the model
+/// frame. `rotation` is a motion in scaled coordinates: translation in units of the rms size in `scaling`, and rotation
+/// about the centroid in radians.
 fn axis_name(rotation: &Vector6<f64>, scaling: &Scaling) -> String {
     let (v, omega) = shift_and_rotation(rotation, scaling);
     let through = scaling.centre + omega.cross(&v) / omega.norm_squared();
@@ -290,9 +309,14 @@ fn direction_name(v: &Vector) -> String {
     format!("({:.3}, {:.3}, {:.3})", u.x, u.y, u.z)
 }
 
-/// Describes the shifts along and rotations about the axes of the model frame whose standard uncertainty at the rim
-/// exceeds `sigma_mm`, the standard deviation of one point. `scaled` is the covariance in scaled coordinates; rotations
-/// are about the centroid of the cloud. Returns nothing if the surface leaves a direction undetermined (`some_held`).
+/// Describes the directions of the pose that the points determine poorly: shifts along the axes of the model frame, and
+/// rotations about these axes through the centroid of the points. A direction is listed if its standard uncertainty at
+/// the rim, in mm, exceeds `sigma_mm`, the standard deviation of one point. Directions with similar uncertainty (within
+/// a factor of two) share one entry.
+///
+/// `scaled` is the covariance of the pose in scaled coordinates (translation in units of the rms size of the points,
+/// rotation in radians). Returns an empty list if `some_held` is true: then the surface does not determine some
+/// direction at all.
 fn uncertain_directions(
     scaled: &Matrix6<f64>,
     sigma_mm: f64,
@@ -327,7 +351,7 @@ fn uncertain_directions(
     found
 }
 
-/// Formats a length with two or three digits, in mm or in µm.
+/// Formats a length that is given in mm, with two or three digits. The text is in mm from 0.1 mm, and in µm below.
 pub(super) fn format_length(mm: f64) -> String {
     match mm {
         l if l >= 10.0 => format!("{l:.0} mm"),
@@ -339,12 +363,13 @@ pub(super) fn format_length(mm: f64) -> String {
     }
 }
 
-/// Returns the share of the nominal surface that is covered by inliers, from 0 to 1.
+/// Returns the share of the nominal surface that inliers cover, from 0 to 1. Tests some thousand places spread over the
+/// surface. Uses at most 50,000 of the `deviations`.
 ///
-/// Many points: divides space into cubes with an edge of a fifteenth of the rms size of the surface, small enough to
-/// show a missing corner. A place is covered if its cube contains an inlier. Few points: a place is covered if an
-/// inlier is within 1.1 times the spacing of the same number of points spread evenly. So a full pattern leaves no gap,
-/// and a line covers only its own strip.
+/// - About 6800 inliers or more: divides space into cubes with an edge of a fifteenth of the rms size of the surface. A
+///   place is covered if its cube contains an inlier. The cubes are small enough to show a missing corner.
+/// - Fewer inliers: a place is covered if an inlier is within 1.1 times the spacing that the same number of evenly
+///   spread points would have. So a full pattern leaves no gap, and a line covers only its own strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MAX_POINTS: usize = 50_000;
     // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
@@ -366,7 +391,8 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     sample.iter().filter(|p| cells.is_marked(p)).count() as f64 / sample.len() as f64
 }
 
-/// Returns the share of `places`, from 0 to 1, that have a point of `used` within the distance `within_mm`.
+/// Returns the share of `places`, from 0 to 1, that have a contact point of `used` within the distance `within_mm`.
+/// Returns 0 if `places` is empty.
 fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 {
     let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / within_mm).floor() as i64);
     let mut points: HashMap<[i64; 3], Vec<Point>> = HashMap::new();
@@ -397,7 +423,8 @@ impl CoverageCells {
     /// covers the rest.
     const MAX_PER_AXIS: i64 = 256;
 
-    /// Creates unmarked cubes of the edge `edge_mm` that cover the bounding box of `points`.
+    /// Creates a grid of unmarked cubes with the edge `edge_mm` that covers the bounding box of `points`. The grid has
+    /// at most 256 cubes along an axis.
     fn new(points: &[Point], edge_mm: f64) -> Self {
         let per_mm = 1.0 / edge_mm;
         let (mut low, mut high) = ([i32::MAX; 3], [i32::MIN; 3]);
@@ -412,12 +439,15 @@ impl CoverageCells {
         Self { low, counts, per_mm, marked: vec![false; counts.iter().product()] }
     }
 
-    /// Returns the numbers of the cube of a point along x, y and z; `per_mm` is the inverse of the edge of a cube.
+    /// Returns the integer positions along x, y and z of the cube that contains the point `p`, counted from the origin
+    /// of the coordinates. `per_mm` is the inverse of the edge of a cube, in 1/mm.
     fn cell(p: &Point, per_mm: f64) -> [i32; 3] {
         [p.x, p.y, p.z].map(|c| (c * per_mm).floor() as i32)
     }
 
-    /// Returns the index of the cell of a point; `None` if the point lies outside the cells.
+    /// Returns the index of the cube that contains the point `p`, for the list of marks. Returns `None` if `p` lies
+    /// outside the grid of cubes. Along an axis with 256 cubes, the maximum, the last cube includes all points beyond
+    /// its far side.
     fn index(&self, p: &Point) -> Option<usize> {
         let at = Self::cell(p, self.per_mm);
         let mut index = 0;
@@ -455,8 +485,10 @@ pub(crate) struct DeviationReporter<'a> {
 }
 
 impl<'a> DeviationReporter<'a> {
-    /// Prepares the conversion: the covariance of the pose in scaled coordinates, and the offset from the probe centre
-    /// to the contact point.
+    /// Prepares the conversion of projections to deviations. Takes the covariance of the pose and the residual variance
+    /// from `verdict`, the quality of the registration. Takes the nominal surface from `part`, and the distance from
+    /// the probe centre to the contact point from `options`. This distance is 0 for contact points, otherwise the probe
+    /// radius.
     pub(crate) fn new(
         part: &Part<'a>,
         scaling: &Scaling,
@@ -486,7 +518,10 @@ impl ProjectionReporter for DeviationReporter<'_> {
         in_fit: true,
     };
 
-    /// Returns the deviations of four points, with contact point, standard uncertainty and status.
+    /// Returns the deviations of four points, one per SIMD lane, in mm, each with contact point, normal, standard
+    /// uncertainty and status. `at` contains the projections of these points under the final pose, and
+    /// `correspondences` tells which of them are in the fit. A contact point outside the outline of the nominal surface
+    /// has the status `OffPart`.
     #[inline(always)]
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Deviation; LANES] {
         let normal = &at.projections.normal;

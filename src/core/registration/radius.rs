@@ -28,13 +28,14 @@ pub(super) struct RadiusEstimate {
 
 impl Registration {
     /// Estimates the correction dr of the probe radius by linear least squares, as a seventh unknown of the fit.
-    /// Returns `None` if the residuals are zero.
+    /// Returns dr and its standard uncertainty in mm, and the ratio of the rms with the corrected radius to the rms
+    /// with the given radius. Returns `None` if one of the three is not finite, for example if the residuals are zero.
     ///
     /// ```text
     ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2,   g = (A^T A)^-1 A^T 1
     /// ```
     ///
-    /// Here r_i is the deviation of point i, and a_i its row of the Jacobian A.
+    /// Here r_i is the deviation of inlier i, a_i its row of the Jacobian A, and 1 in A^T 1 the vector of ones.
     pub(super) fn estimate_radius(&self) -> Option<RadiusEstimate> {
         let variance = self.quality.residual_sigma_mm.powi(2);
         let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
@@ -56,11 +57,11 @@ impl Registration {
     }
 
     /// Adds the uncertainty of the probe radius to the covariance of the pose and to the uncertainties of the
-    /// deviations. `radius_sigma_mm` is the standard uncertainty of the radius, in mm. Equation: GUM, 5.1.2, for one
-    /// more input.
+    /// deviations. `radius_sigma_mm` is the standard uncertainty of the radius, in mm. The radius is one more input
+    /// quantity of the uncertainty budget (GUM, 5.1.2).
     ///
     /// Directions that are undetermined or locked keep their covariance. Changes nothing if the residuals are zero, or
-    /// if `radius_sigma_mm` is not positive and finite. A robust loss is treated as a square loss.
+    /// if `radius_sigma_mm` is not positive and finite. Treats a robust loss as a square loss.
     pub fn add_radius_uncertainty(&mut self, radius_sigma_mm: f64) {
         let variance = self.quality.residual_sigma_mm.powi(2);
         if !(variance > 0.0 && radius_sigma_mm > 0.0 && radius_sigma_mm.is_finite()) {
@@ -77,9 +78,11 @@ impl Registration {
     }
 }
 
-/// Returns the row of the Jacobian for a deviation: the decrease of the distance with each coordinate of the twist of
-/// the pose, in the model frame. The contact point and the probe centre have the same row, because both lie on the
-/// normal.
+/// Returns the row of the Jacobian for one deviation: the decrease of the distance with respect to each coordinate of
+/// the twist (a small motion: translation, then rotation about the origin) of the pose in the model frame.
+///
+/// The row is computed from the contact point. The row of the probe centre is the same, because the centre lies on the
+/// normal through the contact point.
 fn row(deviation: &Deviation) -> Vector6<f64> {
     let (n, arm) = (deviation.normal, deviation.point.coords.cross(&deviation.normal));
     Vector6::new(n.x, n.y, n.z, arm.x, arm.y, arm.z)

@@ -11,8 +11,12 @@ use super::options::RegistrationOptions;
 use super::robust_loss::{Loss, ScaledLoss, robust_median_and_sigma};
 use super::start::{InitialPose, sample_evenly};
 
-/// Fits the pose by alternation: minimises the objective, rejects the points that are off the part or outliers, and
-/// repeats until no point changes.
+/// Fits the pose to the measured points of `problem`, starting at `initial`. Repeats two steps until the set of fitted
+/// points no longer changes, at most 16 times. First it minimises the objective (the sum of the squared distances or of
+/// their robust loss). Then it rejects points beyond the edge of the surface and outliers.
+///
+/// Returns the result of the last minimisation. Updates `correspondences`, one per point, and appends the steps to
+/// `trace`.
 ///
 /// # Errors
 /// Returns an error if the iteration does not converge, if fewer than half of the points are in the fit, or if the
@@ -72,8 +76,9 @@ const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 /// all points then need only those near the final pose.
 const COARSE_COUNTS_WITH_FITTED_NORMALS: [usize; 1] = [2048];
 
-/// Fits all normals near the points at once, and stores a start facet for the projection of each point in
-/// `correspondences`. Does nothing if the normals of the surface are already known.
+/// Prepares the projections of the measured points under `pose`. Fits the surface normals near all points at once, and
+/// stores a start facet for the projection of each point in `correspondences`. Does nothing if the normals of the
+/// surface are already known.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
     if !problem.surface.has_lazy_normals() {
         return;
@@ -85,11 +90,15 @@ fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Po
     }
 }
 
-/// Fits the pose to a sample of `count` points. Returns a pose from which all points need only a step or two. Appends
-/// the steps to `trace`.
+/// Fits the pose to a sample of `count` measured points, starting at `pose`. Returns a pose so good that all points
+/// together need only one or two more steps. Appends the steps to `trace`.
 ///
-/// If `screened` is given, outliers of the sample are rejected first, by its options. This is possible only near the
-/// minimum; far from it outliers cannot be distinguished.
+/// If `screened` contains options, outliers of the sample are rejected before the fit, with the limit in these options.
+/// Use this only if `pose` is near the minimum. Far from the minimum, outliers cannot be distinguished from other
+/// points.
+///
+/// # Errors
+/// Returns an error if fewer points of the sample are in the fit than coordinates of the pose are free.
 fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
@@ -147,11 +156,13 @@ fn robust_distance_sigma(correspondences: &[Correspondence]) -> (f64, f64) {
     (median, sigma.max(MIN_SIGMA_MM))
 }
 
-/// Searches again, over the whole surface, for the projections of the points that are beyond the edge or far from it:
-/// more than 0.2 mm and more than six robust standard deviations from the median distance. Returns the number of points
-/// for which a better projection was found.
+/// Searches the whole surface for better projections of far points. A point is far if its projection is beyond the edge
+/// of the surface, or if its distance differs from the median distance by more than 0.2 mm and by more than six robust
+/// standard deviations. Returns the number of points with a better projection.
 ///
-/// A walk over the facets ends at the edge of a gap, although the right facet can lie beyond the gap.
+/// A new projection is better if it lies on the part, and either the old one was beyond the edge or the distance is
+/// less than half of the old distance. The usual search moves from facet to facet, and ends at the edge of a gap. The
+/// correct facet can lie beyond this gap.
 fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
     /// Distance in mm that no touch on the part exceeds when the pose is nearly right.
     const FAR_MM: f64 = 0.2;
@@ -180,13 +191,15 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
     correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
-/// Sets for each point whether it takes part in the fit. Returns the number of points that changed. If `both_ways` is
-/// true, a rejected point can be accepted again.
+/// Decides for each point whether it takes part in the fit, and stores this in `correspondences`. Returns the number of
+/// points whose decision changed. If `both_ways` is false, a rejected point stays rejected.
 ///
-/// Rejects points off the part, and outliers: points farther than `options.outlier_sigmas` robust standard deviations
-/// from the median distance that also differ from their neighbours. A smooth form error, however large, is no outlier.
-/// Beyond four times this limit a point is an outlier whatever its neighbours are. A rejected point can still be form,
-/// see [`super::isolated_touches`].
+/// Rejects points whose projection is beyond the edge of the surface, and outliers. The limit is
+/// `options.outlier_sigmas` robust standard deviations from the median distance. A point beyond this limit is an
+/// outlier if its distance also differs from the distances of its neighbours. A point beyond four times the limit is
+/// always an outlier. So a large but smooth form error gives no outlier below four times the limit.
+///
+/// A rejected point can later be found to be form of the part, see [`super::isolated_touches`].
 fn select_fit_points(
     problem: &Problem,
     options: &RegistrationOptions,
@@ -217,11 +230,11 @@ fn select_fit_points(
     changed
 }
 
-/// Returns one flag for each index in `suspects`: true if the distance of this point differs by more than `limit_mm`
-/// from the median distance of its eight nearest neighbours.
+/// Returns one flag for each index in `suspects`, the points that may be outliers. A flag is true if the distance of
+/// the point differs by more than `limit_mm` from the median distance of its eight nearest neighbours.
 ///
-/// Ignores neighbours nearer than half the mean spacing: they repeat the same place with the same fault. A suspect that
-/// has only such neighbours is isolated (true).
+/// Ignores neighbours nearer than half of the mean point spacing, because they repeat the same place with the same
+/// fault. The flag is true if there are no other neighbours among the 64 nearest points.
 fn isolated_flags(
     measured: &[Point],
     correspondences: &[Correspondence],

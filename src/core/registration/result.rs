@@ -44,7 +44,8 @@ impl Registration {
         self.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Outlier)
     }
 
-    /// Returns RMS and PV of all points on the part, outliers included; `None` if there are no outliers.
+    /// Returns RMS and PV, in mm, of all points on the part including the outliers, with the number and a description
+    /// of the outliers. Returns `None` if there are no outliers.
     pub fn figures_with_outliers(&self) -> Option<FiguresWithOutliers> {
         let points = StatusCounts::count(&self.deviations).outliers;
         if points == 0 {

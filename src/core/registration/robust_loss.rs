@@ -28,8 +28,9 @@ pub(crate) struct ScaledLoss {
 const SIGMA_PER_MAD: f64 = 1.482_602_218_505_602;
 
 impl ScaledLoss {
-    /// Creates a loss whose limit is the tuning constant of `loss` times `sigma_mm`, the robust standard deviation of
-    /// the distances.
+    /// Creates a loss with a scale. The scale is the distance limit, in mm, beyond which the loss reduces the weight of
+    /// a point: the tuning constant of `loss` (1.345 for Huber, 4.685 for Tukey) times `sigma_mm`, the robust standard
+    /// deviation of the distances.
     pub(crate) fn new(loss: Loss, sigma_mm: f64) -> Self {
         let tuning = match loss {
             Loss::None => f64::INFINITY,

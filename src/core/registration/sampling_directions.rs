@@ -18,9 +18,13 @@ const MAX_RELATIVE_CHANGE: f64 = 0.5;
 /// Maximum number of points that are examined.
 const MAX_EXAMINED: usize = 400;
 
-/// Returns a limit for singular values, as a share of the root of the sum of their squares: directions below it are
-/// determined only by the node positions of the nominal grid, not by the shape of the part. Returns `None` if there is
-/// no such direction, or if the surface is not a single grid.
+/// Returns a lower limit for singular values of the Jacobian, as a share (0 to 1) of the root of the sum of all squared
+/// singular values. The shape of the part does not determine the directions below this limit; only the node positions
+/// of the nominal grid determine them.
+///
+/// Tests the directions with a share of at most 1e-4. Compares the Jacobian of the surface with the Jacobian of a
+/// surface through every second node. Returns `None` if no direction depends on the node positions, if the surface is
+/// not a single grid, or if the coarser surface cannot be made.
 pub(super) fn sampling_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
     let free = free_projector(&problem.locked, &descent.scaling);
     let gram = descent.sums.gram();

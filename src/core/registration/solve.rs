@@ -13,10 +13,10 @@ pub(crate) struct Spectrum {
 
 impl Spectrum {
     /// Computes the singular values S and the right singular vectors V of the Jacobian A from `gram` = A^T A = V S^2
-    /// V^T, by a symmetric eigendecomposition.
+    /// V^T, by a symmetric eigendecomposition. The singular values are in descending order.
     ///
-    /// The columns of A are centred and scaled beforehand. So squaring loses no more than the surface itself leaves
-    /// undetermined.
+    /// The rotations in A are about the centroid of the points, and the translations are in units of their rms size. So
+    /// A^T A loses only directions that the surface does not determine.
     pub(crate) fn new(gram: &Matrix6<f64>) -> Self {
         let eigen = SymmetricEigen::new(*gram);
         let mut order: [usize; 6] = std::array::from_fn(|k| k);
@@ -27,11 +27,12 @@ impl Spectrum {
         }
     }
 
-    /// Returns the number of directions that the surface determines: those with a squared singular value above
-    /// `whole * least_share^2`.
+    /// Returns the number of directions of the pose that the surface determines. These are the directions with a
+    /// squared singular value above `whole * least_share^2`.
     ///
-    /// `whole` is the sum of all squared singular values before any direction was locked. So the rounding that a lock
-    /// leaves does not count as a direction.
+    /// `whole` is the sum of all squared singular values before any direction was locked. `least_share` is the minimum
+    /// share, from 0 to 1. Because `whole` includes the locked directions, the rounding error in a locked direction
+    /// does not count as a direction.
     pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
         let limit = whole * least_share * least_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()
@@ -59,9 +60,12 @@ impl Spectrum {
         step(self.multiplier(&along, rank, alpha))
     }
 
-    /// Returns the Lagrange multiplier mu of the ball constraint in [`Self::step`]: the root of 1/|m(mu)| = 1/alpha, by
-    /// Newton's method. `along` are the components of A^T b along the singular vectors. In this form the function is
-    /// nearly straight, and the iteration rises to the root from below without overshooting.
+    /// Returns the Lagrange multiplier mu of the ball constraint |m| <= `alpha` in [`Self::step`]. Solves 1/|m(mu)| =
+    /// 1/`alpha` for mu by Newton's method, starting at 0. `along` contains the components of A^T b along the singular
+    /// vectors, of which the first `rank` are used.
+    ///
+    /// The function 1/|m(mu)| is almost linear in mu. So the iteration rises to the solution from below, and does not
+    /// overshoot.
     fn multiplier(&self, along: &Vector6<f64>, rank: usize, alpha: f64) -> f64 {
         let mut mu = 0.0;
         for _ in 0..60 {

@@ -76,12 +76,12 @@ const MIN_SIDE_RATIO: f64 = 2.0;
 /// Maximum difference of the shares of points off the part at which the side with more of them can still fit better.
 const MAX_OFF_PART_EXCESS: f64 = 0.05;
 
-/// Returns the initial pose and the side of the probe. A start pose in `options` is kept; otherwise many poses are
-/// tried.
+/// Returns the initial pose and the side of the surface on which the probe is. If `options` contain a start pose, this
+/// pose is kept and only the side is determined. Otherwise a search tries many poses.
 ///
 /// # Errors
-/// Returns [`RegistrationError::WrongSide`] if a given side fits much worse than the other, and
-/// [`RegistrationError::Undetermined`] if the search finds no candidate.
+/// Returns [`RegistrationError::WrongSide`] if the side in `options` fits much worse than the other side. Returns
+/// [`RegistrationError::Undetermined`] if the search finds no pose.
 pub(crate) fn initial_pose(
     part: &Part,
     measured: &[Point],
@@ -94,21 +94,26 @@ pub(crate) fn initial_pose(
     }
 }
 
-/// Returns the rms in mm of the best fit of the mirrored cloud, over all poses with no coordinate locked; `None` if no
-/// pose is found.
+/// Returns the rms distance in mm of the best fit of the mirror image of the points, on the given side of the surface.
+/// Tries poses without locked coordinates. Uses a sample of the points and the smallest nine tenths of the distances.
+/// Returns `None` if no pose is found.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
-/// Returns the rms in mm of the best fit of the cloud as measured, over all poses with no coordinate locked; `None` if
-/// no pose is found.
+/// Returns the rms distance in mm of the best fit of the measured points, not mirrored, on the given side of the
+/// surface. Tries poses without locked coordinates. Uses a sample of the points and the smallest nine tenths of the
+/// distances. Returns `None` if no pose is found.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
 }
 
-/// Returns the rms of the cloud as measured and the rms of the mirrored cloud, in mm, if only the mirrored cloud fits;
-/// otherwise `None`.
+/// Tests whether the measured points are a mirror image of the part. Returns the rms of the points as measured, and the
+/// rms of the mirrored points, both in mm. Returns `None` if the points are not mirrored, or if no pose is found.
+///
+/// The points are mirrored if the mirrored rms is within the rms limit, and less than 0.3 times the rms of the points
+/// as measured. If `options` give no side, both sides of the surface are tried and the better one counts.
 pub(crate) fn detect_mirror_image(
     part: &Part,
     measured: &[Point],
@@ -130,16 +135,18 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
     sample_evenly(measured, 4 * COMPARE_POINTS).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms in mm of the best fit on the given side, over all poses with no coordinate locked; `None` if no pose
-/// is found.
+/// Returns the rms distance in mm of the best fit of `points` on the given side of the surface. Tries many poses
+/// without locked coordinates. Uses a sample of the points and the smallest nine tenths of the distances. Returns
+/// `None` if no pose is found.
 fn searched_rms(part: &Part, points: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let options = RegistrationOptions { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
     search.refine_and_compare(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 
-/// Returns a sample of at most `count` points, evenly along their order. Each place in the order is varied a little, so
-/// that the sample does not follow one column of a grid. The variation is the same in each call.
+/// Returns at most `count` of the points, taken at nearly equal steps through the list. The position in each step
+/// varies a little, so that the sample does not follow one column of a grid. The variation is fixed: each call with the
+/// same input gives the same sample.
 pub(super) fn sample_evenly(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
     let n = points.len();
     let take = count.min(n);
@@ -157,7 +164,8 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// Prepares a search, with samples of the points of three sizes.
+    /// Prepares a search for the pose. Draws three samples of the measured points: 40 to score poses, 160 to refine
+    /// poses, and 640 to compare the best poses.
     fn new(part: &'a Part, measured: &'a [Point], options: &'a RegistrationOptions) -> Self {
         let sample = |count| sample_evenly(measured, count).copied().collect();
         Self {
@@ -170,11 +178,13 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Returns the given pose unchanged, with the side on which the points fit better. If the fit does not decide,
-    /// takes the side on which most points lie.
+    /// Determines the side of the surface on which the probe is, for a given start pose. Returns the pose unchanged,
+    /// with the side on which the points fit much better. If neither side fits much better, takes the side on which
+    /// most points lie. A side that the options give is kept.
     ///
     /// # Errors
-    /// Returns [`RegistrationError::WrongSide`] if the options give a side and the other one fits much better.
+    /// Returns [`RegistrationError::WrongSide`] if the options give a side and the points fit the other side much
+    /// better.
     fn determine_side(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
         // A given pose can refer to either side.
         let at = |side: Side| {
@@ -191,7 +201,8 @@ impl<'a> Search<'a> {
         Ok(InitialPose { cmm_from_model: pose, side, side_known, is_refined: false, alternatives: Vec::new() })
     }
 
-    /// Returns the side of the nominal surface on which most points lie under a pose.
+    /// Returns the side of the nominal surface on which most points lie. `pose` maps the model frame to the CMM frame.
+    /// A tie gives the side of the normals.
     fn nearer_side(&self, pose: &Pose) -> Side {
         let nominal = OffsetSurface::new(self.part.nominal, 0.0, Side::Normal).expect("0 is a radius");
         let inverse = pose.inverse();
@@ -202,15 +213,15 @@ impl<'a> Search<'a> {
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
-    /// Tries many poses, and returns the best with its side and the other poses that fit about as well.
+    /// Tries many poses. Returns the best pose, its side of the surface, and other poses that fit about as well.
     ///
-    /// The candidates are refined on one side of the surface. On the other side the probe centres lie two radii away, a
-    /// small distance compared with the differences between right and wrong poses. Only the best candidates are
-    /// compared on both sides.
+    /// First all start poses are refined on one side of the surface. Then only the best refined poses are compared on
+    /// both sides. This is enough, because the two sides are only two probe radii apart. Right and wrong poses differ
+    /// by much more.
     ///
     /// # Errors
-    /// Returns [`RegistrationError::Undetermined`] if there is no candidate on one of the sides, and
-    /// [`RegistrationError::WrongSide`] if a given side fits much worse than the other.
+    /// Returns [`RegistrationError::Undetermined`] if there is no pose on one of the sides. Returns
+    /// [`RegistrationError::WrongSide`] if the side in the options fits much worse than the other side.
     fn search(&self) -> Result<InitialPose, RegistrationError> {
         let side = self.options.side.side().unwrap_or_default();
         let candidates = self.candidates(side);
@@ -231,8 +242,14 @@ impl<'a> Search<'a> {
         Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, is_refined: true, alternatives })
     }
 
-    /// Selects the side of the probe. `normal` and `opposite` are the best fits on the two sides. Returns the side, its
-    /// fit, and true if the side is certain. A given side is kept.
+    /// Selects the side of the surface on which the probe is. `normal` is the best fit on the side of the normals, and
+    /// `opposite` the best fit on the other side. Returns the side, the fit on this side, and true if the side is
+    /// certain.
+    ///
+    /// A side that the options give is kept and is certain. Without a given side, the side is certain if its rms is
+    /// less than half of the rms on the other side, and if hardly more points are beyond the edge. Otherwise the side
+    /// of the normals is returned as not certain. If the surface has no offset, both sides are the same and the side is
+    /// certain.
     ///
     /// # Errors
     /// Returns [`RegistrationError::WrongSide`] if the rms on the given side is more than eight times the rms on the
@@ -263,16 +280,17 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Converts a pose that fits on the other side to the start pose for `side`. Shifts the surface by two probe radii
-    /// along its mean normal.
+    /// Converts `pose`, which fits with the probe on the other side of the surface, to a start pose for `side`. Shifts
+    /// the surface by two probe radii along its mean normal.
     fn move_across(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
         pose * Pose { translation_mm: shift, ..Pose::identity() }
     }
 
-    /// Returns the most promising poses on one side, roughly refined and with the best first. The start poses are the
-    /// identity, those from principal axes, and those from curvature.
+    /// Returns at most 24 of the best poses on the given side of the surface, refined on a sample of 160 points, with
+    /// the best first. The start poses are the identity, the poses that align principal axes, and the poses that match
+    /// curvatures.
     fn candidates(&self, side: Side) -> Vec<Candidate> {
         let surface = self.part.surface(self.options, side);
         let mut starts = vec![Pose::identity()];
@@ -298,7 +316,8 @@ impl<'a> Search<'a> {
         refined
     }
 
-    /// Refines the best of `candidates` fully on one side. Returns them with the best first, without repeated poses.
+    /// Refines the first six of `candidates` on the given side of the surface, on a sample of 640 points. Returns the
+    /// refined candidates with the best fit first. Omits a pose that is nearly equal to a better one.
     fn refine_and_compare(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
         let best = &candidates[..candidates.len().min(MAX_COMPARED)];
         let mut compared: Vec<Candidate> =
@@ -329,16 +348,18 @@ impl<'a> Search<'a> {
         0.1 * self.part.size_mm
     }
 
-    /// Scores a pose; smaller is better. Returns the root mean square, in mm, of the distances of `points` from the
-    /// part, capped at [`Self::truncation_mm`]. The distance beyond the edge is included.
+    /// Scores a pose on `points`; a smaller score is better. Returns the root mean square, in mm, of the distances from
+    /// the part. A distance beyond the edge of the surface is included. Each distance is limited to
+    /// [`Self::truncation_mm`], so that points far away do not dominate.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
         let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Returns the pose with its figures of fit to `points`. Only the smallest nine tenths of the distances count, so
-    /// that outliers in the remaining tenth have no influence.
+    /// Returns the pose with its figures of fit to `points`: the rms of all distances, the rms of the points on the
+    /// part (both in mm), and the share of points beyond the edge. Both rms values use only the smallest nine tenths of
+    /// the distances. So outliers have no influence if they are in the largest tenth.
     fn assess_candidate(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
@@ -360,8 +381,9 @@ impl<'a> Search<'a> {
         Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part_share: off_part, side: surface.side() }
     }
 
-    /// Returns the squared distance of each point from the part, in mm^2. Beyond the edge it is the squared distance
-    /// along the normal plus the squared distance beyond the edge.
+    /// Returns the squared distance of each point from the part, in mm^2. `cmm_from_model` maps the model frame to the
+    /// CMM frame. For a point beyond the edge of the surface, this is the squared distance along the normal plus the
+    /// squared distance of the projection beyond the edge.
     fn squared_distances_mm2<'b>(
         &self,
         surface: &'b OffsetSurface,
@@ -376,8 +398,10 @@ impl<'a> Search<'a> {
         })
     }
 
-    /// Refines the pose `start` with Tukey's loss, which ignores gross outliers. Each of the `rounds` adapts the scale
-    /// of the loss to the distances and takes at most `iterations` steps. Returns the pose with its figures of fit.
+    /// Refines the pose `start` on `points`. Does at most `rounds` minimisations, each with at most `iterations` steps.
+    /// The first minimisation uses the square loss. Each later one uses Tukey's loss, which ignores gross outliers,
+    /// with a scale from the current distances, and without the points beyond the edge. Ends early if a minimisation
+    /// fails. Returns the last pose with its figures of fit to `points`.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let (middle, size_mm) = centroid_and_size(points);
         let mut problem = Problem {
@@ -405,8 +429,13 @@ impl<'a> Search<'a> {
         self.assess_candidate(&problem.surface, pose, points)
     }
 
-    /// Returns the pose with the smallest rotation from the model frame to the CMM frame, among the poses that fit as
-    /// well as `best`. If the surface does not determine a rotation, only the coordinates in the file do.
+    /// Returns the pose with the smallest rotation between model frame and CMM frame, among the poses that fit as well
+    /// as `best`. These are the poses in `all`, and two more that are refined from start poses without rotation. A pose
+    /// fits as well if its rms is at most 1.1 times the rms of `best` plus 1e-5 mm. Returns `best` if the selected pose
+    /// is nearly equal to `best`.
+    ///
+    /// The reason: if the surface does not determine a rotation, the coordinates in the measured file are the only
+    /// information about it.
     fn prefer_file_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
         /// Largest ratio of two rms that differ by chance.
         const MAX_RMS_RATIO: f64 = 1.1;
@@ -444,8 +473,9 @@ impl<'a> Search<'a> {
             .unwrap_or(best)
     }
 
-    /// Returns the poses in `all` that fit nearly as well as `best` (less than 1.5 times its rms) and differ clearly
-    /// from it.
+    /// Returns the other poses in `all` that fit nearly as well as `best` and clearly differ from `best`. A pose fits
+    /// nearly as well if it is on the same side, has an rms below 1.5 times that of `best`, and has a share of points
+    /// beyond the edge that is larger by at most 0.02.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
@@ -458,8 +488,9 @@ impl<'a> Search<'a> {
             .collect()
     }
 
-    /// Returns 48 start poses that align the principal axes of the nominal points and of the measured points: the
-    /// shortest axis in both directions, and in each 24 rotations about it in steps of 15°.
+    /// Returns 48 start poses for the given side of the surface. Each aligns the principal axes of the nominal points
+    /// with those of the measured points. The shortest axis is taken in both directions. For each direction there are
+    /// 24 rotations about this axis, in steps of 15°.
     fn by_principal_axes(&self, side: Side) -> Vec<Pose> {
         const STEPS_PER_TURN: usize = 24;
         let frame = |points: &[Point]| {
@@ -486,8 +517,9 @@ impl<'a> Search<'a> {
         starts
     }
 
-    /// Returns start poses from curvature. Each maps a place of the measured cloud to a place of the offset surface
-    /// with similar principal curvatures.
+    /// Returns start poses that match curvatures, for the given side of the surface. Each pose maps a place of the
+    /// offset surface to a place of the measured points with similar principal curvatures. Returns an empty list if the
+    /// surface has fewer than 36 places with known curvature.
     fn by_curvature(&self, side: Side) -> Vec<Pose> {
         let on_nominal = self.part.nominal.features();
         if on_nominal.len() < MATCHES_PER_FEATURE {
@@ -501,16 +533,17 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Excludes the points beyond the edge from the fit, and includes all others. If at least half of the points are beyond
-/// the edge, the pose is too far off and all points are included.
+/// Excludes from the fit the points whose projections are beyond the edge of the surface, and includes all other
+/// points. Includes all points if at least half of them are beyond the edge: the pose is then too far off to decide.
 fn exclude_off_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
     correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
 }
 
-/// Selects about 24 features from the half with the largest difference of the two principal curvatures. With a large
-/// difference the principal directions are certain.
+/// Selects at most 24 `features` (places with principal curvatures). They are spread over the half of the list with the
+/// largest difference between the two principal curvatures. With a large difference the principal directions are
+/// certain.
 fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
     features.truncate((features.len() / 2).max(MEASURED_FEATURES));
@@ -518,8 +551,9 @@ fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature
     features.into_iter().step_by(stride).collect()
 }
 
-/// Returns poses that map the 36 features of `offset` with the most similar principal curvatures to the feature
-/// `measured`. Each match gives two poses, because a principal direction has no sign.
+/// Returns start poses from one place of the measured points, `measured`. Selects the 36 places in `offset`, the offset
+/// surface, whose principal curvatures are most similar. Each pose maps one of these places to `measured`. Each pair of
+/// places gives two poses, because a principal direction has no sign.
 fn poses_by_feature(measured: &CurvatureFeature, offset: &[CurvatureFeature]) -> Vec<Pose> {
     let unlike = |f: &CurvatureFeature| {
         (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
@@ -552,7 +586,8 @@ impl Frame {
         Self { origin, axes: nalgebra::Matrix3::from_columns(&[first, second, normal]) }
     }
 
-    /// Returns the pose that maps another frame to this one.
+    /// Returns the pose that maps the frame `other` to this frame: its origin to this origin, and its axes to these
+    /// axes.
     fn from(&self, other: &Frame) -> Pose {
         let rotation = self.axes * other.axes.transpose();
         Pose { rotation, translation_mm: self.origin.coords - rotation * other.origin.coords }.orthonormalised()

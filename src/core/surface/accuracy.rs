@@ -139,9 +139,12 @@ pub enum Reliability {
 }
 
 impl ErrorEstimate {
-    /// Returns the node spacing in mm at which the PV error away from the border equals `wanted_pv_mm`, extrapolated by
-    /// the order p of this estimate. The result is at most the spacing of the coarsest sampling that the estimate used.
-    /// Returns `None` if rounding or noise of the points alone exceeds `wanted_pv_mm`.
+    /// Returns the node spacing in mm at which the PV error away from the border equals `wanted_pv_mm`. Extrapolates
+    /// with the order p of this estimate (the error is proportional to the p-th power of the spacing). The result is at
+    /// most the spacing of the coarsest sampling that the estimate used.
+    ///
+    /// If the error is only rounding or noise of the points, returns the present spacing, or `None` if this error
+    /// exceeds `wanted_pv_mm`.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
         if self.reliability == Reliability::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
@@ -151,13 +154,14 @@ impl ErrorEstimate {
     }
 }
 
-/// Estimates the errors of the distances to a nominal surface through these points. Builds coarser surfaces from a part
-/// of the points, and measures the distances of the withheld points from them, see the module documentation.
+/// Estimates the errors of the distances to a nominal surface through the points of `samples`. Builds two coarser
+/// surfaces from a part of the points, and measures the distances of the withheld points from these surfaces. The
+/// errors of the two give the error of the full sampling by extrapolation. See the module documentation.
 ///
 /// Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Returns an error if the points make no surface, or if there are too few points to withhold most of them.
+/// Returns an error if the points do not form a surface, or if there are too few points to withhold most of them.
 pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceError> {
     let (points, [factor, coarsest], [mut fine, mut coarse]) = match samples {
         NominalPoints::Grid { columns, rows, points, normals } => {
@@ -210,7 +214,7 @@ struct WithheldErrors {
 }
 
 impl WithheldErrors {
-    /// Counts the points near the border as points inside.
+    /// Moves all withheld points near the border to the points inside.
     fn merge_border(&mut self) {
         self.inside.append(&mut self.border);
     }
@@ -222,8 +226,8 @@ struct WithheldPoint {
     errors_mm: [f64; 2],
 }
 
-/// Builds a coarser grid from every `stride`-th node along both axes, with the given normals. Measures the errors of
-/// its distances at the other nodes.
+/// Builds a coarser grid from every `stride`-th node along both axes, with the normals of these nodes. Measures the
+/// distances of the other nodes from the coarser grid, in mm. These distances are the errors of the coarser grid.
 ///
 /// # Errors
 /// Returns an error if the coarser grid has fewer than 3 nodes along an axis.
@@ -249,12 +253,15 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
     (0..rows).step_by(stride).flat_map(move |j| (0..columns).step_by(stride).map(move |i| j * columns + i))
 }
 
-/// Chooses the points of two coarser samplings. Returns for each the ratio of its spacing to the spacing of all points,
-/// and the indices of its points.
+/// Chooses the points of two coarser samplings. Returns two ratios and two lists of point indices, one for each
+/// sampling. A ratio is the spacing of the sampling divided by the spacing of all points.
+///
+/// Keeps every third and every sixth node along both axes if the points form a grid. Otherwise keeps one point in 4 and
+/// one in 16, or one in 2 and one in 4 if there are fewer than 600 points.
 ///
 /// # Errors
-/// Returns an error if there are fewer than 9 points, if they lie on one line, or if no projection to a plane is
-/// one-to-one.
+/// Returns an error if points that form no grid are fewer than 9, lie on one line, or have no one-to-one projection to
+/// a plane.
 fn choose_coarse_points(
     points: &[Point],
     projection: PlaneProjection,
@@ -300,10 +307,10 @@ fn morton_order(points: &[Point], map: &Projector) -> Vec<u32> {
 }
 
 /// Builds a coarser surface from the points with the indices `kept`, with normals fitted to these points. Measures the
-/// errors of its distances at all other points.
+/// distances of all other points from this surface, in mm. These distances are the errors of the coarser surface.
 ///
 /// # Errors
-/// Returns an error if the kept points make no surface.
+/// Returns an error if the kept points do not form a surface.
 fn subset_errors(points: &[Point], kept: &[u32], projection: PlaneProjection) -> Result<WithheldErrors, SurfaceError> {
     let coarse = Nominal::from_points(kept.iter().map(|&k| points[k as usize]).collect(), projection)?;
     let mut left_out = vec![true; points.len()];
@@ -311,8 +318,9 @@ fn subset_errors(points: &[Point], kept: &[u32], projection: PlaneProjection) ->
     Ok(measure_withheld(&coarse, points, &left_out))
 }
 
-/// Measures the distances of the withheld points from the surface `coarse`. A point is withheld if its flag in
-/// `left_out` is true. Measures a sample of more than 150,000 points.
+/// Measures the distances of the withheld points from the surface `coarse`, in mm. A point is withheld if its flag in
+/// `left_out` is true. Sorts the points into those inside, and those within two spacings of the border. Omits points
+/// beyond the edge of `coarse`. Measures only a sample if there are 300,000 points or more.
 fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> WithheldErrors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
     let (flat, curved) =
@@ -341,9 +349,12 @@ fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Wi
     WithheldErrors { inside: strip(inside), border: strip(border), spacing_mm }
 }
 
-/// Extrapolates the errors of two coarser samplings, `fine` and `coarse`, to the sampling by all points (Richardson
-/// extrapolation). `kind` is 0 for the flat and 1 for the curved distance. `factor` is the spacing of `fine` divided by
-/// `spacing_mm`, the spacing of all points. `step` is the spacing of `coarse` divided by that of `fine`.
+/// Extrapolates the errors of two coarser samplings, `fine` and `coarse`, to the sampling with all points (Richardson
+/// extrapolation). `kind` is 0 for the flat distance and 1 for the curved distance. `factor` is the spacing of `fine`
+/// divided by `spacing_mm`, the spacing of all points. `step` is the spacing of `coarse` divided by the spacing of
+/// `fine`.
+///
+/// Does not extrapolate if the error is only rounding or noise. Panics if `fine` has no points inside.
 fn extrapolate_errors(
     fine: &WithheldErrors,
     coarse: &WithheldErrors,
@@ -387,8 +398,12 @@ fn observed_order(fine: &ErrorFigures, coarse: &ErrorFigures, step: f64) -> f64 
     if ratio > 0.0 && ratio.is_finite() { ratio.log2() / step.log2() } else { ORDER_RANGE[0] }
 }
 
-/// Returns how far an estimate can be trusted. `least` is the lowest plausible order; `rms_mm` is the error of the
-/// finer sampling, and `spacing_mm` the spacing of all points.
+/// Returns how reliable an error estimate is. `least` is the lowest plausible order (power of the spacing). `rms_mm` is
+/// the rms error of the finer sampling, and `spacing_mm` is the spacing of all points.
+///
+/// - `Extrapolated`: the order is plausible, or the error is below 1e-11 mm.
+/// - `Rounding`: the order is below `least`, and the error is less than 1e-4 of the spacing.
+/// - `TooCoarse`: the order is below `least` with a larger error, or above 5.
 fn assess_reliability(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Reliability {
     /// Upper limit of the tilt that rounding and noise cause; features between the points cause more.
     const MAX_TILT: f64 = 1e-4;

@@ -35,11 +35,12 @@ impl CurvatureFeature {
         }
     }
 
-    /// Returns the feature of the offset surface at this place, with the normal towards `side`. `radius_mm` is the
-    /// offset r. Returns `None` if the offset surface folds there.
+    /// Moves the feature onto the offset surface: by the distance `radius_mm` (r) along the normal towards `side`.
+    /// Returns the moved feature, with its normal towards `side` and the curvatures of the offset surface. Returns
+    /// `None` if 1 - r k is not positive for a principal curvature k: the offset surface folds there.
     ///
-    /// Equation: a normal curvature k towards the side of the offset becomes k / (1 - r k); the principal directions do
-    /// not change.
+    /// Equation: a normal curvature k, positive if the surface bends towards `side`, becomes k / (1 - r k). The
+    /// principal directions do not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
         let seen = if side == Side::Normal { *self } else { self.flipped() };
         let room = seen.curvatures.map(|k| 1.0 - radius_mm * k);
@@ -54,11 +55,14 @@ impl CurvatureFeature {
 /// Number of nearest points that a local fit uses, including the point itself.
 const NEIGHBOURS: u32 = 25;
 
-/// Fits the principal curvatures at each point to its 24 nearest neighbours. Uses `normals`, one per point, if they are
-/// given. Omits points whose neighbours do not form a surface.
+/// Fits the normal and the principal curvatures at each of the `points` to its 24 nearest neighbours. If `normals` are
+/// given, one unit normal per point, they are used instead of the fitted normals.
 ///
-/// A second fit excludes the neighbours that contradict the first. So an outlier spoils only its own feature and not
-/// the features around it.
+/// Returns one feature per point, in the order of the points. Omits a point if it has fewer than nine neighbours that
+/// differ from it, or if its fit is not finite.
+///
+/// After a first fit, neighbours with large residuals are excluded, and the fit is repeated. So an outlier spoils only
+/// the feature at the outlier itself, and not the features around it.
 pub(crate) fn fit_features(points: &[Point], normals: Option<&[Vector]>) -> Vec<CurvatureFeature> {
     let tree = PointTree::new(points.iter().copied());
     (0..points.len())
@@ -72,7 +76,10 @@ pub(crate) fn fit_features(points: &[Point], normals: Option<&[Vector]>) -> Vec<
         .collect()
 }
 
-/// Fits the principal curvatures at the point `at` to the points `around` it. `known` is the normal, if it is given.
+/// Fits the principal curvatures at the point `at` to the neighbours `around`, which do not contain `at`. `known` is
+/// the unit normal at `at`; if it is `None`, the normal is fitted too. A second fit excludes the neighbours with a
+/// residual above six times the median.
+///
 /// Returns `None` if there are fewer than nine neighbours, or if the fit is not finite.
 fn fit_feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<CurvatureFeature> {
     if around.len() < 9 {

@@ -35,15 +35,16 @@ const TWINS: f64 = 1e-4;
 /// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
 const MAX_COORDINATE: f64 = 3.2e60;
 
-/// Triangulates scattered points in the plane of the projector `map` (Delaunay). Then removes flat triangles at the
-/// convex hull and triangles that bridge holes.
+/// Triangulates scattered points by the Delaunay method in a plane. The projector `map` projects the points to this
+/// plane. Then removes flat triangles at the convex hull, and triangles that bridge holes.
 ///
-/// Shapes: returns the points in a new order, in which neighbours in the plane are mostly neighbours in memory, and the
-/// triangles. Their corners index the returned points, counter-clockwise in the plane.
+/// Shapes: returns the points in a new order and the triangles. The order follows a Z-curve, so that neighbours in the
+/// plane are mostly neighbours in memory. The corners of a triangle are indices of the returned points,
+/// counter-clockwise in the plane.
 ///
 /// # Errors
-/// Returns an error if a coordinate is not finite or too large, if two points coincide or nearly coincide in the plane,
-/// if all points lie on one line, or if one point is far off the others.
+/// Returns an error if a coordinate is not finite or is too large, if two points coincide or nearly coincide in the
+/// plane, if all points lie on one line, or if one point is far from all other points.
 pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Point>, Triangles), SurfaceError> {
     let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(flushed_to_zero)).collect();
     if let Some(index) = places.iter().position(|p| !(p[0].abs() <= MAX_COORDINATE && p[1].abs() <= MAX_COORDINATE)) {
@@ -77,8 +78,8 @@ pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Poin
     Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
-/// Sorts places (u, v) of the plane along a Z-curve (Morton order). Returns for each its key on the curve and its index
-/// in `places`. Places with equal keys are sorted by u, then by v.
+/// Returns one pair per point (u, v) of `places`: the key of the point on a Z-curve (Morton order), and the index of
+/// the point in `places`. The pairs are sorted by key. Pairs with equal keys are sorted by u, then by v.
 pub(crate) fn z_curve_order(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
@@ -115,8 +116,8 @@ fn flushed_to_zero(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
 
-/// Returns the error that names two points with the same place in the plane. The caller knows that there are such
-/// points.
+/// Returns the error that names two points whose `places` in the plane are equal: the first such pair in the order of
+/// u, then v. At least two places must be equal.
 fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     let mut order: Vec<usize> = (0..places.len()).collect();
     let key = |i: usize| (places[i][0], places[i][1]);
@@ -133,7 +134,8 @@ struct EdgeLengths {
 }
 
 impl EdgeLengths {
-    /// Computes the edge lengths of all triangles in the plane, in mm.
+    /// Computes the shortest and the longest edge of each triangle in `t`, and the median of the longest edges. Lengths
+    /// are measured between the `places` of the vertices in the plane, in mm. There must be at least one triangle.
     fn new(t: &Triangles, places: &[[f64; 2]]) -> Self {
         let of = |corners: &[u32; 3]| {
             let [a, b, c] = squared_lengths(corners, places);
@@ -144,8 +146,9 @@ impl EdgeLengths {
     }
 }
 
-/// Returns two points nearer to each other than 1e-4 times the usual edge length: the surface between them would
-/// consist of rounding errors. Returns `None` if there are none.
+/// Returns the indices of two vertices that are nearer to each other than 1e-4 times the median of the longest edges of
+/// all triangles. The surface between two such points would consist of rounding errors. Returns `None` if no edge is
+/// that short.
 fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
     let least = TWINS * lengths.median_max_edge;
     let facet = lengths.min_edge.par_iter().position_first(|shortest| *shortest < least)?;
@@ -155,8 +158,9 @@ fn find_near_duplicates(t: &Triangles, lengths: &EdgeLengths, places: &[[f64; 2]
     Some([corners[(across + 1) % 3], corners[(across + 2) % 3]])
 }
 
-/// Removes the triangles that bridge holes, and then, from the border inwards, the needles: border triangles much
-/// flatter than their border edge is long.
+/// Returns the triangles without bridges and needles. First removes the bridges: triangles that close a hole of the
+/// surface. Then removes the needles, from the border inwards. A needle is a triangle with a border edge whose height
+/// over this edge is less than 0.05 of the edge length.
 fn without_bridges_and_needles(mut t: Triangles, lengths: &EdgeLengths, places: &[[f64; 2]]) -> Triangles {
     let mut dropped = vec![false; t.corners.len()];
     let mut open: Vec<u32> = Vec::new();
@@ -173,8 +177,9 @@ fn without_bridges_and_needles(mut t: Triangles, lengths: &EdgeLengths, places: 
     compact(t, &dropped)
 }
 
-/// Marks a triangle as removed and makes its edges border edges. Appends its neighbours to `open`, because they are at
-/// the border now.
+/// Removes triangle number `facet`: sets its flag in `dropped`. The edges that the triangle shares with its neighbours
+/// become border edges of these neighbours. Appends the neighbours to `open`, the list of triangles whose border must
+/// be checked.
 fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Vec<u32>) {
     dropped[facet as usize] = true;
     for neighbour in t.neighbours[facet as usize] {
@@ -196,8 +201,9 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     })
 }
 
-/// Returns the triangles whose longest edge is more than six times the usual edge length around their corners, see
-/// [`usual_lengths`].
+/// Returns the numbers of the triangles that bridge a hole. In such a triangle the longest edge is more than six times
+/// the usual edge length. The usual length is the largest value of [`usual_lengths`] at the three corners, and at least
+/// the median of the longest edges of all triangles.
 fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
@@ -216,12 +222,18 @@ fn find_bridges(t: &Triangles, lengths: &EdgeLengths) -> Vec<u32> {
         .collect()
 }
 
-/// Returns the usual edge length at each corner of the triangles `suspects`, by vertex. It is the lower quartile of the
-/// longest edges of the triangles that meet there, because at the rim of a hole half of these triangles can be bridges.
+/// Returns the usual edge length in mm at each vertex of the triangles `suspects`: a map from the vertex to the length.
 ///
-/// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller must compare
-/// with the largest value of the three corners. A stray point would justify its own bridges. Therefore the value of a
-/// corner is limited to the second largest value of its neighbours.
+/// The length at a vertex is the lower quartile of the longest edges of the triangles around this vertex. The lower
+/// quartile is used because at the rim of a hole half of these triangles can be bridges (triangles that close the
+/// hole).
+///
+/// Two rules apply:
+///
+/// - A single stray point must not justify its own bridges. So the length at a vertex is limited to the second largest
+///   of the quartiles at the neighbouring vertices.
+/// - A triangle between a dense and a sparse region has the edge length of the sparse region. So the caller must
+///   compare its longest edge with the largest of the lengths at its three corners.
 fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> HashMap<u32, f64> {
     let neighbours = triangles_at(t, suspects.iter().flat_map(|&f| t.corners[f as usize]));
     let around = triangles_at(t, neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]));
@@ -264,7 +276,8 @@ fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {
     (0..3).any(|k| t.neighbours[facet as usize][k] == BORDER && double_area < NEEDLE * squared[k])
 }
 
-/// Removes the triangles whose flag in `dropped` is true, and renumbers the others in their order.
+/// Returns the triangles without those whose flag in `dropped` is true. The remaining triangles keep their order and
+/// are renumbered. Their neighbour numbers are adapted; a removed neighbour becomes [`BORDER`].
 fn compact(t: Triangles, dropped: &[bool]) -> Triangles {
     if !dropped.contains(&true) {
         return t;

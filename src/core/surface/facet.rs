@@ -63,8 +63,9 @@ pub(crate) trait Facets: Sync {
     /// Returns the three corners of a facet, as indices of vertices.
     fn corners(&self, facet: u32) -> [u32; 3];
 
-    /// Returns the next facet on the way to a point. `weights` are the barycentric weights of the point in `facet`.
-    /// Returns `None` if the surface ends on the way, or if the way leads to no other facet.
+    /// Returns the next facet of a walk towards the projection of a point. `weights` are the barycentric weights of the
+    /// point in the current facet `facet`; a negative weight means that the point lies beyond an edge. Returns `None`
+    /// if the surface ends in this direction, or if the walk would stay in the same facet.
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
 
     /// Returns true if the surface ends at one edge of a facet: the edge opposite to the corner with the number
@@ -117,8 +118,9 @@ impl<T: Real> Facet<T> {
         minus(&self.corners[to], &self.corners[from])
     }
 
-    /// Returns the barycentric weights of a point projected onto the plane of the flat facet. `w` is the vector from
-    /// corner 0 to the point.
+    /// Returns the barycentric weights of a point projected perpendicularly onto the plane of the flat facet. Weight k
+    /// belongs to corner k, and the sum of the weights is 1. A negative weight means that the projection lies outside
+    /// the facet. `w` is the vector from corner 0 to the point, in mm.
     #[inline(always)]
     pub(crate) fn weights(&self, w: &[T; 3]) -> [T; 3] {
         let (e1, e2) = (self.edge(0, 1), self.edge(0, 2));
@@ -163,16 +165,18 @@ impl<T: Real> Facet<T> {
         along + T::splat(0.5) * total * b[0] * b[1] * b[2]
     }
 
-    /// Returns the distance of a point from the plane of the flat facet, eq. (2) of the paper, and the unit normal of
-    /// this plane. `w` is the vector from corner 0 to the point.
+    /// Returns the signed distance of a point from the plane through the three corners, in mm, and the unit normal of
+    /// this plane; eq. (2) of the paper. The distance is positive on the side of the probe. `w` is the vector from
+    /// corner 0 to the point, in mm.
     #[inline(always)]
     pub(crate) fn flat_distance(&self, w: &[T; 3]) -> (T, [T; 3]) {
         let flat = self.flat_normal();
         (dot(w, &flat), flat)
     }
 
-    /// Returns the distance of a point from the curved surface, and the unit normal of the surface at the projection.
-    /// `w` is the vector from corner 0 to the point; `b` are the barycentric weights of the projection.
+    /// Returns the signed distance of a point from the curved surface, in mm, and the unit normal of the curved surface
+    /// at the projection of the point. The distance is positive on the side of the probe. `w` is the vector from corner
+    /// 0 to the point, in mm. `b` are the barycentric weights of the projection.
     #[inline(always)]
     pub(crate) fn curved_distance(&self, w: &[T; 3], b: &[T; 3]) -> (T, [T; 3]) {
         let (flat_mm, flat) = self.flat_distance(w);
@@ -188,18 +192,20 @@ fn weighted<T: Real>(v: &[[T; 3]; 3], b: &[T; 3]) -> [T; 3] {
     [at(0), at(1), at(2)]
 }
 
-/// Moves a vertex along its normal onto the offset surface, eq. (3) of the paper. Returns the point, and the unit
-/// normal towards the side of the probe. `sign` is +1 if this is the side of the normals, otherwise -1.
+/// Moves a vertex of the nominal surface by `radius_mm` along its normal onto the offset surface, eq. (3) of the paper.
+/// Returns the moved point, and the unit normal towards the side of the probe. `sign` is +1 if the probe is on the side
+/// of the given normal, otherwise -1.
 #[inline(always)]
 pub(crate) fn offset_corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius_mm: T) -> Corner<T> {
     let normal = times(&normal, sign);
     ([point[0] + normal[0] * radius_mm, point[1] + normal[1] * radius_mm, point[2] + normal[2] * radius_mm], normal)
 }
 
-/// Packs four vertices into lanes. Returns their points and their normals.
+/// Packs four vertices into SIMD lanes, one vertex per lane. Returns their points and their normals, each as x, y and z
+/// of the four vertices.
 ///
-/// Every vector is built from registers. If it were built through an array in memory, it would wait for four narrow
-/// stores.
+/// Each SIMD vector is built directly from registers. This avoids an array in memory, because reading that array would
+/// wait for four narrow stores.
 #[inline(always)]
 pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
     let normal = [
@@ -210,7 +216,7 @@ pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3
     (points_x4(&[a.point, b.point, c.point, d.point]), normal)
 }
 
-/// Packs the coordinates of four points into lanes, one point per lane.
+/// Packs four points into SIMD lanes, one point per lane. Returns x, y and z of the four points.
 #[inline(always)]
 pub(crate) fn points_x4(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;

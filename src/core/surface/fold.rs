@@ -23,8 +23,11 @@ const STEP: usize = 2;
 const PROBE_ENLARGEMENT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
-    /// Returns an error that names the most concave place where the offset surface folds; `None` if no fold is found.
-    /// Checks all facets of a grid, and up to [`MAX_CHECKED_FACETS`] facets of a mesh.
+    /// Searches for folds of the offset surface: places where the nominal surface is more concave than the probe.
+    /// Returns an error that names the most concave fold. Returns `None` if no fold is found, or if the probe radius is
+    /// 0.
+    ///
+    /// Checks each grid over its whole area, and up to [`MAX_CHECKED_FACETS`] facets of each mesh.
     pub(crate) fn find_fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
@@ -33,9 +36,10 @@ impl OffsetSurface<'_> {
         self.worst_fold(patches.iter().flat_map(|patch| self.folded_facets(patch).into_iter().map(move |f| (patch, f))))
     }
 
-    /// Returns an error that names the most concave place where the offset surface folds among the facets `touched`;
-    /// `None` if none of them folds. Checks only facets of meshes, because [`OffsetSurface::find_fold`] checks a whole
-    /// grid.
+    /// Searches for folds of the offset surface at the facets `touched`, onto which measured points project. Returns an
+    /// error that names the most concave fold. Returns `None` if no facet folds, or if the probe radius is 0.
+    ///
+    /// Checks only facets of meshes, because [`OffsetSurface::find_fold`] already checks each grid over its whole area.
     pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = FacetIndex>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
         let is_mesh = |patch: &Patch| matches!(patch.topology, Topology::Mesh(_));
@@ -56,8 +60,11 @@ impl OffsetSurface<'_> {
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
-    /// Returns the facets of a patch at which the offset surface folds. Checks all facets of a grid, and a sample of
-    /// the facets of a mesh.
+    /// Returns the numbers of the facets of a patch at which the offset surface folds.
+    ///
+    /// A grid is checked in two steps. The first step checks facets two nodes wide with an enlarged probe. Only if one
+    /// of these facets folds, the second step checks one facet of each cell. In a mesh, up to [`MAX_CHECKED_FACETS`]
+    /// facets spread over the mesh are checked.
     fn folded_facets(&self, patch: &Patch) -> Vec<u32> {
         match &patch.topology {
             Topology::Grid(grid) => {
@@ -83,8 +90,9 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the work for the first check of a grid: facets [`STEP`] nodes wide along the row of nodes with the
-    /// number `row`, and the enlarged offset.
+    /// Returns the input for the coarse check of one row of a grid: the nodes of row `row`, the nodes [`STEP`] rows
+    /// above (or of the last row), and the signed offset in mm for the enlarged probe. The offset is negative if the
+    /// probe is on the side opposite to the normals.
     fn wide_row<'a>(&self, grid: &GridTopology, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
@@ -95,8 +103,11 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns true if the offset reverses a facet or makes it flat: the matrix E + r B is not positive definite. E and
-    /// B are the fundamental forms, see [`Self::fundamental_forms`], and r is the probe radius.
+    /// Returns true if the offset by the probe radius reverses a facet or makes it flat. `corners` are the vertices of
+    /// the facet.
+    ///
+    /// Criterion: the matrix E + r B is not positive definite. E and B are the fundamental forms of the facet, see
+    /// [`Self::fundamental_forms`], and r is the probe radius.
     #[inline]
     fn is_folded(&self, patch: &Patch, corners: [u32; 3]) -> bool {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
@@ -105,8 +116,10 @@ impl OffsetSurface<'_> {
         is_not_positive_definite(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
-    /// Returns the smallest normal curvature of a facet in 1/mm. It is negative if the facet is concave as seen from
-    /// the side of the probe. It is the smallest eigenvalue of E^-1 B, where E and B are the fundamental forms, see
+    /// Returns the smallest normal curvature of facet number `facet` in 1/mm. The curvature is negative if the facet is
+    /// concave as seen from the side of the probe.
+    ///
+    /// Equation: the smallest eigenvalue of E^-1 B. E and B are the fundamental forms of the facet, see
     /// [`Self::fundamental_forms`].
     fn min_curvature(&self, patch: &Patch, facet: u32) -> f64 {
         let ([e, f, g], [l, m, k]) = self.fundamental_forms(patch, patch.corners(facet));
@@ -116,12 +129,14 @@ impl OffsetSurface<'_> {
         mean - (mean * mean - gauss).max(0.0).sqrt()
     }
 
-    /// Returns the first and the second fundamental form, E and B, of a facet with the corners a, b and c. The basis
-    /// are the edges e_1 = b - a and e_2 = c - a; the normals point to the side of the probe. Each form is given by its
-    /// entries 11, 12 and 22.
+    /// Returns the first and the second fundamental form, E and B, of a facet with the corners a, b and c. Each form is
+    /// a symmetric 2 x 2 matrix, given by its entries 11, 12 and 22. The entries are with respect to the basis e_1 = b
+    /// - a and e_2 = c - a.
     ///
-    /// Along an edge e the normal changes by dn = K e. With E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j,
-    /// K is E^-1 B. The offset by r has the first form E + 2 r B + O(r^2). It is singular where E + r B is.
+    /// Equations: the unit normal n points to the side of the probe and changes by dn_j along the edge e_j. E_ij = e_i
+    /// . e_j, and B_ij is the symmetric part of e_i . dn_j. With the linear map K from an edge to the change of the
+    /// normal, dn = K e and K = E^-1 B. The surface offset by r has the first fundamental form E + 2 r B + O(r^2). The
+    /// offset surface is singular if E + r B is singular.
     #[inline]
     fn fundamental_forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
         let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
@@ -143,7 +158,8 @@ struct WideRow<'a> {
 impl pulp::NullaryFnOnce for WideRow<'_> {
     type Output = bool;
 
-    /// Returns true if the offset by `reach` folds any facet of the row. Facets at holes do not count.
+    /// Returns true if the offset by `reach`, a signed length in mm, folds at least one facet of this row. A facet with
+    /// a hole as a corner has NaN coordinates and does not count.
     #[inline(always)]
     fn call(self) -> bool {
         let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);
@@ -169,9 +185,11 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 }
 
 impl WideRow<'_> {
-    /// Returns true if the offset folds any of four facets, one per lane. `here`, `next` and `up` are the points and
-    /// normals of the corners: the first, the next in the row, and the one in the row above. See
-    /// [`is_not_positive_definite`] for the criterion.
+    /// Returns true if the offset by `reach` folds at least one of four facets, one per SIMD lane. `here`, `next` and
+    /// `up` are the three corners of the facets: the first corner, the next corner in the same row, and the corner in
+    /// the row above. Each is a pair of points and unit normals.
+    ///
+    /// A facet folds if its matrix is not positive definite, as in [`is_not_positive_definite`].
     #[inline(always)]
     fn any_folds_x4(
         &self,
@@ -194,9 +212,11 @@ impl WideRow<'_> {
     }
 }
 
-/// Returns true if the offset by r folds a facet: E + r B is not positive definite, where E and B are the first and
-/// second fundamental form over the edges `e1` and `e2`. `d1` and `d2` are r times the change of the unit normal along
-/// each edge. Returns false for NaN.
+/// Returns true if the offset by r folds a facet with the edges `e1` and `e2` from one corner. `d1` and `d2` are r
+/// times the change of the unit normal along `e1` and `e2`. Returns false if a vector contains NaN.
+///
+/// Criterion: the matrix E + r B is not positive definite. E and B are the first and the second fundamental form with
+/// respect to the basis `e1`, `e2`.
 #[inline(always)]
 fn is_not_positive_definite(e1: Vector, e2: Vector, d1: Vector, d2: Vector) -> bool {
     let e = e1.dot(&(e1 + d1));

@@ -24,7 +24,8 @@ pub(crate) struct GridTopology {
     regular: Option<([f64; 2], [f64; 2])>,
 }
 
-/// Returns the points in the order of the nodes of the grid, with NaN at a node that has no point.
+/// Returns one point per node of the grid, row by row with x fastest. A node without a point gets NaN coordinates.
+/// `order` gives the index in `points` for each node.
 pub(crate) fn reorder_to_grid(points: Vec<Point>, order: &GriddedCloud) -> Vec<Point> {
     if order.is_ordered() {
         return points;
@@ -74,8 +75,9 @@ impl GridTopology {
         self.rows as usize
     }
 
-    /// Returns the first of the two facets of each cell in a row of cells, with its corners. It has the corners 00, 10
-    /// and 11 of the cell. Facets at holes are included.
+    /// Returns the lower right facet of each cell in row `row` of the cells: the facet number and the node indices of
+    /// its three corners. The corners are the nodes 00, 10 and 11 of the cell; the first digit counts columns, the
+    /// second digit rows. The facets are returned even if a corner is a hole.
     pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
         let first = row as u32 * self.columns;
         (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
@@ -100,8 +102,9 @@ impl GridTopology {
         nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
     }
 
-    /// Returns a facet near a node: a facet of the cell that begins at the node, or of the nearest cell whose four
-    /// nodes exist.
+    /// Returns the lower right facet of the cell whose first node is `node`. If a node of this cell is a hole, or if
+    /// `node` is in the last row or column, returns the lower right facet of a cell nearby whose four nodes exist.
+    /// Returns facet 0 if the grid has no such cell.
     pub(crate) fn facet_near(&self, node: u32) -> u32 {
         let (i, j) = (node % self.columns, node / self.columns);
         let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
@@ -128,9 +131,12 @@ impl GridTopology {
         (node % self.columns, node / self.columns)
     }
 
-    /// Returns the cell that lies `u` columns and `v` rows from the cell (i, j), clamped to the grid. If one of its
-    /// four nodes does not exist, halves `u` and `v` until they lead to a cell whose four nodes exist. Returns `None`
-    /// if there is no such cell.
+    /// Returns the column and the row of the cell that contains a target point. The target is `u` columns and `v` rows
+    /// away from the first node of the cell (i, j); `u` and `v` may be fractions or negative. The target is clamped to
+    /// the grid.
+    ///
+    /// If a node of the target cell is a hole, halves `u` and `v` until the four nodes of the cell exist. Returns
+    /// `None` if the halving reaches the cell (i, j) or 1e-4 of the distance without success.
     fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
         let clamp =
             |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
@@ -175,9 +181,12 @@ impl Facets for GridTopology {
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }
 
-    /// Returns the next facet on the way to a point. Continues `facet` as a plane to find the cell to which the
-    /// barycentric `weights` of the point lead. Returns `None` if that is the same facet, or if no cell exists on the
-    /// way.
+    /// Returns the next facet of a walk towards the projection of a point. `weights` are the barycentric weights of the
+    /// point in the facet `facet`.
+    ///
+    /// Continues the plane of `facet` beyond its edges, and jumps to the cell in which the point lies in this plane. If
+    /// a node of that cell is a hole, takes a cell on the line between. Returns `None` if the new facet is `facet`
+    /// itself, or if no such cell has four nodes.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let (u, v) =
@@ -248,12 +257,14 @@ const DERIVATIVES: [&[&[f64]]; 6] = [
     ],
 ];
 
-/// Fits the unit normals of the nodes of a grid, and returns each node with its normal. The directions of column, row
-/// and normal are right-handed.
+/// Fits the unit normals of the nodes of a grid. Returns one vertex per node, in grid order: the point and its normal.
+/// The directions of growing column number, of growing row number and of the normal are right-handed. The normal is NaN
+/// at a hole, and at a node that has no neighbour in its row or in its column.
 ///
-/// Shapes: one vertex per node, in grid order. The normal is NaN at holes, and at nodes that have no neighbour along a
-/// row or along a column. Equation: the tangents are the derivatives of the quartics through five nodes along the row
-/// and along the column, central inside and one-sided at the border. The normal is their cross product.
+/// Equation: the normal is the cross product of the tangents along the row and along the column. A tangent is the
+/// derivative of the quartic polynomial through five nodes on the grid line. Inside the grid the five nodes are centred
+/// on the node. At the border and near holes they are one-sided. If fewer than five consecutive nodes exist, the degree
+/// is lower.
 pub(crate) fn fit_grid_nodes(points: &[Point], lattice: &GridTopology) -> Vec<Vertex> {
     let arch = pulp::Arch::new();
     // Whole blocks are written directly into the result; the last block is filled up with the last node.
@@ -279,7 +290,8 @@ struct NodeBlock<'a> {
 impl pulp::NullaryFnOnce for NodeBlock<'_> {
     type Output = [Vertex; BLOCK];
 
-    /// Returns the nodes of the block with their fitted normals.
+    /// Returns the 32 nodes of this block, from the index `first` on, with their fitted unit normals. Past the end of
+    /// the grid the last node is repeated.
     #[inline(always)]
     fn call(self) -> [Vertex; BLOCK] {
         const NONE: Vertex = Vertex { point: Point::new(0.0, 0.0, 0.0), normal: Vector::new(0.0, 0.0, 0.0) };
@@ -304,8 +316,9 @@ impl pulp::NullaryFnOnce for NodeBlock<'_> {
 }
 
 impl NodeBlock<'_> {
-    /// Fits the normals of four nodes of one row from the index `first` on, and writes them to `nodes`. The grid must
-    /// have no holes, and no node may be within two nodes of the border.
+    /// Fits the unit normals of four consecutive nodes of one row, from the index `first` on, in SIMD lanes. Writes the
+    /// nodes with their normals to `nodes`. The grid must have no holes. Each of the four nodes must have at least two
+    /// nodes on every side in its row and in its column.
     #[inline(always)]
     fn fit_inside_x4(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.topology.columns()));
@@ -317,8 +330,11 @@ impl NodeBlock<'_> {
         }
     }
 
-    /// Returns the derivative along a grid line at four nodes from the index `node` on, one per lane. It is the central
-    /// derivative of the quartic through five nodes that are `stride` indices apart.
+    /// Returns the derivative of the position with respect to the node number on a grid line, in mm, at four nodes from
+    /// the index `node` on, one node per SIMD lane. `stride` is the index step along the line: 1 for a row, the number
+    /// of columns for a column.
+    ///
+    /// Equation: the central derivative of the quartic polynomial through five nodes of the line.
     #[inline(always)]
     fn central_derivative(&self, node: usize, stride: usize) -> Vector3x4 {
         let near = minus(&self.points_x4(node + stride), &self.points_x4(node - stride));
@@ -326,7 +342,7 @@ impl NodeBlock<'_> {
         minus(&times(&near, F64x4::splat(2.0 / 3.0)), &times(&far, F64x4::splat(1.0 / 12.0)))
     }
 
-    /// Packs the four points from the index `first` on into lanes.
+    /// Packs the four points from the index `first` on into SIMD lanes. Panics if fewer than four points are left.
     #[inline(always)]
     fn points_x4(&self, first: usize) -> Vector3x4 {
         let (four, _) = self.points[first..].split_first_chunk::<LANES>().expect("inside the grid");
@@ -348,9 +364,12 @@ impl NodeBlock<'_> {
     }
 }
 
-/// Returns the derivative along a row or a column at a node, from a window of up to five existing nodes around it.
-/// `stride` is the distance of neighbouring nodes in the list; `at` is the number of the node on its line, and `count`
-/// the number of nodes on the line. Returns NaN if the node is a hole or has no neighbour on the line.
+/// Returns the derivative of the position with respect to the node number on a row or column, in mm, at the node with
+/// the index `node`. The derivative is that of the polynomial through up to five existing nodes around `node`. Returns
+/// NaN if the node is a hole or has no neighbour on the line.
+///
+/// `stride` is the index step between neighbouring nodes of the line. `at` is the number of the node on the line, from
+/// 0. `count` is the number of nodes on the line.
 fn line_derivative(
     points: &[Point],
     lattice: &GridTopology,

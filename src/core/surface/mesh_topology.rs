@@ -120,12 +120,13 @@ impl MeshTopology {
 }
 
 impl MeshTopology {
-    /// Writes the two rings of vertices around a vertex into `ring`: first its neighbours, counter-clockwise, then the
-    /// further neighbours of these, each vertex once. Returns the number of vertices in the first ring, and in both
-    /// rings together. Returns `None` if the surface ends within the rings, or if `ring` is too small.
+    /// Writes the vertices around `vertex` into `ring`, each once. First come the neighbours of `vertex`,
+    /// counter-clockwise (the first ring). Then come the other neighbours of these neighbours (the second ring).
+    /// Returns the number of vertices in the first ring, and the number in both rings together. Returns `None` if the
+    /// surface ends within the rings, or if `ring` is too small.
     ///
-    /// The facets around a neighbour are visited only on the side away from the vertex: from beyond one edge of the
-    /// first ring to beyond the next.
+    /// For speed, each neighbour of `vertex` is searched only on its outer side: among the facets outside the first
+    /// ring, from one edge of that ring to the next.
     #[inline(always)]
     pub(crate) fn two_rings<const N: usize>(&self, vertex: u32, ring: &mut [u32; N]) -> Option<[usize; 2]> {
         let place = |facet: u32, of: u32| self.corners[facet as usize].iter().position(|&c| c == of);
@@ -177,8 +178,11 @@ impl Facets for MeshTopology {
         self.corners[facet as usize]
     }
 
-    /// Returns the neighbour across the edge that the point is farthest beyond: the edge with the most negative
-    /// barycentric weight. Ignores edges without a neighbour. Returns `None` if no other edge has a negative weight.
+    /// Returns the next facet of a walk towards the projection of a point. `weights` are the barycentric weights of the
+    /// point in the facet `facet`. A negative weight means that the point lies beyond the edge opposite to that corner.
+    ///
+    /// Returns the neighbour across the edge with the most negative weight. Ignores border edges. Returns `None` if no
+    /// edge with a negative weight has a neighbour.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let across = &self.neighbours[facet as usize];
@@ -242,8 +246,9 @@ fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> 
     Some(SurfaceError::DoubledTriangles { count, at: points[first as usize].into() })
 }
 
-/// Returns one facet at each vertex, or [`BORDER`] if the vertex has none. At the border it is the facet from which the
-/// counter-clockwise order visits all facets of the vertex.
+/// Returns one facet number for each of the `vertices` vertices, or [`BORDER`] if no facet has this vertex. For a
+/// vertex on the border of the mesh, it is the facet from which a counter-clockwise walk around the vertex visits all
+/// its facets.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
     for (facet, c) in corners.iter().enumerate() {

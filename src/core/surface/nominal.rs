@@ -59,14 +59,17 @@ pub enum NominalKind {
 }
 
 impl Nominal {
-    /// Creates a surface from points in any order. Points on a regular grid in x and y are used without a
-    /// triangulation. Other points are triangulated in the plane of `projection`.
+    /// Creates a surface from points in any order. If `projection` is `Auto` or `Xy`, and the points form a regular
+    /// grid in x and y, the grid is used directly. Otherwise the points are triangulated in the plane of `projection`.
+    /// A projection is one-to-one if no two parts of the surface lie on the same place of the plane. `Auto` takes the
+    /// first one-to-one projection of these: the xy plane, the best-fit plane, the sphere.
     ///
     /// Shapes: at least 9 points.
     ///
     /// # Errors
-    /// Returns an error if there are too few points, a coordinate is not finite, two points coincide, the points lie on
-    /// one line, one point is far off the others, or no projection is one-to-one.
+    /// Returns an error if there are fewer than 9 points, if a coordinate is not finite, if all points lie on one line,
+    /// or if no allowed projection is one-to-one. Points that are triangulated also cause an error if two of them
+    /// coincide or nearly coincide, or if one point is far from all other points.
     pub fn from_points(points: Vec<Point>, projection: PlaneProjection) -> Result<Self, SurfaceError> {
         const MIN_POINTS: usize = 9;
         if points.len() < MIN_POINTS {
@@ -86,10 +89,12 @@ impl Nominal {
         Self::from_triangulated_points(points, projection)
     }
 
-    /// Creates a surface from points by triangulation, even if they form a grid.
+    /// Creates a surface from scattered points by triangulation in the plane of `projection`, even if the points form a
+    /// grid.
     ///
     /// # Errors
-    /// Returns the same errors as [`Nominal::from_points`].
+    /// Returns an error if a coordinate is not finite, if two points coincide or nearly coincide in the plane, if all
+    /// points lie on one line, if one point is far from all other points, or if no allowed projection is one-to-one.
     pub fn from_triangulated_points(points: Vec<Point>, projection: PlaneProjection) -> Result<Self, SurfaceError> {
         if points.len() > 3 && is_line(&points) {
             return Err(SurfaceError::Collinear { points: points.len() });
@@ -200,7 +205,7 @@ impl Nominal {
         }
     }
 
-    /// Returns from what the surface was created: a grid, scattered points, a mesh or several patches.
+    /// Returns the source of the surface: a grid, scattered points, a mesh or several patches.
     pub fn kind(&self) -> NominalKind {
         self.kind
     }
@@ -252,7 +257,8 @@ impl Nominal {
             .collect()
     }
 
-    /// Returns the steepest slope against the xy plane, in radians, among some thousand places spread over the surface.
+    /// Returns the largest angle between the unit normal and +z, in radians from 0 to π: the maximum slope against the
+    /// xy plane. The maximum is taken over a sample of about 4096 vertices spread over the surface.
     pub fn max_slope_rad(&self) -> f64 {
         let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
         normals.fold(0.0, f64::max)
@@ -269,8 +275,9 @@ impl Nominal {
         self.extent_mm()[0]
     }
 
-    /// Returns the rms distance of the points from their best-fit plane, in millimetres. It measures the shape by which
-    /// a registration determines the pose.
+    /// Returns the rms distance of the points from their best-fit plane, in millimetres. Near 0 the surface is flat,
+    /// and a registration cannot determine every direction of the pose. It is computed from a sample of about 4096
+    /// points.
     pub(crate) fn relief_mm(&self) -> f64 {
         self.extent_mm()[1]
     }
@@ -292,9 +299,11 @@ impl Nominal {
         if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
     }
 
-    /// Returns the estimated rms error of the fitted normals, in radians; 0 if no normal is fitted to scattered points.
+    /// Returns the estimated rms error of the normals that are fitted to scattered points, in radians. Returns 0 if all
+    /// patches are grids.
     ///
-    /// The estimate is the rms change of the normal if the fit uses twice as many neighbours.
+    /// Fits the normal at about 256 vertices of each mesh patch again, with twice as many neighbours. The estimate is
+    /// the rms change of these normals.
     pub(crate) fn normal_error_rad(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
@@ -308,13 +317,15 @@ impl Nominal {
         if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
     }
 
-    /// Returns the standard deviation of the noise of the nominal points along the normal, about a smooth surface, in
-    /// millimetres. Returns 0 if they show no noise.
+    /// Returns the standard deviation in millimetres of the noise of the nominal points, along the normal of a smooth
+    /// surface fitted locally. Returns 0 if the residuals show the form of the surface and not noise, or if no local
+    /// fit is possible.
     pub(crate) fn noise_sigma_mm(&self) -> f64 {
         nominal_noise::noise_sigma_mm(&self.patches)
     }
 
-    /// Returns facets at the three nominal points nearest to `p`, from a sample of about 20,000 points.
+    /// Returns one facet at each of the three sample points nearest to `p`, the nearest first; fewer facets if the
+    /// sample is smaller. The sample has about 20,000 points of the nominal surface and is drawn at the first call.
     pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = FacetIndex> {
         /// Number of points in the search tree, and number of facets returned.
         const TREE_POINTS: usize = 20_000;

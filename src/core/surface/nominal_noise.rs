@@ -18,8 +18,12 @@ const CHECKED_POINTS: usize = 100;
 /// form of the surface itself.
 const MAX_GROWTH: f64 = 2.0;
 
-/// Returns the standard deviation of the noise of the points along the normal, in millimetres. Returns 0 if the
-/// residuals of local fits grow with their size: the points then show only the form of the surface.
+/// Returns the standard deviation of the noise of the points along the normal, in millimetres. Fits two local cubics at
+/// each of about 100 vertices: one to 17 points, the other to 31. The estimate is the rms residual of the fits to 31
+/// points.
+///
+/// Returns 0 if this residual is more than twice that of the fits to 17 points: such a residual shows the form of the
+/// surface and not noise. Returns 0 if no fit is possible.
 pub(super) fn noise_sigma_mm(patches: &[Patch]) -> f64 {
     let some = |patch| Patch::sample(patch, (CHECKED_POINTS / patches.len()).max(1)).map(move |vertex| (patch, vertex));
     let vertices: Vec<(&Patch, u32)> = patches.iter().flat_map(some).collect();
@@ -41,8 +45,11 @@ fn residual_variances(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     Some([of(NEIGHBOURS + 3)?, of(2 * NEIGHBOURS + 3)?])
 }
 
-/// Returns a vertex and its neighbours, nearest first. Coordinates are along two tangents and along the normal at the
-/// vertex, in mm, with the vertex as origin.
+/// Returns the positions [u, v, w] of a vertex and its neighbours in mm, sorted by the distance in the tangent plane,
+/// nearest first. The origin is the vertex. The axes u and v are two tangents, and w is the unit normal at the vertex.
+///
+/// In a mesh the neighbours are whole rings of vertices with at least 31 vertices, as far as the mesh allows. In a grid
+/// they are the nodes at most 3 rows and 3 columns away.
 fn tangent_frame_neighbours(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     let wanted = 2 * NEIGHBOURS + 3;
     let others: Vec<u32> = match &patch.topology {

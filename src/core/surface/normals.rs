@@ -28,13 +28,15 @@ pub(crate) struct LocalFit {
     pub(crate) direction: Vector,
 }
 
-/// Fits the normal and the curvature of the surface at a vertex. Fits the cubic w = p u + q v + quadratic and cubic
-/// terms by weighted least squares to whole rings of neighbours, until there are `wanted` or more.
+/// Fits the normal and the principal curvatures of the surface at a vertex to its neighbours. The neighbours are whole
+/// rings of vertices around the vertex, as many rings as are needed for `wanted` neighbours or more (at most 64).
 ///
-/// Frame: w is along the mean normal of the facets around the vertex, u and v are along two tangents. The weight of a
-/// neighbour at the distance s is 1/(1 + (s/h)^2), where h is the mean distance. So a far neighbour in an uneven ring
-/// affects the fit less. If the neighbours do not determine a cubic (at a border, on a line), the fit is a quadric,
-/// then a plane.
+/// Frame: the origin is the vertex. The axis w is the mean normal of the facets around the vertex. The axes u and v are
+/// two tangents. The fit is the cubic w = p u + q v + quadratic and cubic terms, by weighted least squares.
+///
+/// A neighbour at the distance s has the weight 1/(1 + (s/h)^2), where h is the mean distance of the neighbours. So a
+/// far neighbour in an uneven ring affects the fit less. If the neighbours do not determine a cubic (at a border, on a
+/// line), a quadric is fitted, otherwise a plane. If they determine no plane either, the mean normal is returned.
 pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wanted: usize) -> LocalFit {
     let mut ring = [0u32; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
@@ -42,8 +44,9 @@ pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wa
     fit_to_neighbours(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
-/// Fits the normal and the curvature at the point `at` to given neighbours, in the same way as [`fit_to_ring`]. `mean`
-/// is the approximate unit normal.
+/// Fits the normal and the principal curvatures of the surface at the point `at` to the given `neighbours`, of which at
+/// most 64 are used. Fits a local cubic by weighted least squares, with the same frame and weights as [`fit_to_ring`].
+/// `mean` is the approximate unit normal; the axis w of the fit points along it.
 pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
     let mut local = [[0.0; 3]; MAX_NEIGHBOURS];
@@ -65,8 +68,8 @@ pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterat
     LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
 }
 
-/// Fits the normals of four vertices in parallel lanes. Each normal equals the normal of [`fit_to_ring`] except for
-/// rounding, and does not depend on the other three vertices.
+/// Fits the unit normals of four vertices in parallel, one vertex per SIMD lane. Each normal equals the result of
+/// [`fit_to_ring`] except for rounding. Each normal is independent of the other three vertices.
 #[inline(always)]
 pub(crate) fn fit_normals_x4(points: &[Point], mesh: &MeshTopology, vertices: &[u32; LANES]) -> [Vector; LANES] {
     let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MAX_NEIGHBOURS], max_count: 0 };
@@ -98,8 +101,9 @@ struct Rings {
 }
 
 impl Rings {
-    /// Writes the neighbours of a vertex into a lane, in the frame of the vertex and in units of their mean distance.
-    /// Returns this frame: the mean normal and two tangents.
+    /// Writes the neighbours of a vertex into SIMD lane `lane`. Their coordinates are in the frame of the vertex,
+    /// divided by the mean distance of the neighbours from the vertex. Returns the axes of this frame: the mean normal
+    /// of the facets around the vertex, and two tangents.
     #[inline(always)]
     fn add(&mut self, points: &[Point], mesh: &MeshTopology, vertex: u32, lane: usize) -> [Vector; 3] {
         let mut ring = [0u32; MAX_NEIGHBOURS];
@@ -122,17 +126,20 @@ impl Rings {
         [mean, tu, tv]
     }
 
-    /// Copies the neighbours of lane `lane - 1` into the lane `lane`.
+    /// Copies the neighbours from SIMD lane `lane - 1` into lane `lane`, because both lanes have the same vertex.
+    /// `lane` must not be 0.
     fn repeat(&mut self, lane: usize) {
         for c in self.local[..self.max_count].iter_mut().flatten() {
             c.0[lane] = c.0[lane - 1];
         }
     }
 
-    /// Fits a cubic in each lane. Returns its slopes along u and v at the vertex, and for each lane true if the
-    /// neighbours determine a cubic.
+    /// Fits a cubic to the neighbours in each SIMD lane. Returns the slopes of the cubic along u and v at the vertex.
+    /// Also returns for each lane true if the neighbours determine a cubic; the slopes of a lane with false must not be
+    /// used.
     ///
-    /// The normal equations contain only 25 different numbers: the weighted sums of the monomials of degrees 2 to 6.
+    /// The matrix of the normal equations contains only 25 different numbers: the weighted sums of the monomials of
+    /// degrees 2 to 6.
     #[inline(always)]
     fn slopes(&self) -> ([F64x4; 2], [bool; LANES]) {
         let one = F64x4::splat(1.0);
@@ -165,8 +172,9 @@ const TERMS: [[usize; 2]; 9] = [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], 
 /// Number of monomials of u and v of degrees 2 to 6.
 const MOMENTS: usize = 25;
 
-/// Returns the first N of the weighted monomials of degree 2, 3 and higher. `squares` are those of degree 2: u^2, u v
-/// and v^2, each times a weight. Each degree n begins with u^n and ends with v^n.
+/// Returns the first N of the weighted monomials in u and v of degree 2, 3 and higher. Degree n has the monomials u^n,
+/// u^(n-1) v, ..., v^n, in this order. `squares` are the weighted monomials of degree 2: u^2, u v and v^2, each times
+/// the weight. The number N must end with a complete degree.
 #[inline(always)]
 fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4; N] {
     let mut all = [F64x4::splat(0.0); N];
@@ -182,8 +190,9 @@ fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4;
     all
 }
 
-/// Solves four symmetric linear systems m x = right side by Cholesky decomposition, one per lane. `x` holds the right
-/// sides. Returns the first two unknowns of each system, and true for each system that has a solution.
+/// Solves four linear systems M x = b by Cholesky decomposition, one per SIMD lane. `m` holds the symmetric matrices M,
+/// and `x` holds the right-hand sides b. Returns the first two unknowns of each system. Also returns for each system
+/// true if its pivots are large enough for a solution.
 #[inline(always)]
 fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
     let least_pivot: [f64; LANES] =
@@ -256,12 +265,14 @@ pub(crate) fn tangents(n: &Vector) -> [Vector; 2] {
     [tu, n.cross(&tu)]
 }
 
-/// Fits the first N monomials of a cubic (2, 5 or 9) to `local`, places [u, v, w] in units of their mean distance, by
-/// weighted least squares. Returns the coefficients, with 0 for the others. Returns `None` if the places do not
-/// determine them.
+/// Fits the first N terms of a cubic w(u, v) to neighbours by weighted least squares. N is 2 (plane), 5 (quadric) or 9
+/// (cubic). `local` holds the positions [u, v, w] of the neighbours, divided by their mean distance.
 ///
-/// The arrays have fixed bounds: the compiler unrolls and vectorises the loops, which makes the fit several times
-/// faster.
+/// Returns nine coefficients, in the order u, v, u^2, u v, v^2, u^3, u^2 v, u v^2, v^3; those beyond the first N are 0.
+/// Returns `None` if there are fewer than N neighbours, or if they do not determine the N coefficients.
+///
+/// The arrays have fixed bounds, so that the compiler unrolls and vectorises the loops. This makes the fit several
+/// times faster.
 fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     if local.len() < N {
         return None;
@@ -288,8 +299,9 @@ fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     Some(solution)
 }
 
-/// Replaces the part of a symmetric matrix below the diagonal by that of its Cholesky factor. Returns the inverse of
-/// each diagonal entry of the factor. Returns `None` if a pivot is not above `least_pivot`.
+/// Computes the Cholesky factor L of the symmetric matrix `m`. Writes the entries of L below the diagonal into `m`.
+/// Returns the inverses of the diagonal entries of L. Returns `None` if a pivot (the square of a diagonal entry) is NaN
+/// or is not above `least_pivot`.
 #[inline(always)]
 fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
     let mut inverse_pivots = [0.0; N];
@@ -308,8 +320,9 @@ fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[
     Some(inverse_pivots)
 }
 
-/// Solves L L^T x = right side by forward and backward substitution, with the Cholesky factor L of [`cholesky`]. `x`
-/// holds the right side, and then the solution.
+/// Solves L L^T x = b by forward and backward substitution. `l` holds the Cholesky factor L below its diagonal, and
+/// `inverse_pivots` the inverses of its diagonal, as [`cholesky`] gives them. `x` holds the right-hand side b at the
+/// call, and the solution afterwards.
 #[inline(always)]
 fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &mut [f64; N]) {
     for i in 0..N {
@@ -322,16 +335,18 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
-/// Returns the vertices around a vertex in whole rings, nearest ring first, until there are `wanted` or more. Returns
-/// fewer if the mesh has no more, and never more than [`MAX_NEIGHBOURS`].
+/// Returns the vertices around a vertex, ring by ring, nearest ring first. Ring k holds the vertices k edges away. Adds
+/// whole rings until there are `wanted` vertices or more. Returns fewer if the mesh has no more vertices, and never
+/// more than [`MAX_NEIGHBOURS`].
 pub(super) fn ring_around(mesh: &MeshTopology, vertex: u32, wanted: usize) -> Vec<u32> {
     let mut ring = [0; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
     ring[..found].to_vec()
 }
 
-/// Writes the vertices around a vertex into `ring`, in whole rings, until there are `wanted` or more. Returns their
-/// number.
+/// Writes the vertices around `vertex` into `ring`, ring by ring, nearest first (ring k holds the vertices k edges
+/// away). Adds whole rings until there are `wanted` vertices or more, or until `ring` is full or the mesh has no more.
+/// Returns the number of written vertices.
 fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u32; MAX_NEIGHBOURS]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
         Some([first, _]) if first >= wanted => return first,
@@ -348,8 +363,9 @@ fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u3
     count
 }
 
-/// Appends to `ring`, which holds `count` vertices around `vertex`, the neighbours of the vertex `of` that it does not
-/// yet contain. Returns the new number of entries.
+/// Appends the neighbours of the vertex `of` to `ring`. The first `count` entries of `ring` are vertices around
+/// `vertex`. Omits neighbours that `ring` already contains, and `vertex` itself. Ignores further neighbours if `ring`
+/// is full. Returns the new number of entries.
 #[inline(always)]
 fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIGHBOURS], mut count: usize) -> usize {
     mesh.visit_neighbours(of, |candidate| {

@@ -88,8 +88,9 @@ pub struct PointProjection {
 }
 
 impl PointProjection {
-    /// Compares two projections of one point: less is nearer. Compares the distances beyond the edge first, then the
-    /// absolute distances of the point from the surface.
+    /// Compares two projections of one point. Returns `Less` if `self` is nearer than `other`. The nearer projection
+    /// has the smaller distance beyond the edge of the surface. If these distances are equal, the nearer one has the
+    /// smaller absolute distance from the surface.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
         self.beyond_edge_mm
             .total_cmp(&other.beyond_edge_mm)
@@ -127,7 +128,8 @@ impl<'a> OffsetSurface<'a> {
         Self { distance_model: distance, ..self }
     }
 
-    /// Sets the rule that assigns a point to a facet, see [`Lookup`].
+    /// Returns the same offset surface with the rule `lookup`, which assigns a point to a facet: the facet that
+    /// contains its projection, or the facet above or below the point along z. See [`Lookup`].
     pub(crate) fn with_lookup(self, lookup: Lookup) -> Self {
         Self { lookup, ..self }
     }
@@ -155,19 +157,20 @@ impl<'a> OffsetSurface<'a> {
         self.side
     }
 
-    /// Returns the local step of the nominal sampling at the facet `place`, in millimetres: the side of a square with
-    /// twice the area of the facet.
+    /// Returns the local point spacing of the nominal surface at the facet with the index `place`, in millimetres. It
+    /// is the side of a square with twice the area of the facet.
     pub(crate) fn spacing_mm(&self, place: FacetIndex) -> f64 {
         let patch = &self.nominal.patches()[place.patch as usize];
         let [a, b, c] = patch.corners(place.facet).map(|v| *patch.point(v));
         (b - a).cross(&(c - a)).norm().sqrt()
     }
 
-    /// Returns the projection of the point `p`, in the model frame, onto the offset surface. The search starts from the
-    /// facet `start`, where the last search for this point ended; [`FacetIndex::UNKNOWN`] if there is none.
+    /// Projects the point `p`, in the model frame, onto the offset surface. Returns the projection. The search begins
+    /// at the facet `start`, where the last search for this point ended. Use [`FacetIndex::UNKNOWN`] if there was no
+    /// earlier search.
     ///
-    /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
-    /// plane at the nearest point of the edge.
+    /// Beyond the edge, the surface is continued. Up to half a step of the sampling, the facet at the edge continues
+    /// it. Farther out, the tangent plane at the nearest point of the edge continues it.
     #[inline]
     pub fn project(&self, p: &Point, start: FacetIndex) -> PointProjection {
         match self.nominal.patches() {
@@ -176,11 +179,14 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Projects the point `p` onto each patch, and returns the best projection: the nearest one inside a patch,
-    /// otherwise the one least beyond an edge.
+    /// Projects the point `p` onto each of the `patches`. Returns the nearest projection that lies inside a patch. If
+    /// none lies inside, returns the one that is least beyond an edge. `start` is used only by the patch that it
+    /// belongs to.
     ///
-    /// The offset surfaces of two patches that only touch leave a gap over a convex seam. If a projection is slightly
-    /// beyond the edges of two patches at about the same height, it lies in this gap. It then counts as on the part.
+    /// The offset surfaces of two touching patches leave a gap over a convex seam. A projection in this gap counts as
+    /// on the part. A projection is in the gap if it is at most half a step of the sampling beyond an edge, and if this
+    /// is also true of the projection onto another patch. The distances of `p` from both projections may differ by half
+    /// a step at most.
     fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
         let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
@@ -204,11 +210,12 @@ impl<'a> OffsetSurface<'a> {
         best
     }
 
-    /// Projects a point without a start facet. Starts one search from each of the three places of the surface nearest
-    /// to the point, and returns the nearest projection found.
+    /// Projects the point `p` onto the offset surface if no start facet is known. Starts one search from a facet at
+    /// each of the three sample points of the surface nearest to `p`. Returns the nearest projection that the searches
+    /// find.
     ///
-    /// A search moves only to nearer facets. A single search that starts on the wrong wall of a gutter can end there,
-    /// because no neighbouring facet is nearer.
+    /// One search is not enough: it moves only to neighbouring facets that are nearer. On the wrong wall of a gutter it
+    /// stops, because no neighbouring facet is nearer.
     #[cold]
     pub(crate) fn project_without_start(&self, p: &Point) -> PointProjection {
         let found = self
@@ -229,11 +236,12 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Walks over the flat facets of the nominal surface towards the projection of `p`. Returns a facet near the
-    /// projection. Returns the start facet if the normals are already known.
+    /// Walks over the flat facets of the nominal surface and returns a facet near the projection of the point `p`.
+    /// `start` is a facet number, or `u32::MAX` to let `facets` choose one. For a grid, whose normals are already
+    /// known, it returns the start facet without a walk.
     ///
-    /// No normal is fitted on the way: the point is moved back to the nominal surface along the normal of each flat
-    /// facet. `start` is a facet number, or `u32::MAX` if it is unknown.
+    /// The walk fits no normal. At each facet, the point is moved back by the probe radius along the normal of the flat
+    /// facet.
     #[inline]
     fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
         let mut facet = if start == u32::MAX { facets.start(p) } else { start };
@@ -258,13 +266,17 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
-    /// Returns a facet of the first patch near the projection of the point `p`, without fitting a normal.
+    /// Returns the index of a facet of the first patch near the projection of the point `p`, without fitting a normal.
+    /// `start` is the facet at which the walk begins; [`FacetIndex::UNKNOWN`] lets `facets` choose one. The patch
+    /// number of `start` is ignored.
     pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: FacetIndex) -> FacetIndex {
         FacetIndex { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
-    /// Walks from facet to facet of one patch until a facet contains the projection of `p`. Returns the projection onto
-    /// this facet. `number` is the index of the patch, and `start` a facet number, or `u32::MAX` if it is unknown.
+    /// Walks from facet to facet of one patch until a facet contains the projection of the point `p`. The walk also
+    /// ends where the surface ends, and if it would return to the previous facet. Returns the projection onto the last
+    /// facet. `number` is the index of the patch. `start` is a facet number, or `u32::MAX` to let `facets` choose one.
+    /// The walk has at most 4096 steps.
     #[inline]
     fn search_projection<F: Facets>(
         &self,
@@ -319,9 +331,12 @@ impl<'a> OffsetSurface<'a> {
         facet.weights(&w)
     }
 
-    /// Returns the projection of the point `p` onto a facet, with the index `place`. `weights` are the barycentric
-    /// weights of `p`; `inside` is true if the projection is on the part. Otherwise it is beyond an edge where the
-    /// surface ends.
+    /// Returns the projection of the point `p` onto a facet whose index is `place`. `weights` are the barycentric
+    /// weights of `p` in the facet. `inside` is true if the projection lies on the surface, and false if it lies beyond
+    /// an edge where the surface ends.
+    ///
+    /// Up to half a step of the sampling beyond the edge, the facet is continued. Farther out, the tangent plane at the
+    /// nearest place of the edge is used.
     #[inline(always)]
     fn project_in_facet(
         &self,
@@ -375,8 +390,8 @@ impl<'a> OffsetSurface<'a> {
     }
 }
 
-/// Returns the barycentric weights of the place on one edge of a facet that is nearest to the point `p`. The edge is
-/// the one with the most negative weight in `b`, the barycentric weights of `p`.
+/// Returns the barycentric weights of the place on one edge of a facet that is nearest to the point `p`. `b` are the
+/// barycentric weights of `p`. The edge is the one opposite to the corner with the most negative weight in `b`.
 fn clamped_weights(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);

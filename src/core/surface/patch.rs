@@ -150,9 +150,11 @@ impl Patch {
         }
     }
 
-    /// Fits those normals of the given vertices that are still unknown, on all cores and four at a time. Does nothing
-    /// for a grid. This is several times faster than fitting each normal when it is first needed, and gives the same
-    /// bits.
+    /// Fits the missing normals of the vertices `vertices` of a mesh and stores them. Works on all cores, four vertices
+    /// at a time. Does nothing for a grid, and for vertices whose normal is already fitted.
+    ///
+    /// This is several times faster than fitting each normal when it is first needed. The results are identical to the
+    /// last bit.
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
         /// Number of vertices per task.
         const CHUNK: usize = 256;

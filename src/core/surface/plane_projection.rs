@@ -40,12 +40,16 @@ pub(crate) enum Projector {
 const MAX_FOLDED_SHARE: f64 = 0.05;
 
 impl PlaneProjection {
-    /// Chooses a projection in which the surface through the points is one-to-one. Returns its kind, never `Auto`, and
-    /// the projector for these points. `Auto` takes the first suitable one of xy plane, best-fit plane and sphere.
+    /// Chooses a projection in which the surface through `points` is one-to-one: each place in the plane of the
+    /// projection belongs to one place of the surface. Returns the kind of the projection and the projector for these
+    /// points. The returned kind is never `Auto`.
+    ///
+    /// `Auto` tries the xy plane, the best-fit plane and the sphere, in this order, and takes the first one that is
+    /// one-to-one.
     ///
     /// # Errors
-    /// Returns [`SurfaceError::NoProjection`] if the requested projection folds the surface, or if with `Auto` every
-    /// projection does.
+    /// Returns [`SurfaceError::NoProjection`] if no tried projection is one-to-one. Without `Auto`, only the requested
+    /// projection is tried.
     pub(crate) fn choose(self, points: &[Point]) -> Result<(Self, Projector), SurfaceError> {
         let candidates: &[Self] = match self {
             Self::Auto => &[Self::Xy, Self::BestFit, Self::Spherical],
@@ -65,7 +69,8 @@ impl PlaneProjection {
         Err(SurfaceError::NoProjection { tried: describe(&shares) })
     }
 
-    /// Returns the projector for these points; `None` if they determine no sphere for the spherical projection.
+    /// Returns the projector of this kind: the projection with the parameters that fit `points`. `Auto` gives the
+    /// projector to the xy plane. Returns `None` only for the spherical projection, if the points determine no sphere.
     fn projector(self, points: &[Point]) -> Option<Projector> {
         match self {
             Self::Auto | Self::Xy => {
@@ -77,7 +82,8 @@ impl PlaneProjection {
     }
 }
 
-/// Describes for a message what share of the surface each projection folds.
+/// Returns a text for an error message: the name of each projection in `shares`, and the percentage of the surface that
+/// it folds. The number of each pair is this share, from 0 to 1.
 fn describe(shares: &[(PlaneProjection, f64)]) -> String {
     let name = |p: &PlaneProjection| match p {
         PlaneProjection::Auto => "auto",
@@ -90,7 +96,9 @@ fn describe(shares: &[(PlaneProjection, f64)]) -> String {
 }
 
 impl Projector {
-    /// Returns the place (u, v) of a point in the plane of the projection, and its height over the plane; all in mm.
+    /// Projects the point `p`. Returns its coordinates (u, v) in the plane of the projection, and its height above the
+    /// plane. For a sphere, (u, v) are the coordinates of the stereographic map, and the height is the height above the
+    /// sphere. All values are in mm.
     pub(crate) fn project(&self, p: &Point) -> ([f64; 2], f64) {
         match self {
             Self::Plane { origin, axes } => {
@@ -107,11 +115,14 @@ impl Projector {
         }
     }
 
-    /// Returns how much the projection folds the surface: the share, from 0 to 1, of small neighbourhoods in the plane
-    /// that contain more than one sheet of the surface.
+    /// Returns the share, from 0 to 1, of the surface that the projection folds. The plane is divided into square
+    /// neighbourhoods with ten points each on average. The share counts the neighbourhoods that contain more than one
+    /// sheet of the surface. Neighbourhoods with fewer than six points do not count. Returns 1 if the projected points
+    /// cover no area.
     ///
-    /// In a neighbourhood of size s a smooth sheet deviates from its tangent plane by a small part of s, even where it
-    /// is steep. Two sheets deviate from any plane by half their distance.
+    /// A neighbourhood has several sheets if its points deviate strongly from their least-squares plane. In a
+    /// neighbourhood of size s, one smooth sheet deviates from its tangent plane only by a small part of s, even where
+    /// the sheet is steep. The points of two sheets deviate from any plane by half the distance between the sheets.
     fn folded_share(&self, points: &[Point]) -> f64 {
         let stride = points.len().div_ceil(200_000);
         let placed: Vec<_> = points.iter().step_by(stride).map(|p| self.project(p)).collect();
@@ -140,7 +151,8 @@ struct Sheet {
 }
 
 impl Sheet {
-    /// Adds a point at (u, v) with the height w, in units of the size of the neighbourhood.
+    /// Adds a point to this neighbourhood. `u` and `v` are the coordinates of the point from the centre of the
+    /// neighbourhood, and `w` is its height. The unit of all three is the size of the neighbourhood.
     fn add(&mut self, u: f64, v: f64, w: f64) {
         let row = Vector4::new(1.0, u, v, w);
         self.gram += row * row.transpose();
@@ -161,8 +173,8 @@ impl Sheet {
     }
 }
 
-/// Returns the projection to the least-squares plane of the points. Its normal points to the side of +z, or, for an
-/// upright plane, along its largest component.
+/// Returns the projector onto the least-squares plane of `points`. The normal of the plane has a positive z component.
+/// If the plane is nearly upright (parallel to z), the largest component of the normal is positive instead.
 fn best_fit_plane(points: &[Point]) -> Projector {
     let (origin, eigen) = principal_axes(points);
     let least = eigen.eigenvalues.imin();
@@ -174,8 +186,10 @@ fn best_fit_plane(points: &[Point]) -> Projector {
     Projector::Plane { origin, axes: [tu, tv, normal] }
 }
 
-/// Returns the centroid of the points, and the eigenvalues and eigenvectors of their scatter matrix, the sum of d d^T
-/// over the vectors d from the centroid. The eigenvectors are the principal axes.
+/// Returns the centroid of `points`, and the eigenvalues (in mm²) and eigenvectors of the scatter matrix of the points.
+/// The eigenvectors are the principal axes.
+///
+/// Equation: the scatter matrix is the sum of d d^T, where d is the vector from the centroid to a point.
 pub(crate) fn principal_axes(points: &[Point]) -> (Point, SymmetricEigen<f64, nalgebra::Const<3>>) {
     let centroid = centroid(points);
     let scatter = points.iter().map(|p| p - centroid).map(|d| d * d.transpose()).sum::<Matrix3<f64>>();
@@ -186,10 +200,12 @@ pub(crate) fn centroid(points: &[Point]) -> Point {
     Point::from(points.iter().map(|p| p.coords).sum::<Vector>() / points.len() as f64)
 }
 
-/// Returns the projection from the least-squares sphere through the points; `None` if they do not determine a sphere.
+/// Returns the projector of the stereographic map of the least-squares sphere through `points`. The pole of the map is
+/// in the direction from the centre of the sphere to the centroid of the points. Returns `None` if the points do not
+/// determine a sphere.
 ///
-/// Equation: the algebraic fit |p|^2 = 2 c.p + (r^2 - |c|^2), with the centre c and the radius r, is linear in its four
-/// unknowns.
+/// Equation: the algebraic fit |p|^2 = 2 c.p + (r^2 - |c|^2), with a point p, the centre c and the radius r, is linear
+/// in its four unknowns c and r^2 - |c|^2.
 fn best_fit_sphere(points: &[Point]) -> Option<Projector> {
     let middle = centroid(points);
     let (mut gram, mut right) = (Matrix4::zeros(), Vector4::zeros());

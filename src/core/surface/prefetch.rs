@@ -20,15 +20,19 @@ const CHUNK: usize = 512;
 const NEAR_STEPS: f64 = 24.0;
 
 impl OffsetSurface<'_> {
-    /// Returns true if the surface fits a normal only when it is first needed, as a mesh does. Callers should then use
-    /// few normals.
+    /// Returns true if a patch of the surface is a mesh. A mesh fits the normal of a vertex only when the normal is
+    /// first needed. This is slow, so callers should use few normals then. Returns false if all patches are grids,
+    /// whose normals are known from the start.
     pub(crate) fn has_lazy_normals(&self) -> bool {
         self.nominal().patches().iter().any(|patch| patch.has_scattered_normals())
     }
 
-    /// Fits all normals that the projections of the `points`, in the model frame, will need. Returns a start facet for
-    /// the projection of each point. Returns an empty list if the normals are already known, or if there are several
-    /// patches.
+    /// Fits all normals that the later projections of `points` onto this surface will need. `points` are in the model
+    /// frame. Returns one facet for each point, in the same order: the facet at which the search for the projection of
+    /// the point should start.
+    ///
+    /// Fits nothing and returns an empty list if the surface is a grid, because its normals are already known, or if
+    /// the surface has several patches.
     pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<FacetIndex> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
         let Topology::Mesh(mesh) = &patch.topology else { return Vec::new() };

@@ -22,20 +22,23 @@ pub(crate) struct ProjectionX4 {
 }
 
 impl OffsetSurface<'_> {
-    /// Returns true if [`OffsetSurface::project_x4`] supports this surface. It requires one patch, the curved distance,
-    /// and the lookup of the containing facet.
+    /// Returns true if [`OffsetSurface::project_x4`] supports this surface. Three conditions are required: the surface
+    /// has one patch; the distance to a facet is computed with its curvature (the curved distance model); and a point
+    /// is assigned to the facet that contains its projection.
     pub(crate) fn supports_project_x4(&self) -> bool {
         self.nominal().patches().len() == 1
             && self.distance_model() == DistanceModel::Curved
             && self.lookup() == Lookup::ContainingFacet
     }
 
-    /// Projects four points `p`, one per lane. Each search starts from a facet in `places`; the facet of the projection
-    /// replaces it.
+    /// Projects four points `p` onto the offset surface, one point in each lane (one of the four parallel numbers).
+    /// Returns the distance in mm and the unit normal for each point. `places` contains the facet at which the search
+    /// for each point starts. The facet of each projection replaces it.
     ///
-    /// Returns `None` if one of the points is beyond the edge or too far from its start facet; `places` are then
-    /// invalid. On a mesh it returns `None` as soon as a point is not on its start facet, because a walk over a mesh
-    /// would fit normals on the way. The caller must check [`OffsetSurface::supports_project_x4`] first.
+    /// Returns `None` if one of the points is beyond the edge of the surface or too far from its start facet. The
+    /// content of `places` is then invalid. On a mesh, returns `None` as soon as a point is not on its start facet,
+    /// because the search for another facet of a mesh would fit new normals. The caller must check
+    /// [`OffsetSurface::supports_project_x4`] first.
     #[inline(always)]
     pub(crate) fn project_x4(&self, p: &Vector3x4, places: &mut [FacetIndex; LANES]) -> Option<ProjectionX4> {
         let patch = &self.nominal().patches()[0];
@@ -45,9 +48,12 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Predicts the facets of the next four points of a grid by linear extrapolation: the step from `last` to them is
-    /// the step from `before` to `last`. A prediction outside the grid or at a hole is replaced by the facet of `last`.
-    /// Returns `None` on a mesh, or if a facet of `last` is unknown.
+    /// Predicts the facets of the next four points on a grid by linear extrapolation. `before` and `last` are the
+    /// facets of the two previous groups of four points. Each predicted facet continues the step from the facet in
+    /// `before` to the facet in `last`.
+    ///
+    /// Keeps the facet in `last` if the facet in `before` is unknown, or if the predicted facet is outside the grid or
+    /// at a hole. Returns `None` on a mesh, or if a facet in `last` is unknown.
     pub(crate) fn extrapolate_x4(
         &self,
         before: &[FacetIndex; LANES],
@@ -65,8 +71,12 @@ impl OffsetSurface<'_> {
         }))
     }
 
-    /// Projects four points `p` onto one patch, as [`OffsetSurface::project_x4`] does. Returns `None` if a point is not
-    /// on its facet after `jumps` moves to other facets.
+    /// Projects four points `p` onto one patch with the facets `facets`, one point in each lane. Returns the distance
+    /// in mm and the unit normal for each point. `places` contains the start facet of each point; the facet of each
+    /// projection replaces it.
+    ///
+    /// Moves to other facets at most `jumps` times. Returns `None` if a point is not on its facet after these moves, or
+    /// if the surface ends on the way.
     #[inline(always)]
     fn project_x4_onto<F: Facets>(
         &self,
@@ -99,7 +109,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns four facets in lanes, with their corners on the offset surface.
+    /// Returns the four facets with the indices `places` as one facet of four lanes: lane k contains facet k. The
+    /// corners of the facets are on the offset surface.
     #[inline(always)]
     fn facets_x4<F: Facets>(&self, patch: &Patch, facets: &F, places: &[FacetIndex; LANES]) -> Facet<F64x4> {
         let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
@@ -110,8 +121,9 @@ impl OffsetSurface<'_> {
         Facet::new([first, second, third], F64x4::splat(self.side().sign()))
     }
 
-    /// Returns one corner of each of four facets, packed into lanes: the points on the offset surface, and the unit
-    /// normals. a, b, c and d are indices of vertices.
+    /// Returns one corner of each of four facets, packed into four lanes. `a`, `b`, `c` and `d` are the vertex indices
+    /// of these corners, one for each facet. Each corner consists of its point on the offset surface and its unit
+    /// normal.
     #[inline(always)]
     fn corners_x4(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
         let four = vertices_x4(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
@@ -119,8 +131,11 @@ impl OffsetSurface<'_> {
     }
 }
 
-/// Moves each point whose flag in `stays` is false to the next facet, in the direction of its barycentric weights `b`.
-/// Changes `places`. Returns false if one of these points has no next facet.
+/// Moves each point whose flag in `stays` is false to the next facet on the way to its projection. `places` contains
+/// the facet of each of the four points and is changed. `b` contains the three barycentric weights of each point in its
+/// present facet; they give the direction of the move.
+///
+/// Returns false if one of these points has no next facet. Some of `places` may have changed then.
 #[inline(never)]
 fn jump_to_facets<F: Facets>(
     facets: &F,

@@ -10,17 +10,18 @@ pub(crate) const LANES: usize = 4;
 pub(crate) trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
 {
-    /// Returns the same number in every lane.
+    /// Returns `value` in every lane (one of the parallel numbers). For a single number, returns `value` itself.
     fn splat(value: f64) -> Self;
 
     /// Returns the square root.
     fn sqrt(self) -> Self;
 
-    /// Returns the unit vector along `v`; four lanes use one division instead of three.
+    /// Returns the unit vector in the direction of `v`. With four lanes, the components are multiplied by the
+    /// reciprocal of the length, so that one division replaces three.
     fn unit(v: &[Self; 3]) -> [Self; 3];
 
-    /// Returns the sum of three numbers. One number adds them in order; four lanes add the last two first, so that the
-    /// additions need not wait for each other.
+    /// Returns the sum `self + second + third`. A single number adds them in this order. Four lanes add `second` and
+    /// `third` first, so that this addition need not wait for `self`. The results can therefore differ by rounding.
     fn plus(self, second: Self, third: Self) -> Self;
 }
 

@@ -72,7 +72,8 @@ pub(crate) struct Triangulation {
 }
 
 impl Triangulation {
-    /// Triangulates at least three points (Delaunay, divide and conquer).
+    /// Computes the Delaunay triangulation of `sites`, by divide and conquer. `sites` must contain at least three
+    /// points. If all points lie on one line, the triangulation has no triangles.
     pub(crate) fn new(sites: SortedSites) -> Self {
         let count = sites.places.len();
         // The system supplies zeroed memory untouched; the threads that build here are the first to touch it.
@@ -83,10 +84,13 @@ impl Triangulation {
         Self { edges, hull }
     }
 
-    /// Returns the triangles of the triangulation: their corners, counter-clockwise, and for each corner the triangle
-    /// across the opposite edge, or [`BORDER`].
+    /// Returns two lists with one entry for each triangle. The first list contains the three corners of the triangle,
+    /// counter-clockwise, as indices of points. The second list contains the three neighbours of the triangle, as
+    /// indices of triangles. Neighbour k is across the edge opposite to corner k; it is [`BORDER`] if there is no
+    /// triangle. Returns empty lists if all points lie on one line.
     ///
-    /// Triangles are numbered in the order of their edges, so that in memory they lie about where their corners do.
+    /// Triangles are numbered in the order of their edges. In memory, a triangle is therefore at about the same place
+    /// as its corners.
     pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
         let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
         self.visit_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
@@ -122,7 +126,8 @@ impl Triangulation {
         self.edges[(e ^ 1) as usize][BEFORE]
     }
 
-    /// Calls `visit` with each edge of the convex hull.
+    /// Calls `visit` with the number of each edge of the convex hull, in counter-clockwise order. Each of these
+    /// directed edges has all points on its left.
     fn visit_hull(&self, visit: impl Fn(u32)) {
         let mut e = self.hull;
         loop {
@@ -135,9 +140,9 @@ impl Triangulation {
     }
 }
 
-/// Triangulates the points with the indices `range`. Large ranges are divided between threads. `edges` is the storage
-/// that is reserved for this part; `base` is the number of its first edge. Returns the part and the edge numbers that
-/// it left unused.
+/// Triangulates the points with the indices `range`. If the range is large, divides it between threads. `edges` is the
+/// storage that is reserved for the edges of this part, and `base` is the number of the first edge in this storage.
+/// Returns the triangulated part, and the edge numbers that the part did not use.
 fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32) -> (PartialTriangulation, FreeEdges) {
     if range.len() <= MAX_POINTS_PER_THREAD {
         let fresh = base..base + edges.len() as u32;
@@ -161,8 +166,11 @@ fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32
 }
 
 impl SortedSites<'_> {
-    /// Divides a range of at least two points by a line along u or v. Returns the index of the first point of the
-    /// second part, and the axis along which the second part has the larger coordinates.
+    /// Divides the points with the indices `range`, at least two, into two parts. A line parallel to the u axis or the
+    /// v axis separates the parts. Returns the index of the first point of the second part, and the axis (u or v) along
+    /// which the second part has the larger coordinates.
+    ///
+    /// If all points have the same key, divides the range in the middle. The axis is then u.
     fn cut(&self, range: &Range<usize>) -> (usize, CutAxis) {
         let keys = &self.keys[range.clone()];
         let differing = keys[0] ^ keys[keys.len() - 1];
@@ -281,12 +289,13 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Deletes edges that the merge makes invalid, at one end of the base edge, and returns the first edge that
-    /// remains. Starts at the edge `e` and goes around its origin in the direction `way` ([`AFTER`] or [`BEFORE`]).
-    /// `left` and `right` are the ends of the base edge.
+    /// Deletes the edges that become invalid at one end of the base edge when two parts are merged. Returns the first
+    /// edge that remains. `left` and `right` are the two ends of the base edge. Starts at the edge `e`, whose origin is
+    /// one of these ends, and goes around this origin in the direction `way`: [`AFTER`] (counter-clockwise) or
+    /// [`BEFORE`] (clockwise).
     ///
-    /// An edge is not Delaunay, and is deleted, if the circle through `left`, `right` and its end contains the end of
-    /// the next edge.
+    /// Deletes an edge if it is not Delaunay: the circle through `left`, `right` and the destination of this edge
+    /// contains the destination of the next edge.
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
@@ -298,8 +307,9 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Adds the lower common tangent of two parts: the lowest edge between them, seen with the separating line upright.
-    /// Returns this edge; it runs from the upper part to the lower.
+    /// Adds the lower common tangent of the parts `lower` and `upper`. This is the edge from a vertex of `upper` to a
+    /// vertex of `lower` that has no point of the two parts on its left. `lower` has the smaller coordinates along
+    /// `axis`. Returns the number of this edge.
     fn tangent(&mut self, lower: PartialTriangulation, upper: PartialTriangulation, axis: CutAxis) -> u32 {
         // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
@@ -339,8 +349,9 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Walks along a hull, from the edge `e`, to its farthest vertex. Returns the hull edge that starts there.
-    /// `beyond(a, b)` is true if vertex b is farther than vertex a.
+    /// Walks along the convex hull of a part to the farthest vertex of the hull. `e` is the hull edge at which the walk
+    /// starts. `beyond(a, b)` must return true if vertex b is farther than vertex a. Returns the hull edge whose origin
+    /// is the farthest vertex.
     fn farthest(&self, mut e: u32, beyond: impl Fn(u32, u32) -> bool) -> u32 {
         let next = |e: u32| self.edge(e ^ 1)[AFTER];
         let previous = |e: u32| self.edge(e)[BEFORE] ^ 1;
@@ -353,8 +364,9 @@ impl Subdivision<'_> {
         e
     }
 
-    /// Compares the coordinates of two vertices along `axis`, across the line that separates the parts. If they are
-    /// equal, compares the other coordinates.
+    /// Compares the coordinates of the vertices `a` and `b` along `axis`. If these coordinates are equal, compares the
+    /// other coordinates: v in ascending order for the axis u, and u in descending order for the axis v. The order for
+    /// v is thus the order for u, turned by a right angle.
     fn compare(&self, axis: CutAxis, a: u32, b: u32) -> std::cmp::Ordering {
         let (a, b) = (self.sites.places[a as usize], self.sites.places[b as usize]);
         match axis {
@@ -433,13 +445,15 @@ impl Subdivision<'_> {
         self.free_edges.freed.push(e & !1);
     }
 
-    /// Returns the orientation of three vertices, see the function [`orient2d`].
+    /// Returns a positive value if the vertices `a`, `b` and `c` are counter-clockwise, a negative value if they are
+    /// clockwise, and 0 if they lie on one line. Uses the function [`orient2d`].
     #[inline(always)]
     fn orient2d(&self, a: u32, b: u32, c: u32) -> f64 {
         orient2d([a, b, c].map(|v| self.sites.places[v as usize]))
     }
 
-    /// Returns true if vertex `d` lies inside the circle through `a`, `b` and `c`, see the function [`in_circle`].
+    /// Returns true if the vertex `d` lies inside the circle through the vertices `a`, `b` and `c`, which must be
+    /// counter-clockwise. Uses the function [`in_circle`].
     #[inline(always)]
     fn in_circle(&self, a: u32, b: u32, c: u32, d: u32) -> bool {
         in_circle([a, b, c, d].map(|v| self.sites.places[v as usize]))
@@ -463,8 +477,8 @@ fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
 
 const HALF_EPSILON: f64 = 0.5 * f64::EPSILON;
 
-/// Returns true if the point d lies inside the circle through a, b and c, which must be counter-clockwise. The result
-/// is exact (Shewchuk's predicate).
+/// Returns true if the point d lies inside the circle through the points a, b and c, which must be counter-clockwise.
+/// Returns false if d lies on the circle or outside. The result is exact (Shewchuk's predicate).
 #[inline(always)]
 fn in_circle([a, b, c, d]: [[f64; 2]; 4]) -> bool {
     const BOUND: f64 = (10.0 + 96.0 * HALF_EPSILON) * HALF_EPSILON;

@@ -60,8 +60,9 @@ pub struct CmmExchange {
 }
 
 impl CmmExchange {
-    /// Returns the default settings of a CMM that exchanges files: `part` is the name of the part, `outbox` the folder
-    /// for plans, `inbox` the folder for results.
+    /// Returns the default settings of a CMM that exchanges files with this program. `part` is the name of the part.
+    /// `outbox` is the folder to which this program writes measuring plans. `inbox` is the folder in which the result
+    /// files of the CMM appear.
     pub fn new(part: impl Into<String>, outbox: impl Into<PathBuf>, inbox: impl Into<PathBuf>) -> Self {
         Self {
             part: part.into(),
@@ -176,7 +177,8 @@ struct FinishedJudgement {
 type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
 impl CmmFolders {
-    /// Creates the driver of the two exchange folders from its settings. Reads no folder before it is opened.
+    /// Creates the driver of a CMM that works with two folders: the outbox for the plans and the inbox for the results.
+    /// `settings` contains both folders. Reads no folder; this happens only when the driver is opened.
     pub fn new(settings: CmmExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -184,11 +186,12 @@ impl CmmFolders {
         Self { judge, watch, running_judgement: None, published: None, expected: None, last_judgement: None }
     }
 
-    /// Returns the result that is expected for a job: its hand-over, plan and targets. After a restart, reads them from
-    /// the outbox.
+    /// Returns the data of the result that is expected for `job`: the hand-over (the folder with the files for the
+    /// machine), the plan and the numbers of the targets. If this program was restarted after the hand-over, reads
+    /// these data from the outbox.
     ///
     /// # Errors
-    /// The job was not handed over, or its files cannot be read.
+    /// Returns an error if the job was not handed over, or if the files of the hand-over cannot be read.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
         if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.header.job() == job) {
             return Ok(expected.clone());
@@ -215,9 +218,11 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Starts a check of the files `found` in another thread, unless a check still runs, and waits for its result for
-    /// at most `read_timeout`. Returns the finished check. Returns `None` if the check still runs, was of another job,
-    /// or accepted a file that has changed since the check began.
+    /// Returns the result of a finished check of inbox files. If no check runs, first starts a check of the files
+    /// `found` in another thread. Then waits for the result for at most `read_timeout`.
+    ///
+    /// Returns `None` in three cases: the check still runs; the check was of another job; or the check accepted a file
+    /// that has changed since the check began.
     fn finished_judgement(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<FinishedJudgement> {
         let job = expected.stored.header.job();
         if self.running_judgement.is_none() {
@@ -263,8 +268,9 @@ impl Judge {
         Ok(accepted)
     }
 
-    /// Returns true if a file may be read as an answer. A file that was in the inbox before the hand-over may be read
-    /// only if the settings accept such files; otherwise a text about it is added to `notes`.
+    /// Returns true if `file` may be read as an answer to the hand-over. A file that was in the inbox before the
+    /// hand-over may be read only if the settings accept such files. If they do not, returns false and adds a text
+    /// about this file to `notes`.
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
@@ -315,12 +321,16 @@ impl Judge {
         }
     }
 
-    /// Returns the reason, as text, why a file does not belong to the hand-over `ticket`, or `None` if it does. A file
-    /// belongs to it if its header states this job or plan, or if its name matches `pattern`, and if nothing in its
-    /// header contradicts.
+    /// Returns the reason, as text, why `file` does not belong to the hand-over with the header `ticket`. Returns
+    /// `None` if the file belongs to this hand-over. Two conditions are then fulfilled:
+    ///
+    /// - The header of the file states the plan, or the part and the cycle; or the name of the file matches `pattern`.
+    /// - Nothing in the header of the file contradicts `ticket`.
+    ///
+    /// A file of more than 16 MiB whose name does not match `pattern` is not read and does not belong to the hand-over.
     ///
     /// # Errors
-    /// The file cannot be read.
+    /// Returns an error if the file cannot be read.
     fn foreign_reason(
         &self,
         ticket: &HandOverHeader,
@@ -356,8 +366,9 @@ impl Judge {
         Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], notes })
     }
 
-    /// Reads a file of points and checks that no other hand-over has accepted it. Then checks it against the plan and
-    /// the cell file. Returns its content and the SHA-256 of its bytes in hexadecimal digits.
+    /// Reads the file of measured points at `path`. Returns the content of the file and the SHA-256 of its bytes in
+    /// hexadecimal digits. Returns an error if the file cannot be read, if another hand-over has already accepted the
+    /// same bytes, or if the content does not agree with the plan and the cell file.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
         let sha = hex(&Sha256::digest(&bytes));
@@ -365,8 +376,9 @@ impl Judge {
         Ok((self.requirements(expected).read(path, &bytes)?, sha))
     }
 
-    /// Returns what a result of this hand-over must fulfil: the targets, the content, and the probe radius with its
-    /// tolerance.
+    /// Returns the requirements for a result of the hand-over `expected`: the numbers of the targets, the known
+    /// properties of the files, and the probe radius with its tolerance in mm. The numbers of the targets are `None` if
+    /// any number of points is allowed.
     fn requirements<'a>(&'a self, expected: &'a Expected) -> ResultRequirements<'a> {
         ResultRequirements {
             targets: (!self.settings.free_count).then_some(&*expected.targets),
@@ -376,8 +388,11 @@ impl Judge {
         }
     }
 
-    /// Returns an error if a file with the same SHA-256, `sha`, was accepted as the answer to another hand-over. This
-    /// is allowed only if the other hand-over is of another job and the cell file has `accept_earlier_files`.
+    /// Returns an error if the file at `path` was already accepted as the answer to another hand-over. `sha` is the
+    /// SHA-256 of the file; files with the same `sha` are the same file.
+    ///
+    /// There is one exception. If the other hand-over is of another run and the cell file has `accept_earlier_files`,
+    /// the file is allowed.
     fn check_not_accepted_before(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
         let own = (expected.stored.header.job, expected.stored.header.cycle);
         let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.accepted);
@@ -431,11 +446,13 @@ impl Judge {
         Ok(Some(accepted))
     }
 
-    /// Returns the complete stations, each as its file of points and its file of reference points. Also returns what is
-    /// still missing, as texts: names of files, or files that still change.
+    /// Returns two lists. The first list contains the complete stations. Each is a pair: the file of measured points,
+    /// and the file of the reference points that the station measured. The second list contains texts about missing
+    /// items: the name of a missing file, or a file that still changes. `new` are the files in the inbox that may be
+    /// read.
     ///
     /// # Errors
-    /// Several files match the name of one file.
+    /// Returns an error if several files match one file name of a station.
     fn paired<'f>(
         &self,
         ticket: &HandOverHeader,
@@ -455,11 +472,11 @@ impl Judge {
         Ok((pairs, waiting))
     }
 
-    /// Returns the only file in `new` whose name matches the pattern, if the file no longer changes. Otherwise the
-    /// inner `Err` is a text about what is awaited.
+    /// Returns the only file in `new` whose name matches `pattern`. Returns an inner `Err` if there is no such file
+    /// yet, or if the file still changes. The inner `Err` is a text that says what is awaited.
     ///
     /// # Errors
-    /// The outer `Err` means that several files match the pattern.
+    /// Returns an outer `Err` if several files match `pattern`.
     fn settled<'f>(
         &self,
         pattern: &Pattern,
@@ -474,9 +491,12 @@ impl Judge {
         }
     }
 
-    /// Returns the names of the two files of each station: points and reference points. If the cell file has a star in
-    /// both names, there is a station for each text in place of the star for which both files exist, in the order of
-    /// `files`.
+    /// Returns the two file names of each station: the file of measured points and the file of reference points. The
+    /// part, the job and the cycle of `ticket` are filled in.
+    ///
+    /// If both names of a station in the cell file contain a star (`*`), this entry represents several stations. There
+    /// is one station for each text in place of the star for which both files exist in `files`. These stations are in
+    /// the order of `files`.
     fn named_stations(
         &self,
         ticket: &HandOverHeader,
@@ -545,10 +565,11 @@ impl Judge {
         place_station(&format!("{} ({name})", index + 1), seen, nominal, stations.limit_mm)
     }
 
-    /// Returns an error value if the file of a station states another part, cycle or plan, otherwise `None`.
+    /// Returns an error value if the header of a station's file names another part, cycle or plan than the hand-over.
+    /// Returns `None` if the header agrees or names none of them.
     ///
     /// # Errors
-    /// The file cannot be read.
+    /// Returns an outer error if the file cannot be read.
     fn station_contradiction(
         &self,
         expected: &Expected,
@@ -643,10 +664,11 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     (off > 0).then(|| format!("{name}: {off} rows are switched off and were ignored"))
 }
 
-/// Reads the plan of a hand-over back from the files `plan.json` and `plan.csv` in its folder.
+/// Reads a plan that was handed over from the files `plan.json` and `plan.csv` in `folder`. The field `careful_start`
+/// of the returned plan is `None`, because the files do not contain it.
 ///
 /// # Errors
-/// A file cannot be read, or somebody has changed its layout.
+/// Returns an error if a file cannot be read, or if somebody has changed the layout of a file.
 fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
     #[derive(Deserialize)]
     struct Stored {
@@ -692,8 +714,9 @@ fn stored_target(row: &str) -> Option<PlanTarget> {
     })
 }
 
-/// Returns the text of `plan.csv`: the targets of a plan as a CSV table, after a header with the part, the job and
-/// `identity`, the SHA-256 of the plan.
+/// Returns the text of the file `plan.csv`. The text begins with a header that names the part, the job and `identity`
+/// (the SHA-256 of the plan). After the header, a CSV table contains the targets of the plan: points in mm, unit
+/// normals, and kinds.
 pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\

@@ -21,14 +21,16 @@ pub(super) struct DmisHeader<'a> {
     pub(super) coordinates: Coordinates,
 }
 
-/// Returns a text if it may be written between quotes: at most 60 printable ASCII characters, without `'` and `$`.
+/// Returns `text` if it can be written between the quotes of a DMIS program. It then has at most 60 characters, all of
+/// them printable ASCII characters other than `'` and `$`. Returns `None` for any other text.
 fn quotable(text: &str) -> Option<&str> {
     let is_plain = |c: char| matches!(c, ' '..='~') && c != '\'' && c != '$';
     (text.len() <= 60 && text.chars().all(is_plain)).then_some(text)
 }
 
-/// Returns the DMIS program with which a CMM measures the targets of a plan. `about` contains the part, the cycle, the
-/// identity of the plan and the sensor.
+/// Returns the text of the DMIS program with which a CMM measures the targets of `plan`. `about` contains the part, the
+/// cycle, the identity (SHA-256) of the plan, the name of the sensor, and the meaning of the measured coordinates
+/// (probe centres or contact points).
 pub(super) fn program(plan: &Plan, about: &DmisHeader<'_>) -> String {
     let (compensation, what) = match about.coordinates {
         Coordinates::Centres => ("OFF", "centres"),

@@ -67,11 +67,12 @@ impl Confirmation {
         Self { map: ticket.identity.clone(), job: Some(ticket.job), cycle: Some(ticket.cycle), ..Self::default() }
     }
 
-    /// Checks that a confirmation of a pass belongs to the hand-over `ticket`. `path` is the file of the confirmation,
-    /// for the error text.
+    /// Checks that this confirmation belongs to the hand-over with the header `ticket`. A person confirms with it that
+    /// a grinding pass has begun or ended. `path` is the file of the confirmation and is used only in the error text.
     ///
     /// # Errors
-    /// The confirmation names another map, job or cycle, or one of its numbers is negative or not finite.
+    /// Returns an error if the confirmation names no map, another map, another job or another cycle, or if one of its
+    /// numbers is negative (except the temperature) or not finite.
     fn check(&self, path: &Path, ticket: &HandOverHeader) -> Result<(), ExchangeError> {
         let wrong = |found: String, expected: String, remedy| {
             Err(ExchangeError::Confirmation { path: path.to_owned(), found, expected, remedy })
@@ -105,7 +106,9 @@ impl Confirmation {
 }
 
 impl GrinderFolders {
-    /// Creates the driver of the two exchange folders from its settings. Reads no folder before it is opened.
+    /// Creates the driver of a grinder that works with two folders: the outbox for the correction maps and the inbox
+    /// for the confirmations of a person. `settings` contains both folders. Reads no folder; this happens only when the
+    /// driver is opened.
     pub fn new(settings: GrinderExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -121,9 +124,11 @@ impl GrinderFolders {
         Ok(stored)
     }
 
-    /// Returns the confirmation of a pass from the file `name` of the inbox, with the SHA-256 of the file in
-    /// hexadecimal digits. Returns `None` if the file does not exist, was there before the hand-over, still changes, or
-    /// does not belong to the hand-over. If the file exists, the reason is added to `notes`.
+    /// Reads the confirmation of a pass from the file `name` in the inbox. Returns its content and the SHA-256 of the
+    /// file in hexadecimal digits. `stored` is the hand-over that is confirmed, and `found` are the files in the inbox.
+    ///
+    /// Returns `None` if the file does not exist, was in the inbox before the hand-over, still changes, cannot be read,
+    /// or does not belong to the hand-over. If the file exists, adds the reason to `notes`.
     fn confirmation(
         &self,
         name: &str,

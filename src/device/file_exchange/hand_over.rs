@@ -16,15 +16,19 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// Answer that comes back.
     type Answer: std::fmt::Debug + Clone + Send + 'static;
 
-    /// Checks access to the outbox and the inbox. Returns every hand-over in the outbox, the oldest first. Hand-overs
-    /// of earlier runs are included.
+    /// Checks that the outbox can be written and the inbox can be read. The outbox is the folder of the hand-overs
+    /// (requests to the machine); the inbox is the folder of the answers. Returns every hand-over in the outbox, also
+    /// those of earlier runs, with the oldest first. Returns an error if one of the folders is not accessible, or if a
+    /// hand-over cannot be read.
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
-    /// Publishes a hand-over: all its files appear at once, by the rename of a folder. `sequence` is its start number.
+    /// Publishes `request` as a hand-over in the outbox. All files of the hand-over appear at once, because a hidden
+    /// folder is renamed. `sequence` is the start number of the hand-over. `permit` can be withdrawn by the client
+    /// until the rename.
     ///
     /// # Errors
-    /// The job and cycle were published before, the permit was withdrawn before the rename, or the outbox cannot be
-    /// written.
+    /// Returns an error if this job and cycle were published before, if `permit` was withdrawn before the rename, or if
+    /// the outbox cannot be written.
     fn publish(
         &mut self,
         job: Job,
@@ -33,15 +37,19 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
         permit: &Permit,
     ) -> Result<(), ExchangeError>;
 
-    /// Changes the status of the hand-over of a job to `standing`.
+    /// Changes the status of the hand-over of `job` to `standing`, for example to held or stopped. Returns an error if
+    /// the hand-over does not exist or cannot be changed.
     fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError>;
 
-    /// Looks in the inbox for the answer to the open hand-over of a job. `now` is the time since the driver was
-    /// created.
+    /// Looks in the inbox for the answer to the open hand-over of `job`. Returns the answer, if it is complete and
+    /// correct, together with notes for a person. `now` is the time since the driver was created.
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Self::Answer>, ExchangeError>;
 
-    /// Records the confirmation of a person that the job with this map identity has begun or has ended. The default
-    /// returns an error, for machines that report a job only by files.
+    /// Records that a person has confirmed a step of `job`: the machine has begun, or it has ended and the part is
+    /// clear. `_map_identity` is the SHA-256 of the correction map of the job.
+    ///
+    /// The default always returns an error. It is for machines that report their jobs only by files, without a
+    /// confirmation by a person.
     fn confirm(&mut self, job: Job, _what: ConfirmedStep, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
     }
@@ -58,19 +66,19 @@ const USED: u8 = 1;
 const WITHDRAWN: u8 = 2;
 
 impl Permit {
-    /// Creates a permit for one publication.
+    /// Creates a valid permit to publish one hand-over.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Uses the permit for a publication. Returns false if it was withdrawn or used before: then nothing may be
-    /// published.
+    /// Uses up the permit immediately before a hand-over is published. Returns true if the permit was valid. Returns
+    /// false if the permit was already used or withdrawn; then nothing may be published.
     pub fn use_up(&self) -> bool {
         self.0.compare_exchange(VALID, USED, Ordering::AcqRel, Ordering::Acquire).is_ok()
     }
 
-    /// Withdraws the permit. Returns true if it was not used yet. Returns false if it was used or withdrawn before:
-    /// then the hand-over may have been published.
+    /// Withdraws the permit. Returns true if the permit was still valid; then the hand-over never appears. Returns
+    /// false if the permit was already used or withdrawn; then the hand-over may have been published.
     pub(super) fn withdraw(&self) -> bool {
         self.0.swap(WITHDRAWN, Ordering::AcqRel) == VALID
     }

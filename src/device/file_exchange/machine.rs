@@ -51,8 +51,10 @@ struct FolderMachine<M: Exchange> {
 }
 
 impl<M: Exchange> ExchangeMachine<M> {
-    /// Creates the machine from the driver of its folders; `name` is its name in messages. If an access to the folders
-    /// takes longer than `answers_within`, for example on a lost network drive, the machine counts as lost.
+    /// Creates a machine of the kind `kind` that is reached through two folders. `exchange` is the driver of these
+    /// folders. `name` is the name of the machine in messages. If an access to the folders takes longer than
+    /// `answers_within`, for example because of a lost network drive, the operation ends with a timeout error, and the
+    /// machine counts as lost.
     pub fn new(name: impl Into<Arc<str>>, kind: MachineKind, exchange: M, answers_within: Duration) -> Self {
         let name = name.into();
         let machine = FolderMachine {
@@ -76,15 +78,17 @@ impl<M: Exchange> ExchangeMachine<M> {
         Self { name, timeout: answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
     }
 
-    /// Sets whether this machine cannot reach the part while the part is at the other machine. Such a machine always
-    /// counts as clear of the part.
+    /// Sets whether this machine cannot reach the part while the part is at the other machine. If `apart` is true, the
+    /// status of this machine always says that the machine is clear of the part. Returns the changed machine.
     #[must_use]
     pub fn apart(self, apart: bool) -> Self {
         self.machine.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
         self
     }
 
-    /// Runs an operation on the folders on a thread that may block. `what` names the operation in errors.
+    /// Runs the operation `work` in a thread that may block, and returns its result. `work` receives the state of the
+    /// machine and the time since the driver was created. `what` names the operation in errors. Returns a timeout error
+    /// if the operation takes longer than the timeout of this machine; the operation itself continues in this case.
     async fn run_blocking<T: Send + 'static>(
         &self,
         what: &'static str,
@@ -186,8 +190,9 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    /// Reads all hand-overs in the outbox. The first call restores the job and the state of this machine from an open
-    /// or held hand-over.
+    /// Reads all hand-overs in the outbox. The first call also restores the state of this machine after a restart. If
+    /// the newest hand-over is open, its job becomes the job of this machine with the state EXECUTE. If it is held, the
+    /// state becomes HELD. Returns an error if the folders are not accessible.
     fn open(&mut self) -> DeviceResult<()> {
         self.hand_overs = self.exchange.open().map_err(|error| self.failed(MachineCommand::Claim, error))?;
         if !self.connected
@@ -201,7 +206,9 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Looks for the answer in the inbox if the state is EXECUTE. `now` is the time since the driver was created.
+    /// Looks for the answer in the inbox if the state of this machine is EXECUTE; does nothing in any other state. If
+    /// the answer has arrived, stores it and changes the state to COMPLETE. `now` is the time since the driver was
+    /// created.
     fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == MachineState::Execute) else { return Ok(()) };
         let look = self.exchange.poll(now, job).map_err(|error| self.failed(MachineCommand::Start, error))?;
@@ -261,11 +268,12 @@ impl<M: Exchange> FolderMachine<M> {
         self.started(armed)
     }
 
-    /// Marks a hand-over as stopped that appeared after its client had stopped waiting for it. The client may have
-    /// continued without it, so it must not stay open.
+    /// Changes the status of a hand-over to stopped. It was published only after its client had stopped waiting. The
+    /// client may have continued without this hand-over, so the hand-over must not stay open.
     ///
     /// # Errors
-    /// Always returns the refusal [`Answer::DeadToken`], or the error of the marking.
+    /// Always returns an error: the refusal [`Answer::DeadToken`], or the error that occurred when the status was
+    /// changed.
     fn take_back_late(&mut self, armed: &Armed) -> DeviceResult<Started> {
         self.mark(MachineCommand::Start, HandOverStatus::Stopped)?;
         self.notes = self.withdrawal_notes();
@@ -279,11 +287,13 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
-    /// Handles an error during the publication of a hand-over. If the outbox contains the hand-over, the start counts,
-    /// or is taken back if the permit was withdrawn.
+    /// Decides whether a start has taken effect although the publication of its hand-over returned `error`. For this
+    /// purpose, reads the outbox again. If the outbox contains the hand-over and `permit` is not withdrawn, the start
+    /// counts as successful. If `permit` is withdrawn, the hand-over is stopped and the start is refused.
     ///
     /// # Errors
-    /// Returns `error` if the hand-over is not there, and [`DeviceError::StartUnknown`] if the outbox cannot be read.
+    /// Returns `error`, as the error of this machine, if the outbox does not contain the hand-over. Returns
+    /// [`DeviceError::StartUnknown`] if the outbox cannot be read.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
         let why = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {
@@ -392,11 +402,13 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Accepts the confirmation of a person that the job with this map identity has begun, or has ended with the
-    /// machine clear of the part. The returned list of files is always empty.
+    /// Accepts the confirmation of a person about the running job: the job has begun, or it has ended and the machine
+    /// is clear of the part. `map_identity` is the SHA-256 of the correction map that the person names. Always returns
+    /// an empty list of files.
     ///
     /// # Errors
-    /// The machine is a CMM, no job runs, or the confirmation is of another map.
+    /// Returns an error if the machine is not connected, if it is a CMM, if no job runs, or if `map_identity` is not
+    /// that of the running job.
     fn confirm(&mut self, what: ConfirmedStep, map_identity: [u8; 32]) -> DeviceResult<Vec<String>> {
         self.check_connected("a confirmation")?;
         if self.kind == MachineKind::Cmm {
@@ -470,7 +482,8 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         &self.name
     }
 
-    /// Returns the notes for a person. Returns none while another thread works on the folders.
+    /// Returns the present notes for a person, for example which files are awaited. Does not wait: returns an empty
+    /// list while another thread works on the folders.
     fn notes(&self) -> Vec<String> {
         match self.machine.try_lock() {
             Ok(machine) => machine.notes.clone(),

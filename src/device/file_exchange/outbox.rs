@@ -59,8 +59,9 @@ pub(super) struct HandOverHeader {
 }
 
 impl HandOverHeader {
-    /// Creates the header of a hand-over. `identity` is that of the plan or map, and the files that are now in `inbox`
-    /// are listed as earlier files.
+    /// Creates the header of a hand-over. `identity` is the SHA-256 of the plan or map that is handed over.
+    /// `tool_radius_mm` is the radius of the probe or of the wheel. The header lists the files that are in `inbox` now,
+    /// so that these earlier files can be told apart from later answers. Returns an error if `inbox` cannot be read.
     pub(super) fn new(
         part: &str,
         job: Job,
@@ -87,14 +88,15 @@ impl HandOverHeader {
         Job { job: self.job, cycle: self.cycle, digest: self.digest }
     }
 
-    /// Returns true if the file `name` was in the inbox when the hand-over was created, and `look` shows the same size
-    /// and time of change.
+    /// Returns true if the file `name` was already in the inbox when the hand-over was created and has not changed
+    /// since. `look` contains the present size of the file and the time of its last change. The file counts as
+    /// unchanged if both are still the same.
     pub(super) fn is_earlier(&self, name: &str, look: &FileStamp) -> bool {
         self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
     }
 }
 
-/// Returns the time since 1970 in ns.
+/// Returns the time from the start of 1970 (UTC) to `at`, in ns. Returns 0 if `at` is earlier.
 fn nanoseconds(at: SystemTime) -> u128 {
     at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
 }
@@ -124,8 +126,9 @@ pub(super) struct Outbox {
 }
 
 impl Outbox {
-    /// Checks that the outbox can be written and the inbox can be read. Returns every hand-over in the outbox, the
-    /// oldest first.
+    /// Checks that this outbox (the folder of the hand-overs) can be written and that `inbox` (the folder of the
+    /// answers) can be read. Returns every hand-over in the outbox, with the oldest first. Returns an error if a folder
+    /// is not accessible, or if a hand-over cannot be read.
     pub(super) fn open(&self, inbox: &mut Watch) -> Result<Vec<HandOver>, ExchangeError> {
         try_writing(&self.folder)?;
         inbox.scan(Duration::ZERO)?;
@@ -138,7 +141,9 @@ impl Outbox {
         Ok(handed.map(hand_over).collect())
     }
 
-    /// Returns every hand-over in the folder, in the order of their start numbers.
+    /// Reads every hand-over in the outbox and returns them in ascending order of their start numbers. Ignores hidden
+    /// folders and everything that has no header file. Returns an error if a file of a hand-over cannot be read, or if
+    /// somebody has changed the name of its folder.
     pub(super) fn list(&self) -> Result<Vec<StoredHandover>, ExchangeError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut found = Vec::new();
@@ -182,11 +187,13 @@ impl Outbox {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
-    /// Publishes a hand-over in the outbox: `ticket` as its header, and `files` with their names.
+    /// Publishes a hand-over in the outbox. The hand-over is a folder that contains the header `ticket` and the
+    /// `files`. Each file is a pair of its name and its bytes.
     ///
     /// # Errors
-    /// The job and cycle were published before, the permit was withdrawn, or the outbox cannot be written. Nothing is
-    /// published then.
+    /// Returns an error if this job and cycle were published before, if `permit` was withdrawn, or if the outbox cannot
+    /// be written. Nothing is published then, with one exception: the hand-over may have appeared if only the flush to
+    /// the disk failed after the rename.
     pub(super) fn publish(
         &self,
         ticket: &HandOverHeader,
@@ -211,7 +218,8 @@ impl Outbox {
         Ok(())
     }
 
-    /// Renames a hand-over so that its name shows its status.
+    /// Renames the folder of the hand-over of `job`, so that the ending of its name shows the status `standing`. Does
+    /// nothing if the name is already right. Returns an error if the hand-over does not exist or cannot be renamed.
     pub(super) fn mark(&self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         let stored = self.handed_over(job)?;
         let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);
@@ -219,7 +227,8 @@ impl Outbox {
         if target != stored.path { Ok(rename(&stored.path, &target)?) } else { Ok(()) }
     }
 
-    /// Records which files were accepted as the answer.
+    /// Writes the list `taken` of the accepted files to the folder of the hand-over `stored`. Does nothing if `stored`
+    /// already has the same list.
     pub(super) fn record_accepted(&self, stored: &StoredHandover, taken: &AcceptedFiles) -> Result<(), ExchangeError> {
         if stored.accepted.as_ref() == Some(taken) {
             return Ok(());
@@ -259,7 +268,8 @@ fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
     sync_folder(to).map_err(failed("flushing it to the disk"))
 }
 
-/// Reads a small JSON file.
+/// Reads the JSON file at `path`, at most 16 MiB, and converts it to the type `T`. Returns an error if the file cannot
+/// be read or does not have this content.
 pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, FormatError> {
     let bytes = read_whole(path, MAX_BYTES)?;
     serde_json::from_slice(&bytes).map_err(|error| FormatError::Unexpected {
@@ -270,7 +280,7 @@ pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, 
     })
 }
 
-/// Returns a JSON document as it is written to a file.
+/// Returns the text of a JSON value as the bytes of a file: indented, with a line end after the last line.
 pub(super) fn json_lines(value: &serde_json::Value) -> Vec<u8> {
     format!("{value:#}\n").into_bytes()
 }

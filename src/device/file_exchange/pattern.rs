@@ -10,13 +10,14 @@ impl Pattern {
         Self(text.into())
     }
 
-    /// Returns the pattern with part, job and cycle filled in.
+    /// Returns this pattern with `part`, `job` and `cycle` in place of the placeholders. Characters of `part` that a
+    /// file name must not contain become `_`.
     pub fn filled(&self, part: &str, job: u32, cycle: u16) -> Self {
         let filled = self.0.replace("{part}", &file_word(part)).replace("{job}", &job.to_string());
         Self(filled.replace("{cycle}", &cycle.to_string()))
     }
 
-    /// Returns true if a name matches; case matters.
+    /// Returns true if the whole `name` matches this pattern. Upper-case and lower-case letters are different.
     pub fn fits(&self, name: &str) -> bool {
         let mut pieces = self.0.split('*');
         let first = pieces.next().unwrap_or_default();
@@ -32,14 +33,14 @@ impl Pattern {
         rest.ends_with(last)
     }
 
-    /// Returns the characters that the one star of a pattern matches in a name. Returns `None` if the name does not
-    /// match, or if there is not exactly one star.
+    /// Returns the characters of `name` that the `*` of this pattern matches. Returns `None` if `name` does not match,
+    /// or if the pattern does not contain exactly one `*`.
     pub fn star<'n>(&self, name: &'n str) -> Option<&'n str> {
         let (before, after) = self.0.split_once('*').filter(|(_, after)| !after.contains('*'))?;
         name.strip_prefix(before)?.strip_suffix(after)
     }
 
-    /// Returns the pattern with `text` in place of its first star.
+    /// Returns this pattern with `text` in place of its first `*`. Returns the pattern unchanged if it contains no `*`.
     pub fn with_star(&self, text: &str) -> Self {
         Self(self.0.replacen('*', text, 1))
     }
@@ -50,8 +51,9 @@ impl Pattern {
     }
 }
 
-/// Returns a text as a word that every file system accepts in a file name: any character other than letters, digits,
-/// `-`, `_` and `.` becomes `_`.
+/// Returns `text` in a form that every file system accepts as part of a file name. Any character other than letters,
+/// digits, `-`, `_` and `.` becomes `_`. If the text is empty or begins with a dot, it gets an additional `_` at the
+/// beginning, because a leading dot would hide the file.
 pub fn file_word(text: &str) -> String {
     let word: String =
         text.chars().map(|c| if c.is_alphanumeric() || matches!(c, '-' | '_' | '.') { c } else { '_' }).collect();

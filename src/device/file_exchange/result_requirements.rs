@@ -23,11 +23,12 @@ pub struct ResultRequirements<'a> {
 }
 
 impl ResultRequirements<'_> {
-    /// Reads the bytes of a file of points and checks them against plan and cell; `path` is its name in messages.
+    /// Reads a file of measured points from its content `bytes`. Checks the file against the plan and the cell file.
+    /// `path` is the name of the file in messages.
     ///
     /// # Errors
-    /// The file is incomplete, does not state whether its coordinates are probe centres or contact points, or was
-    /// measured with another probe.
+    /// Returns an error if the file is incomplete or not valid, if it was measured with another probe radius, or if
+    /// neither the file nor the cell file states whether the coordinates are probe centres or contact points.
     pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<ResultFile, ExchangeError> {
         check_ended(path, bytes)?;
         let file = parse_result(path, bytes, self.content)?;
@@ -43,11 +44,14 @@ impl ResultRequirements<'_> {
         }
     }
 
-    /// Assigns the points to the targets, by the index of each row or by their order.
+    /// Assigns the points of `result` to the targets of the plan. Uses the target number of each row if the file has
+    /// them, otherwise the order of the points. With target numbers, returns one point for each target in the order of
+    /// the plan; a target without a row is marked as not found. If any number of points is allowed, returns all points,
+    /// numbered from 0. `path` is used in messages.
     ///
     /// # Errors
-    /// The number of points without indices differs from the number of targets, or an index is not a target of the plan
-    /// or occurs twice.
+    /// Returns an error if a target number is not in the plan or occurs twice. Without target numbers, returns an error
+    /// if the number of points differs from the number of targets.
     pub fn assign_by_index(&self, path: &Path, result: &ResultFile) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         let Some(targets) = self.targets else { return Ok(numbered(&result.points)) };
         let Some(indices) = &result.indices else { return self.assign_in_order(path, &result.points) };
@@ -68,10 +72,11 @@ impl ResultRequirements<'_> {
         Ok(all)
     }
 
-    /// Assigns points to the targets in the order of the plan.
+    /// Assigns `points`, in mm, to the targets of the plan in the order of the plan: the first point belongs to the
+    /// first target. If any number of points is allowed, numbers the points from 0 instead. `path` is used in messages.
     ///
     /// # Errors
-    /// The number of points differs from the number of targets of the plan.
+    /// Returns an error if the number of points differs from the number of targets of the plan.
     pub fn assign_in_order(&self, path: &Path, points: &[Point]) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         match self.targets {
             None => Ok(numbered(points)),
@@ -84,12 +89,18 @@ impl ResultRequirements<'_> {
     }
 }
 
-/// Checks a complete measurement against its plan before it is accepted as the answer, because a rejected file can
-/// still be replaced. `least_found` is the required fraction of the targets, from 0 to 1.
+/// Checks a complete measurement against its plan. This is done before the measurement is accepted as the answer,
+/// because a rejected file can still be replaced. `least_found` is the fraction of the targets, from 0 to 1, that need
+/// a touched point. `rehearsal` is true if people only act as the machines; the plan itself may then be returned as the
+/// measurement. `path` is used in messages.
 ///
 /// # Errors
-/// Too few targets have a point: fewer than `least_found` requires or, in a further batch, fewer than half. Or the
-/// points equal the plan and this is no rehearsal, or points are not at their targets.
+/// Returns an error in each of these cases:
+///
+/// - Too few targets have a touched point. The first batch needs the fraction `least_found` of its targets, every
+///   further batch half of its targets.
+/// - The points are equal to the points of the plan, and `rehearsal` is false.
+/// - The points do not lie at their targets.
 pub fn check_measurement(
     path: &Path,
     plan: &Plan,
@@ -113,8 +124,9 @@ pub fn check_measurement(
     }
 }
 
-/// Assembles a measurement from its points and from the statements in its result files. `done` is the number of the
-/// START that began it. A value that no file states is `None`.
+/// Builds a measurement from its points and from the headers of its result files. The probe radius and the temperature
+/// come from the first file that states them; they are `None` if no file states them. `done` is the number of the START
+/// command that began the measurement. The duration is `None`.
 pub fn assemble_measurement(
     points: Vec<MeasuredPoint>,
     results: &[ResultFile],
@@ -136,8 +148,9 @@ pub fn assemble_measurement(
     }
 }
 
-/// Returns a text if the header of a result file, `says`, names another part, cycle or plan than expected. `plan` is
-/// the identity of the plan in hexadecimal digits. Returns `None` if the header agrees or does not name them.
+/// Compares the header `says` of a result file with the expected part, cycle and plan. `plan` is the identity (SHA-256)
+/// of the plan in hexadecimal digits. Returns a text about the first difference. Returns `None` if there is no
+/// difference; a value that the header does not contain is no difference.
 pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
     if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
         return Some(format!("is of part {other}, not {part}"));

@@ -177,11 +177,12 @@ impl ExchangeWire {
         ExchangeMachine::new(name, kind, folders, FOLDER_TIMEOUT).apart(self.cannot_reach_part)
     }
 
-    /// Returns the outbox and the inbox.
+    /// Returns the paths of two folders: the outbox, to which this program writes hand-overs, and the inbox, in which
+    /// the answers appear. `machine` is used for the error text.
     ///
     /// # Errors
-    /// One of the two folders does not exist. Regrind does not create them, because no machine or person would use a
-    /// folder that Regrind created itself.
+    /// Returns an error if one of the two folders does not exist. Regrind does not create them, because no machine or
+    /// person would use a folder that Regrind created itself.
     fn folders(&self, making: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
         let table = machine.name();
         let folder = |name: &str, path: &String| {
@@ -194,8 +195,11 @@ impl ExchangeWire {
         Ok([folder("outbox", &self.outbox)?, folder("inbox", &self.inbox)?])
     }
 
-    /// Returns the settings of the stations, or `None` if the cell file has no stations. Reads the reference points at
-    /// once, so that an error in them does not appear only after a day of measuring.
+    /// Returns the settings for a measurement from several stations, each with its own frame. Returns `None` if the
+    /// cell file names no file of reference points.
+    ///
+    /// Reads the file of reference points now, so that an error in this file is found before the measurement begins.
+    /// Returns an error if the file is not valid.
     fn stations(&self, making: &DriverContext<'_>) -> Result<Option<Stations>, DriverError> {
         let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
             return Ok(None);

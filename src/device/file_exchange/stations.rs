@@ -29,8 +29,9 @@ pub struct PlacedStation {
 }
 
 impl PlacedStation {
-    /// Returns a text about this station: how well its reference points fit in mm, which nominal points it does not
-    /// see, and which of its points are not nominal.
+    /// Returns a text about the registration of this station. The text contains the rms residual and the residual of
+    /// each fitted reference point, in mm. It also names the nominal points that the station has not measured, and the
+    /// measured points that are not nominal.
     pub fn summary(&self) -> String {
         let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
         let mut words = format!(
@@ -48,15 +49,20 @@ impl PlacedStation {
     }
 }
 
-/// Registers a station to the nominal reference points by a rigid best fit. `seen` are the reference points that the
-/// station has measured.
+/// Registers the frame of a station to the frame of the nominal reference points by a rigid best fit. `seen` are the
+/// reference points that the station has measured. `station` is the name of the station in messages. Returns the pose
+/// and the residuals.
 ///
-/// Points are matched by name if the station names at least one nominal point (three are required), otherwise by their
-/// order. A station without these names that has fewer points than `nominal` is matched by the distances between its
-/// points, if only one subset of `nominal`, in order, has the same distances.
+/// The measured points are matched to the nominal points by one of these rules:
+///
+/// - By name, if at least three measured points have the name of a nominal point.
+/// - By their order, if no measured point has a nominal name and there are as many points as in `nominal`.
+/// - By the distances between the points, if no measured point has a nominal name and there are fewer points than in
+///   `nominal`. Exactly one subset of `nominal`, in the order of `nominal`, must then fit.
 ///
 /// # Errors
-/// The points cannot be matched, they determine no pose, or a residual exceeds `limit_mm`.
+/// Returns an error if the points cannot be matched, for example because only one or two have a nominal name. Returns
+/// an error too if the points determine no pose, or if a residual exceeds `limit_mm`.
 pub fn place_station(
     station: &str,
     seen: &References,
@@ -139,11 +145,12 @@ fn match_points(
     }
 }
 
-/// Finds the subset of the nominal points, in their order, to which the points `seen` fit with residuals of at most
-/// `limit_mm`.
+/// Finds the subset of the nominal points to which the points `seen` fit with residuals of at most `limit_mm`. The
+/// points of the subset keep the order of `nominal`: the first point of `seen` belongs to the first point of the
+/// subset.
 ///
 /// # Errors
-/// Returns a text if no subset fits, or more than one.
+/// Returns a text if no subset fits, or if more than one fits.
 fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Result<Matching, &'static str> {
     let (have, want) = (seen.points.len(), nominal.points.len());
     let chosen = |mask: u32| (0..want).filter(|n| mask >> n & 1 == 1).enumerate().collect::<Vec<_>>();
@@ -160,9 +167,12 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     }
 }
 
-/// Looks for the cause why the points `from` do not fit the nominal points `to`: two points are swapped, or one point
-/// is wrong. Returns the index of the point that the message names, or `None` if no single point explains it, and the
-/// probable cause as text.
+/// Looks for the reason why the points `from` of a station do not fit the nominal points `to`. Tests two causes: two
+/// points are swapped, or a single point is wrong. The points fit if no residual exceeds `limit_mm`. `names` are the
+/// names of the points for the text.
+///
+/// Returns the index of the suspected point and a text about the probable cause. If two points are swapped, the index
+/// is that of the first one. The index is `None` if neither cause explains the misfit.
 fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (Option<usize>, String) {
     let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.max_residual().1 <= limit_mm);
     for a in 0..from.len() {
@@ -191,8 +201,8 @@ fn without(points: &[Point], index: usize) -> Vec<Point> {
     points.iter().enumerate().filter(|(k, _)| *k != index).map(|(_, p)| *p).collect()
 }
 
-/// Returns the distance in mm of the point `index` from its nominal position, if only the other points are fitted.
-/// Returns `None` if these determine no pose.
+/// Returns the distance, in mm, of the point `index` from its nominal position. All other points of `from` are first
+/// fitted to their nominal points in `to`. Returns `None` if these other points determine no pose.
 fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
     let fit = fit_rigid(&without(from, index), &without(to, index)).ok()?;
     Some((to[index] - fit.pose.transform_point(&from[index])).norm())

@@ -53,17 +53,18 @@ impl Watch {
         Self { folder: folder.into(), stable_for, known: BTreeMap::new() }
     }
 
-    /// Returns the folder.
+    /// Returns the path of the watched folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Reads the folder and returns its files sorted by name, without those that begin with a dot.
+    /// Reads the folder and returns its files, sorted by name. Omits sub-folders and files whose name begins with a
+    /// dot. Each returned file states whether it counts as complete because it has not changed for some time.
     ///
-    /// `now` is the time since any fixed moment; it must not decrease.
+    /// `now` is the time since any fixed moment. It must not decrease from one call to the next.
     ///
     /// # Errors
-    /// The folder cannot be read.
+    /// Returns an error if the folder cannot be read.
     pub fn scan(&mut self, now: Duration) -> Result<Vec<WatchedFile>, FormatError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut known = BTreeMap::new();

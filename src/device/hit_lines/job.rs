@@ -79,7 +79,8 @@ struct LoggedLine<'a> {
     refused: Option<&'a str>,
 }
 
-/// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
+/// Locks the state `hearing`, which the driver and the listening thread share, and returns access to it. A panic in
+/// another thread does not make this state invalid, so a poisoned lock is ignored.
 pub(super) fn locked(hearing: &Mutex<MeasurementSession>) -> MutexGuard<'_, MeasurementSession> {
     hearing.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -137,7 +138,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a received line. Rejects data that are too long for a line and have no line end.
+    /// Processes `gathered`, the next data from the machine. If the data are a line, evaluates the line as a touch. If
+    /// the data exceed the maximum length of a line without a line end, rejects them.
     pub(super) fn process(&mut self, gathered: ReceivedLine) {
         match gathered {
             ReceivedLine::Line(line) => self.line(&line),
@@ -147,7 +149,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Rejects the incomplete line `text`, whose end did not arrive in time.
+    /// Rejects the incomplete line `text`, whose end did not arrive in time. A running measurement then holds, because
+    /// the touch may be lost.
     pub(super) fn cut_short(&mut self, text: &str) {
         self.reject_line(text, "it is incomplete: its end did not arrive; touch that point again");
     }
@@ -194,8 +197,13 @@ impl MeasurementSession {
         }
     }
 
-    /// Processes a line that is not a valid touch, for the reason `why`. During a measurement, also a held one, the
-    /// line is listed as refused. Without a measurement, the line is only counted.
+    /// Processes a line that cannot be used as a touch. `why` is the reason, for the list of refused lines. The effect
+    /// depends on the state:
+    ///
+    /// - While the machine may be moving, lists the line as refused. A measurement in the state EXECUTE changes to
+    ///   HOLDING.
+    /// - In the state HELD, lists the line as refused because it arrived too late.
+    /// - In any other case, only counts the line and stores it as the last unrequested one.
     fn reject_line(&mut self, line: &str, why: &str) {
         match (&mut self.measurement, self.state) {
             (Some(asked), state) if state.is_moving() => {
@@ -221,8 +229,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Records that the connection was lost: a running measurement holds, because later touches are not received.
-    /// `begun` is the incomplete last line, if there is one.
+    /// Records that the connection was lost with `error`. A measurement in the state EXECUTE changes to HOLDING,
+    /// because later touches cannot be received. `begun` is the incomplete last line, or `None`; this line is rejected.
     pub(super) fn link_lost(&mut self, error: DeviceError, begun: Option<String>) {
         if let Some(text) = begun {
             self.cut_short(&text);
@@ -234,8 +242,9 @@ impl MeasurementSession {
         self.link_error = Some(error);
     }
 
-    /// Ends a complete measurement if `clear_after` has passed since its last line. This is the time that the probe
-    /// needs to move clear of the part. With `None`, does nothing.
+    /// Ends the running measurement if every target is touched and the time `clear_after` has passed since the last
+    /// line. The probe needs this time to move clear of the part. Then the state is COMPLETE and the probe counts as
+    /// clear of the part. Does nothing if `clear_after` is `None` or the state is not EXECUTE.
     pub(super) fn finish_if_clear(&mut self, clear_after: Option<Duration>) {
         let (Some(asked), Some(clear_after), MachineState::Execute) = (&self.measurement, clear_after, self.state)
         else {
@@ -258,8 +267,9 @@ impl MeasurementSession {
 
     // ---- words ------------------------------------------------------------------------------------------------------------------------
 
-    /// Returns notes for a person about lines: the last refused lines, the number of repeated lines, and lines that
-    /// arrived without a measurement.
+    /// Returns notes for a person about received lines that were not used. The notes contain the last refused lines (at
+    /// most four) and the lines that arrived without a requested measurement. When all targets are touched, they also
+    /// contain the number of lines that arrived twice.
     pub(super) fn refusals(&self) -> Vec<String> {
         let asked = self.measurement.as_ref();
         let refused = asked.into_iter().flat_map(|asked| asked.refused_lines.iter().cloned());

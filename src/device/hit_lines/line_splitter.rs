@@ -21,7 +21,8 @@ pub struct LineSplitter {
 }
 
 impl LineSplitter {
-    /// Adds bytes and returns the lines completed by them.
+    /// Adds `bytes` to the stored incomplete line. Returns the lines that these bytes complete, without empty lines. If
+    /// a line exceeds the maximum length of 200 bytes, returns its beginning as overlong data and ignores its rest.
     pub fn push(&mut self, bytes: &[u8]) -> Vec<ReceivedLine> {
         let mut gathered = Vec::new();
         for &byte in bytes {
@@ -50,8 +51,8 @@ impl LineSplitter {
         !self.partial.is_empty()
     }
 
-    /// Discards the line that has begun and not ended, and returns its text so far. Returns `None` if there is none, or
-    /// if it has only blanks.
+    /// Discards the stored line that has begun and not ended. Returns the text of this line. Returns `None` if no line
+    /// has begun, or if the line contains only blanks.
     pub fn give_up(&mut self) -> Option<String> {
         self.overlong = false;
         let line = std::mem::take(&mut self.partial);
@@ -59,7 +60,8 @@ impl LineSplitter {
     }
 }
 
-/// Converts bytes to text; invalid bytes become a character that no format contains.
+/// Converts `bytes` (UTF-8) to text. Invalid bytes become the replacement character U+FFFD, which no line format
+/// accepts.
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }

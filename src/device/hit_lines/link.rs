@@ -62,11 +62,13 @@ pub(super) struct Listener {
 }
 
 impl Listener {
-    /// Opens the line to the machine and discards the data received so far. Then a thread of its own passes each line
-    /// to `hearing`.
+    /// Opens the connection `line` to the measuring machine and discards the data that were sent before. Then starts a
+    /// thread that receives the lines and passes each line to the shared state `hearing`. The thread ends when the
+    /// returned handle is dropped or the connection is lost. `machine` is the name of the machine in errors, and
+    /// `waits` contains the timeouts.
     ///
     /// # Errors
-    /// The line cannot be opened.
+    /// Returns an error if the connection cannot be opened, or if the machine does not stop sending.
     pub(super) async fn open(
         machine: &Arc<str>,
         line: HitSource,
@@ -158,7 +160,8 @@ async fn connect(line: &HitSource) -> io::Result<Box<dyn Source>> {
     }
 }
 
-/// Discards incoming data until the line has been silent for `silence`.
+/// Discards incoming data until nothing has arrived for the time `silence`. Returns an error if data still arrive after
+/// 2 s, or if the connection ends.
 async fn drain(source: &mut dyn Source, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + MAX_DRAIN_TIME;
     let mut bytes = [0; 512];

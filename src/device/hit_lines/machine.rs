@@ -65,10 +65,12 @@ impl HitLinesCmm {
         DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
     }
 
-    /// Changes the state to `to` and returns the status.
+    /// Changes the state of the machine from one of the states in `from` to `to`. Returns the new status. `command` is
+    /// the command of the client that causes the change; the error names this command.
     ///
     /// # Errors
-    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
+    /// Returns the refusal [`Answer::WrongState`] if the current state is not in `from`. The state then does not
+    /// change.
     fn transition(&self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         let mut hearing = locked(&self.session);
         if !from.contains(&hearing.state) {
@@ -79,7 +81,9 @@ impl HitLinesCmm {
         Ok(status_of(&hearing))
     }
 
-    /// Returns instructions for the operator: what to do at the machine now, and which command to type after that.
+    /// Returns instructions for the operator, one per line: what to do at the machine now, and which `regrind` command
+    /// to type afterwards. `hearing` is the current measurement session. Returns no lines if no measurement is
+    /// requested, or if the operator has nothing to do in the current state.
     fn prompt(&self, hearing: &MeasurementSession) -> Vec<String> {
         let Some(asked) = &hearing.measurement else { return Vec::new() };
         let folder = &self.settings.run_folder;
@@ -126,10 +130,13 @@ impl HitLinesCmm {
         }
     }
 
-    /// Ends the measurement after a person has confirmed its end. Returns the paths of the stored files.
+    /// Ends the measurement of the session `hearing` with the outcome COMPLETE, after a person has confirmed its end.
+    /// Returns the paths of the two stored files, relative to the folder of the run: the list of targets and the
+    /// received lines.
     ///
     /// # Errors
-    /// Returns a text if no measurement is requested, no point arrived, or fewer points arrived than required.
+    /// Returns the reason as text if no measurement is requested, if no point arrived, or if fewer points arrived than
+    /// the setting `min_free_points`.
     fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
         let Some(asked) = &hearing.measurement else { return Err("no measurement is requested".to_owned()) };
         let (there, _) = asked.list.progress();
@@ -204,8 +211,11 @@ fn batch_suffix(job: Job) -> String {
     }
 }
 
-/// Writes the list of targets of a job into the folder of the run. Opens and returns the file that stores the received
-/// lines.
+/// Writes the targets of `plan` as a CSV file for `job` into the folder of the run. Then opens the JSON-lines file of
+/// this job, which stores each line that the machine sends. Returns this open file.
+///
+/// # Errors
+/// Returns an error if a folder or a file cannot be created.
 fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<JsonlAppender, FormatError> {
     let path = settings.run_folder.join(plan_file(job));
     ResultFolder::prepare(path.parent().unwrap_or(&settings.run_folder))?.keep();
@@ -404,7 +414,8 @@ impl Machine for HitLinesCmm {
     }
 }
 
-/// Returns a plan without targets, for a measurement of an interrupted run: only its job is known.
+/// Returns a plan without targets and with all lengths 0. The driver uses this plan for a measurement that an
+/// interrupted run began: after a restart, only the job number is known, not the plan.
 fn no_plan() -> Plan {
     Plan {
         targets: Vec::new(),

@@ -153,10 +153,12 @@ impl fmt::Display for LineError {
 }
 
 impl LineParser {
-    /// Parses a line without its line end.
+    /// Parses a line from the machine. `line` has no line end. Returns the position in mm, and the angle of the rotary
+    /// table in degrees if the format has one.
     ///
     /// # Errors
-    /// Returns an error if the line is not exactly of the format.
+    /// Returns an error if the line has a wrong number of values, if a value does not match the format, or if a value
+    /// exceeds its limit.
     pub fn read(&self, line: &str) -> Result<Hit, LineError> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
             let why = format!("its character {} is {c:?}, which is not plain text", at + 1);
@@ -188,11 +190,11 @@ impl LineParser {
         Err(LineError::whole_line(format!("it has {} values instead of {expected}: {why}", fields.len())))
     }
 
-    /// Returns the text of value number `k` (from 0) of a line, without blanks and without the letter of its axis.
-    /// `field` is the text between two separators.
+    /// Returns the number in `field` as text, without blanks and without the axis letter. `field` is the text between
+    /// two separators. `k` is the index of the value in the line, from 0; the letter must belong to this index.
     ///
     /// # Errors
-    /// The format requires the letter, and it is missing.
+    /// Returns an error if the format requires an axis letter and `field` does not begin with this letter.
     fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineError> {
         let field = field.trim_matches(' ');
         if !self.format.is_lettered() {
@@ -238,8 +240,9 @@ impl LineParser {
         Ok(angle)
     }
 
-    /// Returns every parser (format, separator, decimal mark, number of decimals) that accepts a line. Helps the author
-    /// of a cell file to find the right settings.
+    /// Returns every parser that accepts `line`. Tries all combinations of format, separator, decimal mark and number
+    /// of decimals (1 to 9). The unit and the order of the axes keep their defaults. The author of a cell file can use
+    /// the result to find the right settings. Returns an empty list if no parser accepts the line.
     pub fn fitting(line: &str) -> Vec<Self> {
         let marks = [('.', Separator::Comma), ('.', Separator::Semicolon), ('.', Separator::Tab)];
         let commas = [(',', Separator::Semicolon), (',', Separator::Tab), (',', Separator::Blank)];
@@ -279,8 +282,9 @@ impl fmt::Display for LineParser {
     }
 }
 
-/// Parses a number with an optional sign and `least` to `most` digits after the decimal mark `mark`. Without a mark,
-/// `least` must be 0. If `most` is 0, no mark is allowed. Returns `None` for any other text.
+/// Parses a decimal number with an optional sign. The number needs 1 to 9 digits before the decimal mark `mark`, and
+/// `least` to `most` digits after the mark. The mark may be absent only if `least` is 0. If `most` is 0, no mark is
+/// allowed. Returns `None` for any other text.
 fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
     let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
     let (whole, behind) = match digits.split_once(mark) {

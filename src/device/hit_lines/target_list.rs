@@ -54,8 +54,9 @@ pub(super) enum TouchAssignment {
 }
 
 impl TargetList {
-    /// Creates the list of the targets of a plan. `what` states whether lines contain probe centres or contact points,
-    /// and `telling` are the rules for touches. With `is_free`, the list has no targets and accepts any points.
+    /// Creates the list of the targets of `plan`, without any touch. `what` states whether the received coordinates are
+    /// centres of the probe ball or contact points on the surface. `telling` contains the rules that assign a touch to
+    /// a target. If `is_free` is true, the list has no targets and accepts every point.
     pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: TouchRules) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };
@@ -73,11 +74,14 @@ impl TargetList {
         self.expected_mm.is_empty()
     }
 
-    /// Assigns the point of a line to the nearest target. Recognises a line that arrived twice. `came` is the time of
-    /// the line since the measurement began.
+    /// Assigns the point `at_mm` to the nearest target and stores the point. `at_mm` is the position in `line`, in mm.
+    /// `came` is the time from the start of the measurement to the arrival of the line. An identical line that follows
+    /// the previous line within `double_within` is reported as a duplicate and not stored. If the list accepts any
+    /// points, stores every other point with the next index.
     ///
     /// # Errors
-    /// Returns the reason, as text, why the point is not a touch of a target.
+    /// Returns the reason as text if the nearest target is farther away than `limit_mm`, or if that target was already
+    /// touched and the rules do not allow replacement.
     pub(super) fn assign(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<TouchAssignment, String> {
         let before = self.last.replace((line.to_owned(), came));
         let within = |at: Duration| came.saturating_sub(at) < self.rules.double_within;
@@ -123,12 +127,14 @@ impl TargetList {
         (self.points.iter().flatten().count(), (!self.is_free()).then_some(self.points.len()))
     }
 
-    /// Returns true if every target was touched.
+    /// Returns true if the list has targets and every target was touched. Returns false if the list accepts any points,
+    /// because such a list has no targets.
     pub(super) fn is_complete(&self) -> bool {
         !self.is_free() && self.points.iter().all(Option::is_some)
     }
 
-    /// Returns the indices of the remaining targets.
+    /// Returns the plan indices of the targets that were not touched yet, in the order of the plan. Returns none if the
+    /// list accepts any points.
     pub(super) fn remaining(&self) -> impl Iterator<Item = u32> + '_ {
         self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
     }
@@ -145,7 +151,9 @@ impl TargetList {
         self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
     }
 
-    /// Returns the points from index `from` on, up to the first target that is not touched yet.
+    /// Returns the measured points that follow each other without a gap: from the target at position `from` of the plan
+    /// to the last target before the first untouched one. Returns an empty list if the target at `from` is not touched
+    /// yet.
     pub(super) fn ready(&self, from: usize) -> Vec<MeasuredPoint> {
         self.points.iter().skip(from).map_while(|point| *point).collect()
     }

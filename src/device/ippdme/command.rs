@@ -29,10 +29,11 @@ impl DmeCommand {
         self.name.ends_with('E')
     }
 
-    /// Parses a line without its line end, as strictly as a server must. Returns the tag and the command.
+    /// Parses a command line from a client, as strictly as an I++ DME server must. `line` has no line end. Returns the
+    /// tag and the command.
     ///
     /// # Errors
-    /// Returns the error number of the standard with which a server refuses the line.
+    /// Returns the I++ DME error number with which a server refuses the line, and the reason.
     pub fn read(line: &str) -> Result<(Tag, Self), SyntaxError> {
         if line.len() > MAX_LINE_LENGTH {
             return Err(SyntaxError { number: 8, reason: "a line of more than 65536 characters" });
@@ -83,7 +84,10 @@ impl fmt::Display for DmeCommand {
     }
 }
 
-/// Splits a line into its tag and the text after the blank that follows the tag.
+/// Splits `line` into the tag and the rest of the line. The tag has five characters, and one blank follows.
+///
+/// # Errors
+/// Returns an error if the tag is invalid, if its number is 0, or if no blank follows the tag.
 fn tagged(line: &str) -> Result<(Tag, &str), SyntaxError> {
     let illegal = SyntaxError { number: 1, reason: "an invalid tag" };
     let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;

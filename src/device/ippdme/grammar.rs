@@ -120,10 +120,11 @@ pub(super) fn is_known(name: &str) -> bool {
     names().any(|known| known == name)
 }
 
-/// Checks the arguments of a command.
+/// Checks that the arguments of `command` match the grammar of I++ DME: their number, their types and their names.
 ///
 /// # Errors
-/// Returns the error with which a server refuses the arguments.
+/// Returns the error number with which a server refuses the command: 507 if the command is unknown, otherwise the
+/// number for the invalid arguments.
 pub(super) fn check(command: &DmeCommand) -> Result<(), SyntaxError> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
         return Err(SyntaxError { number: 507, reason: "an unknown command" });
@@ -197,8 +198,12 @@ fn transformation(items: &[Item]) -> Result<(), SyntaxError> {
     }
 }
 
-/// Checks that there is at least one argument, that `fits` accepts each of them as a property, and that no property
-/// occurs twice.
+/// Checks the properties `items` of a command. `fits` receives the name of a property and the items in its parentheses,
+/// and returns true if the command allows this property.
+///
+/// # Errors
+/// Returns error 502 if `items` is empty, if an item is not a property, if `fits` returns false for an item, or if a
+/// property occurs twice.
 fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), SyntaxError> {
     if items.is_empty() {
         return Err(arguments("it has at least one argument"));
@@ -249,8 +254,9 @@ fn touch(items: &[Item]) -> Result<(), SyntaxError> {
 
 // ---- properties of tools --------------------------------------------------------------------------------------------------------
 
-/// Returns the error for arguments that end in a name and a comma: the name is refused as a property without
-/// parentheses. For all other arguments, returns the error `otherwise`.
+/// Returns the error with which a server refuses `items`; never returns `Ok`. If the last two items are a name and an
+/// empty item (as in `X,`), returns error 509, because the name is a property without parentheses. For all other items,
+/// returns the error `otherwise`.
 fn trailing(items: &[Item], otherwise: SyntaxError) -> Result<(), SyntaxError> {
     match items {
         [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),

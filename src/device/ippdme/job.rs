@@ -101,7 +101,8 @@ impl SharedState {
     }
 }
 
-/// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
+/// Locks the shared state and returns the guard of the lock. Ignores a poisoned lock (a lock whose holder panicked),
+/// because the shared state stays valid after a panic.
 pub(super) fn locked(shared: &Mutex<SharedState>) -> MutexGuard<'_, SharedState> {
     shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -120,7 +121,9 @@ pub(super) struct Worker {
 }
 
 impl Worker {
-    /// Serves the session until it is lost or until no sender of orders is left; then ends the session.
+    /// Carries out the orders of the driver until the connection fails or until the driver closes the order channel.
+    /// Checks in idle intervals that the server answers. An abort interrupts a running order. If the order channel was
+    /// closed, also ends the session at the server.
     pub(super) async fn serve_session(mut self) {
         loop {
             let done = tokio::select! {
@@ -170,8 +173,9 @@ impl Worker {
         }
     }
 
-    /// Records a failure in the shared state: ABORTED after an abort, FAULTED after a refused command or an implausible
-    /// answer. Returns true if the connection failed, so that the session is lost.
+    /// Stores `failure` in the shared state. The state becomes ABORTED after an abort, and FAULTED after a refused
+    /// command or an implausible answer. Returns true if the connection failed, which means that the session is lost;
+    /// otherwise returns false.
     fn failed(&mut self, failure: Failure) -> bool {
         let why = self.device_error(&failure);
         self.position_mm = None;
@@ -206,11 +210,13 @@ impl Worker {
 
     // ---- a job ------------------------------------------------------------------------------------------------------------------------
 
-    /// Measures the targets of the plan that have no point yet, along the route. Stops before the next target if a hold
-    /// or a stop is requested.
+    /// Measures all targets of the plan in `work` that have no point yet, in the order of the route. Before each target
+    /// or scan, checks for a requested hold or stop; if there is one, ends the measurement early. Then raises the probe
+    /// and sets the state COMPLETE or HELD.
     ///
     /// # Errors
-    /// An abort, a failed connection, or an answer that is an error or implausible.
+    /// Returns a failure if an abort is ordered, if the connection fails, if the server refuses a command, if an answer
+    /// is implausible, or if too many targets cannot be reached.
     async fn run(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
@@ -264,8 +270,9 @@ impl Worker {
         Err(Failure::Refused(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
-    /// Returns whether the client requests to continue, hold or stop the job. If no status request came within
-    /// `silence_limit`, the job holds by itself, as a machine does that loses its client.
+    /// Returns the current request of the client for the job: continue, hold or stop. Returns `Hold` and changes the
+    /// state to HOLDING if the state is EXECUTE and the last status request is older than `silence_limit`: the client
+    /// is then assumed to be lost.
     fn current_request(&self) -> JobRequest {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
@@ -276,8 +283,14 @@ impl Worker {
         *self.job_request.borrow()
     }
 
-    /// Homes the machine if necessary. Sets the frame, the tool, its parameters and the content of a point report, as
-    /// the plan requires. Assumes nothing about settings that other clients left.
+    /// Prepares the server for the job. Homes the machine if it is not homed, sets the coordinate system, raises the
+    /// probe, and changes the tool. Checks the tool radius. Sets the approach, search and retract distances of the
+    /// plan, and the values that the server reports for each touch. Sets all these values again for every job, because
+    /// another client can have changed them.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses a step, if an answer is implausible, if an abort is ordered, or if the
+    /// connection fails.
     async fn set_up(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let homed = self.session.ask("IsHomed", Vec::new()).await?;
         if homed.value("IsHomed") != Some(1.0) {
@@ -355,8 +368,13 @@ impl Worker {
         Err(Failure::Implausible(DeviceError::ProbeRadius { machine, tool, reported_mm: told_mm, plan_mm, limit_mm }))
     }
 
-    /// Sets parameters of the tool and returns the values in force, in the same order. The machine may limit a value: a
-    /// lower speed is accepted and noted, any other difference is an error.
+    /// Sets parameters of the tool, then reads them back. `parameters` contains names without the prefix `Tool.`, each
+    /// with its requested value. Returns the values that the server now uses, in the same order. If the server uses a
+    /// lower speed than requested, accepts the lower speed and adds a note.
+    ///
+    /// # Errors
+    /// Returns a failure if any other value differs from the request, if a value is missing in the answer, or if the
+    /// server refuses the parameters.
     pub(super) async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
         let named = |name: &str| format!("Tool.{name}");
         let wanted = parameters.iter().map(|(name, value)| Item::property(&named(name), *value)).collect();
@@ -403,7 +421,12 @@ impl Worker {
 
     // ---- motion -----------------------------------------------------------------------------------------------------------------------
 
-    /// Touches one target and returns its point. After a miss, tries again up to `retries` times.
+    /// Touches `target` and returns the measured point. If the probe finds no surface or meets an obstacle, repeats the
+    /// touch up to `retries` times. If all attempts miss, returns a point with the status `NotFound` or `NotReached`.
+    ///
+    /// # Errors
+    /// Returns a failure if the server reports another error, if the answer is implausible, if an abort is ordered, or
+    /// if the connection fails.
     async fn touch(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<MeasuredPoint, Failure> {
         let mut missed = TouchStatus::NotFound;
         for _ in 0..=self.settings.retries {
@@ -456,8 +479,11 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: TouchStatus::Touched, quality, position_mm: at_mm })
     }
 
-    /// Checks the touched position `at_mm`. It may be away from the position of the target by at most the sum of
-    /// approach distance, search distance and probe tolerance.
+    /// Checks the distance between `at_mm` and the expected position of the probe's centre at `target`, in mm. The
+    /// distance must not exceed the sum of the approach distance, the search distance and `probe_tolerance_mm`.
+    ///
+    /// # Errors
+    /// Returns a failure if the distance is larger.
     pub(super) fn check_touch_position(
         &self,
         work: &RoutedPlan,
@@ -475,8 +501,9 @@ impl Worker {
         Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }
 
-    /// Moves the probe at the clearance height to a position above a target, then down to the approach point, from
-    /// which the probe moves along the normal.
+    /// Moves the probe to the approach point of `target` in three steps: up to the clearance height, horizontally until
+    /// the probe is above the approach point, and down to the approach point. The approach point lies on the normal of
+    /// the target; the touch begins there.
     pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
@@ -484,7 +511,8 @@ impl Worker {
         self.go_to([x, y, z]).await
     }
 
-    /// Moves straight up to the clearance height if the probe is below it.
+    /// Moves the probe straight up to the clearance height of the route. Does nothing if the probe is already at this
+    /// height or higher, or if its position is unknown.
     pub(super) async fn rise(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let Some([x, y, z]) = self.position_mm else { return Ok(()) };
         let clearance_mm = work.route.clearance_mm;
@@ -504,9 +532,10 @@ impl Worker {
         Ok(())
     }
 
-    /// Returns the maximum duration of a motion over `way_mm`, with time for acceleration. `speed` is an index into the
-    /// speeds in force. If this speed is not set yet, the machine uses its own speed, which can be low: 1 mm/s is
-    /// assumed.
+    /// Returns the time limit for a motion of length `way_mm`, in mm: twice the length divided by the speed. The factor
+    /// 2 allows for acceleration and deceleration. `speed` is an index into `speeds_mm_s`: 0 for travel, 1 for
+    /// touching, 2 for scanning. Assumes 1 mm/s if this speed is not set yet, because the default speed of the machine
+    /// is unknown and can be low.
     pub(super) fn motion_time(&self, way_mm: f64, speed: usize) -> Duration {
         const MIN_SPEED_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
@@ -556,8 +585,8 @@ pub(super) async fn request_if_supported(
     }
 }
 
-/// Returns the error number of a touch without contact that the server reported only as a warning, without data.
-/// Returns `None` if the answer has data or no such warning.
+/// Returns the number of a warning in `answer` which states that a touch met no surface or an obstacle. Some servers
+/// report a missed touch only as such a warning. Returns `None` if the answer contains data or no such warning.
 fn missed_by(answer: &CommandReply) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
     numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())

@@ -106,11 +106,12 @@ struct Pending<'a> {
 }
 
 impl Session {
-    /// Opens the connection with `dial`; sends nothing yet. `aborts` is the counter of ordered aborts, `aborted` the
-    /// number of them that were sent.
+    /// Opens a connection to the server at the address `line` with the connector `dial`. Sends nothing yet. `aborts`
+    /// counts the aborts that the client has ordered since the program began; `aborted` is the number of these aborts
+    /// that earlier sessions have already sent. Returns the session.
     ///
     /// # Errors
-    /// The connection cannot be opened, or not in time.
+    /// Returns an error if the connection cannot be opened within the time limit `limits.answer`.
     pub(super) async fn connect(
         machine: Arc<str>,
         (line, dial): (&LineAddress, &mut dyn Connector),
@@ -124,8 +125,9 @@ impl Session {
         Ok(Self::from_stream(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
-    /// Creates a session on an open connection. `aborted` is the number of aborts that earlier sessions have sent. If
-    /// more were ordered, the session first sends an abort.
+    /// Creates a session on the open connection `stream`. `aborts` counts the aborts that the client has ordered;
+    /// `aborted` is the number of these aborts that earlier sessions have already sent. If `aborts` is larger than
+    /// `aborted`, the session sends an abort before any other command.
     fn from_stream(
         aborted: u64,
         machine: Arc<str>,
@@ -147,12 +149,18 @@ impl Session {
         }
     }
 
-    /// Starts a new session, whatever state the server is in. First ends a session that may be left from an earlier
-    /// connection, and waits for the end of its motion. If the server still refuses because of an error or a session,
-    /// clears its errors and tries once more.
+    /// Starts a new session at the server, whatever state the server is in. Works in four steps:
     ///
-    /// If `ours_within` is given, the motion is of a job of this client and is aborted after that time. An ordered
-    /// abort is sent before everything else.
+    /// - Sends an abort if one was ordered and not sent yet.
+    /// - Ends a session that an earlier connection may have left, and waits for the end of its motion. If `ours_within`
+    ///   is given, the motion belongs to a job of this client, and is aborted after this time.
+    /// - Starts the new session.
+    /// - If the server refuses the start because of an open session or an uncleared error, clears the errors and
+    ///   repeats the second and third step once.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses the session again or for another reason, if an abort is ordered, or if
+    /// the connection fails.
     pub(super) async fn open(&mut self, ours_within: Option<Duration>) -> Result<(), Failure> {
         const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
         if self.is_abort_ordered() {
@@ -254,11 +262,12 @@ impl Session {
         }
     }
 
-    /// Processes a line with the tag of the pending command. Returns the reply when the server has completed the
-    /// command, otherwise `None`.
+    /// Processes a line from the server that has the tag of the command `pending`. `said` is the content of the line.
+    /// Stores data and warnings in `pending`. Returns the complete reply if the line states that the command is
+    /// complete; returns `None` for every other line.
     ///
     /// # Errors
-    /// The server has refused the command.
+    /// Returns a failure if the command is complete and the server has reported an error for it.
     fn process_own_line(
         &mut self,
         pending: &mut Pending<'_>,
@@ -354,8 +363,8 @@ impl Session {
         }
     }
 
-    /// Aborts the running and waiting commands and makes the server ready again. Returns [`Failure::Aborted`] on
-    /// success.
+    /// Aborts the running command and all waiting commands at the server, then clears the errors of the server. Always
+    /// returns a [`Failure`]: [`Failure::Aborted`] if both steps succeed, otherwise the failure of the abort.
     pub(super) async fn abort(&mut self) -> Failure {
         self.sent_aborts = *self.ordered_aborts.borrow();
         match self.run_abort().await {
@@ -395,8 +404,12 @@ impl Session {
         }
     }
 
-    /// Clears the errors of the server, with up to `tries` attempts. A server that has acknowledged an abort may need
-    /// some time until it accepts this.
+    /// Clears the errors of the server. If the server refuses, waits for `limits.after_abort` and tries again, up to
+    /// `tries` attempts in total. Repeated attempts are useful after an abort, because a server can acknowledge the
+    /// abort before it has processed it.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses the last attempt, if an abort is ordered, or if the connection fails.
     pub(super) async fn clear_errors(&mut self, tries: u32) -> Result<(), Failure> {
         for left in (0..tries).rev() {
             match Box::pin(self.ask("ClearAllErrors", Vec::new())).await {
@@ -438,13 +451,19 @@ impl Session {
     }
 }
 
-/// Returns true if an error does not stop the machine. Servers may send another severity than the standard, so errors
-/// that stop a machine are recognised by their numbers.
+/// Returns true if `error` does not stop the machine: its severity is 0 or 1, and its number is not one of the numbers
+/// that stop a machine. The number is checked too, because servers may send another severity than the standard
+/// prescribes.
 fn is_harmless(error: &ServerError) -> bool {
     error.is_warning() && !matches!(error.number, 6 | 500 | 503 | 1000..=1009 | 1500..=1503 | 2500..=2506)
 }
 
-/// Reads a line. If the future is dropped, the bytes already read stay in `unread`.
+/// Reads from `stream` until one line is complete, and returns this line without its line end. Ignores empty lines.
+/// Replaces each character outside printable ASCII by `?`. `unread` holds the received bytes of the next lines. If the
+/// caller drops the future, the bytes of an incomplete line stay in `unread`.
+///
+/// # Errors
+/// Returns an error if the connection ends or fails, or if the line is too long.
 async fn read_line(stream: &mut Box<dyn Stream>, unread: &mut Vec<u8>) -> std::io::Result<String> {
     loop {
         if let Some(end) = unread.iter().position(|b| *b == b'\n') {

@@ -55,8 +55,8 @@ impl IppdmeCmm {
         Self::build(settings, Box::new(SystemConnector), false)
     }
 
-    /// Creates the driver of a machine that opens its connections with `dial` and computes on no other thread: for
-    /// servers in the same process, and for simulated time.
+    /// Creates the driver of a machine. The driver opens its connections with `dial` and starts no extra threads for
+    /// long computations. Use this function for a server in the same process or for simulated time.
     pub fn with_connector(settings: IppdmeSettings, dial: Box<dyn Connector>) -> Self {
         Self::build(settings, dial, true)
     }
@@ -77,9 +77,14 @@ impl IppdmeCmm {
         }
     }
 
-    /// Opens a session with the server, and checks the identity of the machine. When this returns, nothing moves. The
-    /// server first finishes its current command; a motion of a job of this client may last at most `silence_limit`,
-    /// then it is aborted. If an abort was ordered and not sent yet, the command is aborted at once.
+    /// Connects to the server, opens a session and checks the identity of the machine. Returns this identity. The
+    /// machine does not move when the function returns, because the server first completes its current command. If that
+    /// command may belong to a job of this client, it is aborted after `silence_limit`. If an abort was ordered and not
+    /// confirmed, the abort is sent at once.
+    ///
+    /// # Errors
+    /// Returns an error if the server cannot be reached, refuses the session, has a wrong identity, or does not have
+    /// the tool.
     async fn open(&mut self) -> DeviceResult<Identity> {
         let state = locked(&self.shared).state;
         let moved = state.is_moving() || self.memory.unresolved.is_some();
@@ -211,10 +216,12 @@ impl IppdmeCmm {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
 
-    /// Changes the state to `to` and returns the status.
+    /// Changes the state of the machine from one of the states in `from` to `to`. Returns the new status. `command` is
+    /// the command of the client that causes the change; the error names this command.
     ///
     /// # Errors
-    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
+    /// Returns the refusal [`Answer::WrongState`] if the current state is not in `from`. The state then does not
+    /// change. Returns an error if the session is lost or not open.
     fn transition(&self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         self.current_status()?;
         let mut shared = locked(&self.shared);

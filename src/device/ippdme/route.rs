@@ -43,11 +43,14 @@ pub(super) struct Route {
 }
 
 impl Route {
-    /// Finds the route of the probe to all targets of a plan. `volume_mm` is the lower and the upper corner of the
-    /// travel. If `scan` is given, rows of targets whose spacing is at most `scan.step_mm` are scanned.
+    /// Finds a route of the probe to all targets of `plan`. `volume_mm` contains the minimum and the maximum corner of
+    /// the box that the probe's centre must not leave, in mm. `machine` is the name of the machine in errors. If `scan`
+    /// is given, rows of at least four targets are scanned; the distance between successive targets of a row is at most
+    /// `scan.step_mm`. Without rows, every target is touched in an order that shortens the travel.
     ///
     /// # Errors
-    /// A target is not reachable from above, or a position is outside of `volume_mm`.
+    /// Returns an error if the normal of a target points too far down to touch the target from above, or if a position
+    /// of the route is outside of `volume_mm`.
     pub(super) fn find(
         plan: &Plan,
         scan: Option<Scanning>,
@@ -79,8 +82,9 @@ impl Leg {
     }
 }
 
-/// Splits a plan, in its own order, into rows that are scanned and targets that are touched one by one. The slow first
-/// targets of a careful start, targets on the reference sphere and targets outside of all rows are touched.
+/// Splits `plan` into scans (rows of targets) and single touches, in the order of the plan. The first targets of a
+/// careful start, the targets on the reference sphere, and the targets in rows of fewer than four targets become single
+/// touches.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
@@ -97,8 +101,9 @@ fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     legs
 }
 
-/// Returns the index after the last target of the row that begins at index `from`. A row ends at a step longer than
-/// `scan.step_mm`, at a sharp change of direction, at a target that is not on the part, or at the maximum length of a
+/// Returns the index after the last target of the row that begins at index `from` of the plan. The row ends before a
+/// target whose distance from the previous target exceeds `scan.step_mm` or is 0. The row also ends at a turn of more
+/// than 45 degrees, at a target that is not on the part, and at the maximum number of targets or maximum duration of a
 /// scan.
 fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     let targets = &plan.targets[from..plan.targets.len().min(from + MAX_SCAN_TARGETS)];
@@ -124,7 +129,8 @@ pub(super) fn approach(target: &PlanTarget, plan: &Plan) -> [f64; 3] {
     point_on_normal(target, plan.approach_mm + plan.probe_radius_mm)
 }
 
-/// Returns the point on the normal of a target at a distance of `mm` from the surface.
+/// Returns the point on the normal of `target` at the signed distance `mm` from the surface, in mm. Positive distances
+/// are outside of the material.
 pub(super) fn point_on_normal(target: &PlanTarget, mm: f64) -> [f64; 3] {
     std::array::from_fn(|k| target.point_mm[k] + mm * target.normal[k])
 }
@@ -167,8 +173,9 @@ fn check(
     Ok(())
 }
 
-/// Returns the order of the touches, as indices into the plan. The slow first targets of a careful start stay first.
-/// Targets on the reference sphere stay separate from targets on the part.
+/// Returns an order of the targets that shortens the travel, as indices into the plan. The first targets of a careful
+/// start stay first. Targets on the part and targets on the reference sphere are not mixed. Returns the plan's own
+/// order if the plan has more than 6000 targets.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
     if plan.targets.len() > MAX_ORDERED {
@@ -185,8 +192,9 @@ fn order(plan: &Plan) -> Vec<usize> {
     order
 }
 
-/// Reorders the range `stretch` of `order` to shorten the travel. Compares three orders: the plan's own order, the
-/// plan's order after [`improve`], and nearest neighbour followed by [`improve`]. Keeps the shortest.
+/// Reorders the elements of `order` in the range `stretch` to shorten the horizontal travel. `order` contains indices
+/// into the plan. Compares three candidates: the order of the plan, this order after [`improve`], and the
+/// nearest-neighbour order after [`improve`]. Keeps the shortest candidate.
 fn shorten(plan: &Plan, order: &mut [usize], stretch: Range<usize>) {
     let begin = stretch.start.checked_sub(1).map(|k| place(plan, order[k]));
     let targets = &mut order[stretch];
@@ -221,8 +229,9 @@ fn nearest(places: &[[f64; 2]], begin: Option<[f64; 2]>) -> Vec<usize> {
     order
 }
 
-/// Improves an order by 2-opt and Or-opt over the nearest neighbours of each stop, until neither shortens the travel or
-/// for at most 30 passes.
+/// Shortens the tour `order` with the methods 2-opt and Or-opt. `order` contains indices into `places`, the xy
+/// positions of the stops in mm. Both methods try only the nearest neighbours of each stop. The first stop stays first.
+/// Ends when no change shortens the tour, or after 30 passes. Does nothing for fewer than four stops.
 fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     const PASSES: usize = 30;
     if order.len() < 4 {
@@ -279,8 +288,9 @@ impl<'a> Tour<'a> {
         self.note(stretch);
     }
 
-    /// Reverses the section after `stop` so that one of its nearest neighbours becomes its successor, if that shortens
-    /// the tour. Returns true if it did.
+    /// Tries to shorten the tour by a reversal (2-opt). The reversed section begins after `stop` and ends with one of
+    /// the nearest neighbours of `stop`, so this neighbour becomes the successor of `stop`. Returns true if the tour
+    /// was changed, false if no such reversal shortens the tour.
     fn reverse_after(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         let Some(&next) = self.order.get(i + 1) else { return false };
@@ -300,8 +310,9 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Reverses a section before `stop` so that one of its nearest neighbours becomes its predecessor, if that shortens
-    /// the tour. Returns true if it did.
+    /// Tries to shorten the tour by a reversal (2-opt). The reversed section begins with one of the nearest neighbours
+    /// of `stop` and ends before `stop`, so this neighbour becomes the predecessor of `stop`. Returns true if the tour
+    /// was changed, false if no such reversal shortens the tour.
     fn reverse_before(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         if i < 2 {
@@ -326,8 +337,9 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Moves a section of one to three stops that begins with `stop` to the position after one of its nearest
-    /// neighbours, if that shortens the tour (Or-opt). Returns true if it did.
+    /// Tries to shorten the tour by moving a section (Or-opt). The section begins with `stop` and has one to three
+    /// stops. Its new position is directly after one of the nearest neighbours of `stop`. Returns true if the tour was
+    /// changed, false if no such move shortens the tour.
     fn move_segment(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         for size in 1..=3 {

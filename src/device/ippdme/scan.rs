@@ -42,8 +42,13 @@ impl Worker {
         Ok(())
     }
 
-    /// Scans a row of targets, and stores their points. Returns false if the tool radius is unknown, or if the probe
-    /// lost the surface or met it elsewhere: then the targets must be touched one by one.
+    /// Scans the targets with the plan indices `row` in one motion, and stores their points. Returns true on success.
+    /// Returns false and stores no points if the tool radius is unknown, if the probe met no surface, or if the probe
+    /// met an obstacle. In these cases the caller must touch the targets one by one.
+    ///
+    /// # Errors
+    /// Returns a failure if the server reports another error, if the points do not match the targets, if an abort is
+    /// ordered, or if the connection fails.
     pub(super) async fn scan(&mut self, work: &RoutedPlan, row: Range<usize>) -> Result<bool, Failure> {
         if locked(&self.shared).radius_mm.is_none() {
             return Ok(false);
@@ -75,10 +80,13 @@ impl Worker {
         Ok(is_there)
     }
 
-    /// Converts the numbers that a scan returned to measured points, one for each target.
+    /// Converts the result of a scan to measured points, one for each of `targets`. `data` contains the lines of
+    /// numbers that the server returned: three coordinates in mm for each point, and with some servers also a quality
+    /// before or after them.
     ///
     /// # Errors
-    /// The number of points differs from the number of targets, or a point is not at its target.
+    /// Returns a failure if the number of points differs from the number of targets, or if a point is too far from its
+    /// target.
     fn decode_scan(
         &self,
         work: &RoutedPlan,
@@ -114,8 +122,12 @@ impl Worker {
             .collect())
     }
 
-    /// Checks every point of a row against its target: no farther away than the probe may search, and sideways no
-    /// farther than half of the distance to the nearest neighbour in the row.
+    /// Checks the scanned positions `places`, in mm, one for each of `targets`. Each position must pass the distance
+    /// check of a single touch. In addition, its distance from the normal line of its target must not exceed half of
+    /// the distance between this target and the nearest adjacent target of the row.
+    ///
+    /// # Errors
+    /// Returns a failure for the first position that is too far away.
     fn check_row(&self, work: &RoutedPlan, targets: &[PlanTarget], places: &[[f64; 3]]) -> Result<(), Failure> {
         for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
             self.check_touch_position(work, target, *at_mm)?;
@@ -149,8 +161,8 @@ fn curve(targets: &[PlanTarget]) -> Vec<Item> {
     vec![Item::property("Closed", 0.0), call("Format", format), call("Data", data)]
 }
 
-/// Returns the distance of `at_mm`, a position of the probe's centre, from the line along the normal of a target, in
-/// mm.
+/// Returns the lateral distance of `at_mm` from `target`, in mm. `at_mm` is a position of the probe's centre. The
+/// lateral distance is the distance from the line through the target along its normal.
 fn lateral_distance_mm(target: &PlanTarget, plan: &Plan, at_mm: [f64; 3]) -> f64 {
     let centre = point_on_normal(target, plan.probe_radius_mm);
     let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);

@@ -116,7 +116,8 @@ pub(super) fn list(items: &[Item]) -> String {
     text
 }
 
-/// Formats a number with at most 16 digits. Leading zeros count, because a strict server counts them too.
+/// Formats `value` as I++ DME text with at most 16 digits. Uses plain notation if 16 digits are enough, otherwise an
+/// exponent with `E`. Leading zeros also count as digits, because a strict server counts them.
 pub fn number(value: f64) -> String {
     let value = if value == 0.0 { 0.0 } else { value };
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).count();
@@ -179,7 +180,11 @@ impl<'a> Reader<'a> {
         if self.eat(')') { Ok(items) } else { Err(arguments("a comma or ) is missing")) }
     }
 
-    /// Parses items separated by commas.
+    /// Parses at least one item, and further items as long as a comma follows. An item can be empty. Stops at the first
+    /// character after an item that is not a comma.
+    ///
+    /// # Errors
+    /// Returns an error if an item is invalid.
     pub(super) fn items(&mut self) -> Result<Vec<Item>, SyntaxError> {
         let mut items = vec![self.item()?];
         while self.eat(',') {
@@ -266,8 +271,9 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Returns true if a blank is at a position that the grammar does not allow: within a name or a number, or between two
-/// items without a comma.
+/// Returns true if `text` contains a blank that the grammar of I++ DME does not allow. Blanks are allowed before and
+/// after commas and parentheses, within strings, and at the ends of `text`. A blank within a name or a number is not
+/// allowed.
 pub(super) fn has_stray_blank(text: &str) -> bool {
     let (mut before, mut quoted, mut blank) = ('(', false, false);
     for c in text.chars() {

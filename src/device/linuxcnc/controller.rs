@@ -67,8 +67,13 @@ impl Controller {
         Self { name, settings, connector: dial, link: None, link_error: None, has_control: false, configuration: None }
     }
 
-    /// Reconnects to the controller and checks its identity. Changes only settings of this connection. Returns the name
-    /// of the machine: the server and its INI file.
+    /// Closes an existing connection, connects to the controller again and checks the identity of the machine. Sends no
+    /// order to the machine; only turns off the echo and turns on the acknowledgements for this connection. Returns the
+    /// name of the machine: the name of the server and the path of its INI file.
+    ///
+    /// # Errors
+    /// Returns an error if the controller cannot be reached, if the password for the connection is wrong, if the
+    /// answers are not those of LinuxCNC, or if the machine has another name than expected.
     pub(super) async fn connect(&mut self) -> DeviceResult<String> {
         (self.link, self.has_control) = (None, false);
         let LinuxcncSettings { host, port, answer_timeout, connect_password, .. } = &self.settings;
@@ -167,7 +172,11 @@ impl Controller {
         })
     }
 
-    /// Reads the errors that the controller has reported since the last call.
+    /// Reads the error messages that the controller has not yet reported, oldest first and at most 32. The controller
+    /// reports each message only once. Returns an empty list if there are no messages.
+    ///
+    /// # Errors
+    /// Returns an error if the connection fails or if an answer is not valid.
     pub(super) async fn errors(&mut self) -> DeviceResult<Vec<String>> {
         let mut errors = Vec::new();
         while errors.len() < MAX_ERRORS {
@@ -213,8 +222,11 @@ impl Controller {
         }
     }
 
-    /// Asks the controller why it has refused an order, and returns that as an error: another client has control, or
-    /// the state of the controller does not allow the order.
+    /// Finds out why the controller has refused the order of `command`, and returns the reason as an error value. The
+    /// reason is that another client has control, or that the state of the controller does not allow the order.
+    ///
+    /// # Errors
+    /// Returns `Err` if the connection fails during this query.
     async fn denied(&mut self, command: MachineCommand) -> DeviceResult<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
             return Ok(self.control_taken());
@@ -261,11 +273,13 @@ impl Controller {
         self.wait_until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
     }
 
-    /// Opens the program `path` at the controller, and checks that it is then the open program. The controller
-    /// acknowledges a failed attempt too, and leaves the previous program open.
+    /// Opens the program `path` at the controller. Then checks that the controller reports this program as the open
+    /// one. The check is necessary because the controller also acknowledges a failed attempt; the previous program then
+    /// stays open. `command` is the name of the order for error messages.
     ///
     /// # Errors
-    /// The controller reports an error or does not open the program in time.
+    /// Returns an error if the controller reports an error, if it does not open the program within `settle_timeout`, or
+    /// if the connection fails.
     pub(super) async fn open(&mut self, path: &str, command: MachineCommand) -> DeviceResult<()> {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
@@ -286,8 +300,12 @@ impl Controller {
         }
     }
 
-    /// Reads the state until `holds` returns true for it, and returns it. Returns an error if that takes longer than
-    /// `settle_timeout`; `what` names the awaited state in that error.
+    /// Reads the state of the controller repeatedly until `holds` returns true for this state. Returns this state.
+    /// `what` is the name of the awaited state for error messages.
+    ///
+    /// # Errors
+    /// Returns an error if `holds` is still false after `settle_timeout`, if another client takes control, or if the
+    /// connection fails.
     pub(super) async fn wait_until(
         &mut self,
         what: &'static str,
@@ -342,8 +360,8 @@ impl Controller {
         DeviceError::NotLinuxcnc { machine: self.machine(), request: asked, reply: told.chars().take(80).collect() }
     }
 
-    /// Returns the error for a request that had no answer; `what` names the request. Closes the connection, unless the
-    /// request was invalid and not sent.
+    /// Converts `fault`, the reason why a request has no answer, to an error. `what` is the name of the request for the
+    /// error message. Also closes the connection, except if the request was not sent because it is not one plain line.
     fn broken(&mut self, fault: LinkFault, what: &'static str) -> DeviceError {
         let error = self.fault(fault, what);
         if fault != LinkFault::Unsendable {

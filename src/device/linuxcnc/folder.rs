@@ -28,11 +28,13 @@ pub(super) struct Folders {
 }
 
 impl Folders {
-    /// Returns the newest program of the run as a [`FramedProgram`]. `map` is the identity of the required map,
-    /// `rounds` the number of times that the pass is run.
+    /// Reads the program of the newest cycle in the folder of the run, and adds the lines that log its begin and its
+    /// end. `map` is the SHA-256 identity of the correction map for which the program must be made. `rounds` is the
+    /// number of times that the controller runs the pass.
     ///
     /// # Errors
-    /// Returns a text if there is no program, or if the newest is not of this map or must not be run.
+    /// Returns the reason as text if no cycle has a program, if the newest program is for another map, or if the
+    /// program must not be run.
     pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<FramedProgram, String> {
         let cycles = std::fs::read_dir(&self.run).map_err(|error| path_error(&self.run, &error))?;
         let cycles =
@@ -51,11 +53,11 @@ impl Folders {
         FramedProgram::frame(order).map_err(|why| format!("{}: {why}", file.display()))
     }
 
-    /// Writes a program into the folder that the controller sees, and reads it back. Does nothing if the same program
-    /// is there already.
+    /// Writes `program` into the folder of programs, which this computer and the controller both see. Then reads the
+    /// file back and compares the content. Writes nothing if the folder already contains the same program.
     ///
     /// # Errors
-    /// Returns a text if the file cannot be written or is different afterwards.
+    /// Returns the reason as text if the file cannot be written, or if its content differs afterwards.
     pub(super) fn put(&self, program: &FramedProgram) -> Result<(), String> {
         let file = self.local.join(&program.name).with_extension(PROGRAM);
         let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
@@ -83,8 +85,12 @@ impl Folders {
         }
     }
 
-    /// Returns the program of this run and cycle whose log file contains the token. An earlier process has prepared
-    /// that program. Returns `None` if there is none.
+    /// Finds the program that an earlier process prepared for cycle `cycle` of this run. `token` is the random number
+    /// of that preparation. Returns the program whose log file contains `token`. Returns `None` if no log file contains
+    /// it, or if the program file is not valid.
+    ///
+    /// # Errors
+    /// Returns the reason as text if the folder or a file cannot be read.
     pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<FramedProgram>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);

@@ -61,8 +61,15 @@ impl ActiveJob {
         record.filter(|record| record.token == Some(self.token))
     }
 
-    /// Returns the verdict on a job that was begun. `record` is the content of its log file, `still` is how long the
-    /// controller has been seen idle, and `settles` is the maximum delay until a written log file is visible.
+    /// Determines the state or the outcome of a job that was started. Uses these inputs:
+    ///
+    /// - `seen` is the state of the controller.
+    /// - `record` is the content of the log file of the program.
+    /// - `still` is the time since the controller became idle.
+    /// - `settles` is the maximum time from the end of a program until its log file is visible.
+    ///
+    /// Returns `Verdict::Unresolved` if the controller is idle for longer than `settles`, no stop or abort was
+    /// requested, and the log file shows neither a begin nor an end of the program.
     pub(super) fn judge(
         &self,
         seen: &ControllerState,
@@ -100,8 +107,9 @@ impl ActiveJob {
         }
     }
 
-    /// Updates the current round from `line`, the line number that the controller reports. Returns the progress `(done,
-    /// total)` over all rounds, in thousandths of a round; `None` without a program.
+    /// Returns the progress of the job over all rounds (repetitions of the pass) as `(done, total)`, both in
+    /// thousandths of a round. `line` is the line number that the controller reports. Counts a new round if `line` is
+    /// far before the previous line number. Returns `None` if the program is not known.
     pub(super) fn progress(&mut self, line: u32) -> Option<(u32, u32)> {
         let program = self.program.as_ref()?;
         let (round, before) = self.round;

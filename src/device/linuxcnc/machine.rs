@@ -396,7 +396,8 @@ impl LinuxcncGrinder {
         self.job.as_mut().filter(|work| (work.job, work.token) == (armed.job, armed.token))
     }
 
-    /// Stores the requested outcome of the job, if one was begun.
+    /// Stores `outcome`, the outcome that a person requested, in the current job. Does nothing if there is no job, or
+    /// if the job has not started or is over.
     fn set_requested_outcome(&mut self, outcome: Outcome) {
         if let Some(work) = self.job.as_mut().filter(|work| work.stage == Stage::Begun) {
             work.requested_outcome = Some(outcome);
@@ -410,7 +411,12 @@ impl LinuxcncGrinder {
         self.controller.take_control().await
     }
 
-    /// Sends an order to a running or held job, and returns the status after it.
+    /// Sends the order `set` to the controller, then reads and returns the status. `command` is the name of the order
+    /// for error messages.
+    ///
+    /// # Errors
+    /// Returns an error with the current state if the controller refuses the order. Returns an error if another client
+    /// has control or if the connection fails.
     async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<Status> {
         match self.controller.order(set, command).await {
             Ok(()) => {}
@@ -426,8 +432,9 @@ impl LinuxcncGrinder {
         Ok(self.read_status().await?.1)
     }
 
-    /// Aborts if the program had ended just before it was to pause: a controller that stays paused would accept no
-    /// other program. Returns the status after that.
+    /// Sends an abort if the job has already ended when the machine was paused. Without the abort, the controller would
+    /// stay paused and accept no other program. Returns the new status after an abort. Otherwise sends nothing and
+    /// returns `status` unchanged.
     async fn abort_if_ended(&mut self, status: Status) -> DeviceResult<Status> {
         if !matches!(self.job.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
             return Ok(status);
@@ -435,7 +442,11 @@ impl LinuxcncGrinder {
         self.order(Set::Abort, MachineCommand::Hold).await
     }
 
-    /// Runs work in the folders on a thread for blocking work.
+    /// Runs the file operation `work` on a thread for blocking work, and returns its result. Runs `work` on the current
+    /// thread if the driver is single-threaded.
+    ///
+    /// # Errors
+    /// Returns an error with the reason if `work` fails, or if it does not end within 30 s on the other thread.
     async fn in_folders<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Folders) -> Result<T, String> + Send + 'static,

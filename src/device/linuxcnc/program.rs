@@ -80,8 +80,9 @@ impl FramedProgram {
         Ok(Self { name, cycle: order.cycle, text, lines, rounds: order.rounds.max(1), map: *order.map })
     }
 
-    /// Parses a program that [`FramedProgram::frame`] of an earlier process built. Returns `None` if the text is not
-    /// such a program.
+    /// Parses the complete program that [`FramedProgram::frame`] built in an earlier process. `name` is the file name
+    /// without an extension, and `cycle` is the cycle of the program. Returns `None` if `text` has no valid map
+    /// identity or too few lines, or is not UTF-8.
     pub(super) fn read(name: &str, cycle: u32, text: Vec<u8>) -> Option<Self> {
         let whole = std::str::from_utf8(&text).ok()?;
         let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
@@ -98,7 +99,8 @@ impl FramedProgram {
         Some(Self { name: name.to_owned(), cycle, lines, rounds, map: identity, text })
     }
 
-    /// Returns the progress of the pass in thousandths, when the controller is at the line number `line` of the file.
+    /// Returns the progress within one run of the pass in thousandths, from 0 to 1000. `line` is the line of the
+    /// program file that the controller executes, counted from 1.
     pub(super) fn thousandths(&self, line: u32) -> u32 {
         let (first, count) = self.lines;
         let done = line.saturating_sub(first).min(count);
@@ -106,7 +108,9 @@ impl FramedProgram {
     }
 }
 
-/// Returns the beginning of the name of every program of a cycle.
+/// Returns the first part of the file name that all programs of a cycle have in common: the name of the run and the
+/// cycle number. Replaces characters of `run` other than ASCII letters, digits, `-` and `_` by `_`, and uses at most 60
+/// characters of `run`.
 pub(super) fn name_begins(run: &str, cycle: u32) -> String {
     let run: String = run.chars().map(plain).take(MAX_RUN_LENGTH).collect();
     format!("{run}-c{cycle}-")
@@ -135,11 +139,12 @@ fn plain(c: char) -> char {
     if c.is_ascii_alphanumeric() || matches!(c, '-' | '_') { c } else { '_' }
 }
 
-/// Returns the program without its final M2.
+/// Checks the program `pass` and returns its text without the final M2 (end of program). `map` is the SHA-256 identity
+/// of the correction map for which the program must be made.
 ///
 /// # Errors
-/// Returns a text if the program is not of this map, does not set its path tolerance, does not end with M2, or contains
-/// M2, M30 or % before that.
+/// Returns the reason as text if the program is not ASCII, is for another map, does not set its path mode and path
+/// tolerance, does not end with M2, or contains M2, M30 or % before its end.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
     let of_map = format!("{MAP_COMMENT}{})", hex(map));
@@ -164,8 +169,12 @@ fn code(line: &str) -> Vec<&str> {
     line.split_whitespace().collect()
 }
 
-/// Checks that the program sets its path mode before it moves. At power-on, LinuxCNC uses G64 without a tolerance,
-/// which rounds corners by a tenth of a millimetre.
+/// Checks that a program sets its path mode (G61, G61.1, or G64 with a tolerance P) before its first motion. `code`
+/// contains the words of each line. The check is necessary because LinuxCNC starts with G64 without a tolerance, which
+/// rounds corners by a tenth of a millimetre.
+///
+/// # Errors
+/// Returns the reason as text if the path mode is missing or set too late, or if G64 has no tolerance.
 fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
     let mut says = false;
     for words in code {
@@ -197,8 +206,8 @@ pub struct ProgramRecord {
 }
 
 impl ProgramRecord {
-    /// Parses the text of a log file: its token, and how often the program began and ended. An incomplete last line is
-    /// ignored.
+    /// Parses the text of a log file that a program wrote. Returns the token of the preparation, and how often the
+    /// program began and ended. Ignores unknown lines and an incomplete last line.
     pub fn read(text: &str) -> Self {
         let mut record = Self::default();
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);

@@ -185,7 +185,8 @@ fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
     (ends && head.eq_ignore_ascii_case(word)).then(|| rest.trim())
 }
 
-/// Parses the answer to `hello`: `HELLO ACK name version` or `HELLO NAK`. Returns `None` for another line.
+/// Parses `line` as the answer to the request `word`, which is `hello`. Returns the name and version of the server from
+/// `HELLO ACK name version`, or a refusal for `HELLO NAK`. Returns `None` for any other line.
 fn said(line: &str, word: &str) -> Option<RshReply> {
     let rest = after(line, word)?;
     match after(rest, "ack") {
@@ -194,8 +195,8 @@ fn said(line: &str, word: &str) -> Option<RshReply> {
     }
 }
 
-/// Parses `X NAK`, where X is `word`, or `NAK` alone, and returns the refusal. Returns `None` for another text. A
-/// server answers `NAK` alone if it refuses before it evaluates the word.
+/// Returns a refusal if `rest` is `NAK`, or `word` followed by `NAK`. Returns `None` for any other text. A server
+/// answers only `NAK` if it refuses a request before it evaluates `word`.
 fn refused(rest: &str, word: &str) -> Option<RshReply> {
     let rest = after(rest, word).unwrap_or(rest);
     rest.eq_ignore_ascii_case("nak").then_some(RshReply::Refused)
@@ -251,12 +252,14 @@ impl<T> Default for PendingRequests<T> {
 }
 
 impl<T> PendingRequests<T> {
-    /// Adds a request that was sent. `kept` is a value that is returned with its answer.
+    /// Appends `request`, which was sent, to the pending requests. `kept` is any value of the caller;
+    /// [`PendingRequests::match_line`] returns it together with the answer.
     pub fn push(&mut self, request: RshRequest, kept: T) {
         self.requests.push_back((request, kept));
     }
 
-    /// Returns the value attached to the oldest pending request.
+    /// Returns the value that the caller attached to the oldest pending request. Returns `None` if no request is
+    /// pending.
     pub fn first(&self) -> Option<&T> {
         self.requests.front().map(|(_, kept)| kept)
     }
@@ -266,8 +269,9 @@ impl<T> PendingRequests<T> {
         self.requests.drain(..).map(|(_, kept)| kept)
     }
 
-    /// Compares a line with the oldest pending request. If the line answers it, removes the request and returns its
-    /// value with the reply. Too many lines in a row without a match mean that the server does not use this protocol.
+    /// Checks if `line` answers the oldest pending request. If it does, removes this request and returns the answer and
+    /// the value that the caller attached to the request. Otherwise returns `Unmatched`. Returns `NotProtocol` after
+    /// more than 100 unmatched lines in a row, because the server then does not use this protocol.
     pub fn match_line(&mut self, line: &str) -> LineMatch<T> {
         match self.requests.front().and_then(|(request, _)| request.answer(line)) {
             Some(reply) => {

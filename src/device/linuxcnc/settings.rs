@@ -182,8 +182,9 @@ impl DriverFactory for LinuxcncWire {
 }
 
 impl LinuxcncWire {
-    /// Returns the command that prints the path that the controller executes, for a simulated cell. Returns `None` if
-    /// the cell file has no such command.
+    /// Returns the command that prints the path that the LinuxCNC controller executes. A simulated cell needs this path
+    /// to move its simulated wheel. A program path that contains a folder is relative to `cell_folder`. Returns `None`
+    /// if the cell file has no `executed_path`.
     pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
         let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
         let at = Path::new(program);
@@ -195,8 +196,11 @@ impl LinuxcncWire {
         Some(command)
     }
 
-    /// Reports to the document a missing or superfluous `executed_path`. A simulated cell has a real controller but no
-    /// real machine, so its simulated wheel follows the executed path.
+    /// Checks the key `executed_path` and reports errors to `document`. `place` gives the table of the machine for the
+    /// messages.
+    ///
+    /// A simulated cell with LinuxCNC requires this key, because its simulated wheel follows the path that the
+    /// controller executes. In a real cell the key is an error. An empty word in the key is also an error.
     fn check_path(&self, place: &MachineTable<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
@@ -216,8 +220,12 @@ impl LinuxcncWire {
         }
     }
 
-    /// Reports to the document a folder at the controller whose path cannot be part of a protocol line or of a comment
-    /// in a program.
+    /// Checks the folder in which the controller finds its programs, and reports errors to `document`. `place` gives
+    /// the table of the machine for the messages.
+    ///
+    /// A path with blanks, brackets, commas, semicolons, `%`, `#` or characters outside ASCII is an error: it cannot be
+    /// part of a command to the controller or of a comment in a program. A relative path in `programs_at_controller` is
+    /// also an error.
     fn check_folder(&self, place: &MachineTable<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {
             Some(folder) => ("wire.programs_at_controller", folder),

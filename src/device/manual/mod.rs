@@ -143,8 +143,8 @@ impl ManualMachine {
 
     // ---- what a person is asked ---------------------------------------------------------------------------------------------------
 
-    /// Returns instructions for the operator: what to do and check at the machine now, and which command to type after
-    /// that.
+    /// Returns the present instructions for the operator, one per line: what to do and check at the machine, and which
+    /// `regrind confirm` command to type after that. Returns an empty list if the operator has nothing to do.
     fn prompt(&self) -> Vec<String> {
         let Some((job, _)) = self.job else { return Vec::new() };
         let name = self.kind.name();
@@ -199,8 +199,9 @@ impl ManualMachine {
         ]
     }
 
-    /// Returns the run folder as an argument of `regrind confirm`, with a blank before it. Returns an empty text if the
-    /// command finds the newest run by itself.
+    /// Returns the path of the run folder as an argument for the command `regrind confirm`, with a blank before it.
+    /// Returns an empty text if the run folder is directly in `runs`, because then the command finds the newest run
+    /// without the argument.
     fn run_argument(&self) -> String {
         let folder = &self.settings.run_folder;
         if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
@@ -256,8 +257,9 @@ impl ManualMachine {
         }
     }
 
-    /// Returns true if `named`, the map in a confirmation, is another map than that of the requested pass. Returns
-    /// false if the confirmation names no map.
+    /// Returns true if the operator confirmation names another map than the map of the requested pass. `named` is the
+    /// SHA-256 of the map in the confirmation. Returns false if the confirmation names no map, or if no pass is
+    /// requested.
     fn names_other_map(&self, named: Option<[u8; 32]>) -> bool {
         match &self.task {
             Some((ManualTask::Grind(_, map), _)) => named.is_some_and(|named| named != *map),
@@ -265,11 +267,12 @@ impl ManualMachine {
         }
     }
 
-    /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run. Returns the paths of
-    /// the plan and of the stored file.
+    /// Accepts `file` as the result of the requested measurement. Stores its bytes in the folder of the cycle. Returns
+    /// the paths of the plan and of the stored file, relative to the folder of the run.
     ///
     /// # Errors
-    /// No measurement is requested, the file was accepted before, or it does not fulfil the plan.
+    /// No measurement is requested, the same bytes were accepted before, the file does not fit the plan, or it cannot
+    /// be read or stored.
     async fn accept_file(&mut self, file: PathBuf) -> DeviceResult<Vec<String>> {
         let (Some((job, done)), Some((ManualTask::Measure(plan), _))) = (self.job, &self.task) else {
             return Err(self.not_accepted("no measurement is requested"));
@@ -302,7 +305,8 @@ fn plan_file(job: Job) -> String {
     format!("plan{}.csv", batch_suffix(job))
 }
 
-/// Returns the suffix that the file names of a further batch of touches have; empty for the first batch.
+/// Returns the suffix of the file names of a batch of touches (a part of a measurement that is taken in several jobs).
+/// Returns an empty text for the first batch, `-2` for the second.
 fn batch_suffix(job: Job) -> String {
     match job.batch_id().batch {
         0 => String::new(),
@@ -320,8 +324,11 @@ fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
 }
 
-/// Parses the bytes of a measured file and checks them against the plan and the cell file. `done` is the number of the
-/// START that began the measurement. Returns the measurement.
+/// Parses `bytes`, the content of the measured file `path`, and checks it against `plan` and the settings. `done` is
+/// the sequence number of the START that began the measurement. Returns the measurement.
+///
+/// # Errors
+/// The file has a wrong format, belongs to another job or plan, has too few points, or its points do not fit the plan.
 fn read_measurement(
     settings: &ManualSettings,
     plan: &Plan,
@@ -353,7 +360,11 @@ fn read_measurement(
     Ok(measurement)
 }
 
-/// Writes the targets of a plan as a CSV file into `folder`, for the person who measures.
+/// Writes the targets of `plan` as a CSV file into `folder`, for the person who measures. The file is named `plan.csv`.
+/// For a later batch of touches in `job`, the name has the number of the batch, for example `plan-2.csv`.
+///
+/// # Errors
+/// The folder or the file cannot be written.
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
@@ -523,7 +534,8 @@ impl Grinder for ManualMachine {
     }
 }
 
-/// Returns the path of the program of a pass in the folder of a cycle, in any dialect. Returns `None` if there is none.
+/// Returns the path of the tool path program in `folder`, the folder of a cycle: a file named `toolpath` with any
+/// extension. If there are several, returns the first in alphabetical order. Returns `None` if there is none.
 fn find_program(folder: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
     let mut programs: Vec<PathBuf> =

@@ -7,19 +7,20 @@ use super::protocol::{Registers, decode_outcome, decode_pass_record, decode_poin
 use super::{LineAddress, Link, ModbusMachine, ModbusSettings, WordOrder};
 use crate::{Job, MachineKind, Status};
 
-/// Returns a driver whose line leads nowhere and is never used.
+/// Returns a driver for tests. The address of its Modbus line does not exist, and nothing is sent on the line.
 fn driver() -> ModbusMachine {
     let settings = ModbusSettings::new(LineAddress::Tcp { host: "nowhere.invalid".into(), port: 502 });
     let link = Link::new(settings.line.clone(), settings.request_timeout, Duration::ZERO).expect("a thread");
     ModbusMachine::new(MachineKind::Cmm, link, settings)
 }
 
-/// Decodes any bytes as the registers of a block, to test the decoders. The first byte selects the block and the word
-/// order.
+/// Decodes arbitrary bytes as a block of registers, to test the decoders. The low seven bits of the first byte select
+/// the kind of block. The high bit selects the word order. The other bytes are the content of the registers. Does
+/// nothing if `bytes` is empty.
 ///
 /// # Panics
-/// Panics if a forbidden result occurs: a value that is not finite, a result above the maximum size, or a block that
-/// makes the driver panic.
+/// Panics if a decoder fails its test: it panics, returns a value that is not finite or out of range, or accepts a
+/// result above the maximum size.
 pub fn any_registers(bytes: &[u8]) {
     static DRIVER: OnceLock<Mutex<ModbusMachine>> = OnceLock::new();
     let Some((which, bytes)) = bytes.split_first() else { return };

@@ -123,10 +123,11 @@ struct QueuedRequest {
 
 /// Stream between a line and its machines. It can report if bytes wait to be read.
 pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
-    /// Returns the number of received bytes that wait to be read, as far as known.
+    /// Returns a number above 0 if received bytes wait to be read, and 0 if none wait. The number can be smaller than
+    /// the real number of bytes: a TCP socket returns at most 1.
     ///
     /// # Errors
-    /// The other end has closed the stream.
+    /// The other end has closed the stream, or the system reports an error.
     fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
 }
 
@@ -151,11 +152,13 @@ pub struct Link {
 }
 
 impl Link {
-    /// Creates a line that is opened with its first request. `quarantine` is the worst-case answer time of a machine on
-    /// it: after an error the line is not used for this time.
+    /// Creates a Modbus line (TCP connection or serial port) with its own thread. The line is opened when the first
+    /// request is sent. `request_timeout` is the longest wait for an answer. `quarantine` is the longest time that a
+    /// machine on the line may need for an answer: after an error, the line is not used for this time, so that no late
+    /// answer is mistaken for a new one.
     ///
     /// # Errors
-    /// The thread of the line cannot be started.
+    /// The runtime or the thread of the line cannot be created.
     pub fn new(line: LineAddress, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let name = format!("line {line}");
@@ -165,8 +168,11 @@ impl Link {
         Ok(link)
     }
 
-    /// Creates a line that `dial` opens and that runs as a task of the current runtime, with random numbers from
-    /// `seed`. For machines in the same process, and for simulated time. For `quarantine`, see [`Link::new`].
+    /// Creates a Modbus line that the connector `dial` opens. The line runs as a task of the current Tokio runtime, not
+    /// on its own thread. Use it for simulated machines in the same process and for simulated time.
+    ///
+    /// `request_timeout` is the longest wait for an answer. After an error the line is not used for the time
+    /// `quarantine`. `seed` starts the random numbers that vary the pauses.
     pub fn with_connector(
         line: LineAddress,
         request_timeout: Duration,
@@ -208,7 +214,8 @@ impl Link {
         *self.counters.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lets the next request open the line at once, without the pause after an error.
+    /// Ends the pause after an error early, so that the line is opened again at once. If no pause is active, the next
+    /// pause is skipped.
     pub(super) fn skip_pause(&self) {
         self.pause_skipped.notify_one();
     }
@@ -221,9 +228,16 @@ impl Link {
         self.counters.count(|figures| figures.retries += 1);
     }
 
-    /// Sends one request to one unit. Returns the registers, and the generation of the connection: its number since the
-    /// line was created. If `generation` is given, the request is sent only on that connection; otherwise the line is
+    /// Sends the request `ask` to the machine with the number `unit`. Returns the generation and the received
+    /// registers. The generation is the number of the connection, counted since the line was created. A write returns
+    /// no registers.
+    ///
+    /// If `generation` is given, the request is sent only on the connection with this number. Otherwise the line is
     /// opened if necessary.
+    ///
+    /// # Errors
+    /// Returns `LinkFault::Stale` if the connection `generation` no longer exists; nothing was sent then. Other faults
+    /// state that the line cannot be opened, or that no valid answer arrived in time.
     pub(super) async fn request(&self, unit: u8, generation: Option<u64>, ask: LinkRequest) -> LinkResult {
         let (reply, answer) = oneshot::channel();
         let question = QueuedRequest { unit, generation, request: ask, reply };
@@ -322,7 +336,8 @@ impl Connection {
         }
     }
 
-    /// Closes the connection, so that data that arrive late on it are lost, and sets the pause before the next opening.
+    /// Closes the connection, so that late data on it are lost. Sets the earliest time of the next opening. The pause
+    /// is random and doubles with each failure, up to [`MAX_BACKOFF`]. It is never shorter than the quarantine.
     fn drop_connection(&mut self) {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);

@@ -161,10 +161,11 @@ impl ModbusMachine {
         Ok(identity)
     }
 
-    /// Compares the identity that the machine reports with the cell file.
+    /// Checks the identity that the machine reports against the settings of the cell file.
     ///
     /// # Errors
-    /// The name is another one, or one is a simulated and the other a real machine.
+    /// The machine has another name than the cell file requires. Or the machine is a simulation and the cell is not, or
+    /// the reverse.
     fn check_identity(&self, identity: &Identity) -> Result<(), DeviceError> {
         if let Some(expected) = self.expected_name.as_ref().filter(|expected| **expected != identity.name) {
             let (expected, found) = (expected.clone(), identity.name.clone());
@@ -178,7 +179,8 @@ impl ModbusMachine {
         }
     }
 
-    /// Writes the heartbeat, unless the last one is recent. Does nothing if this client is not the owner.
+    /// Writes the heartbeat, a counter that shows the machine that its client is alive. Does nothing if the heartbeat
+    /// interval since the last write has not passed, or if this client is not the owner of the machine.
     async fn send_heartbeat(&mut self) -> Result<(), DeviceError> {
         if !self.owned {
             return Ok(());
@@ -193,11 +195,12 @@ impl ModbusMachine {
         self.unit.write("beat", self.unit.map.beat, beat.words()).await
     }
 
-    /// Sends the heartbeat if it is due, and reads the status block. All registers are of one moment. The additional
-    /// signals are not included.
+    /// Sends the heartbeat if it is due. Then reads the status block and returns its values. All values belong to the
+    /// same moment. The additional signals of the cell file are not part of the block.
     ///
     /// # Errors
-    /// The two snapshot numbers of the block still differ after several reads, or a request fails.
+    /// The two snapshot numbers of the block still differ after several reads, a value is invalid, a request fails, the
+    /// machine was restarted, or its heartbeat no longer changes.
     async fn read_status_block(&mut self) -> Result<StatusBlock, DeviceError> {
         self.send_heartbeat().await?;
         let address = self.unit.map.status;
@@ -282,8 +285,12 @@ impl ModbusMachine {
         Ok(status)
     }
 
-    /// Returns an error if another client has become the owner of the machine, because this client would not notice the
-    /// commands of that client. ABORTING and ABORTED are accepted, because every client may abort.
+    /// Checks that this client is still the owner of the machine. If another client owns the machine, this client does
+    /// not notice the commands of the other client. Returns `Ok` if this client has not claimed the machine. The states
+    /// ABORTING and ABORTED are always accepted, because every client may abort.
+    ///
+    /// # Errors
+    /// Returns [`DeviceError::OwnedByOther`] if another client has become the owner.
     fn check_owner(&self, status: &StatusBlock) -> Result<(), DeviceError> {
         let aborts = matches!(status.state, MachineState::Aborting | MachineState::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
@@ -292,8 +299,12 @@ impl ModbusMachine {
         Err(DeviceError::OwnedByOther { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
-    /// Reads the additional signal with the index `k`. If the machine does not have the signal, or its value is not a
-    /// finite number, the value is `None` and a cause is given.
+    /// Reads the additional signal with the index `k` in the cell file. Returns its value in the unit of the signal,
+    /// with its range. The value is `None` if the machine answers with a Modbus exception or the value is not finite;
+    /// then a cause is given.
+    ///
+    /// # Errors
+    /// The request fails for another reason, for example without an answer.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
         let ask = LinkRequest::Read { address: signal.address, count: signal.kind.registers() };
@@ -328,10 +339,12 @@ impl ModbusMachine {
         self.send_command(frame).await
     }
 
-    /// Writes a command and waits for its acknowledgement. Without one, writes the same frame again.
+    /// Writes the command `frame` and waits until the machine acknowledges it. If no acknowledgement arrives within
+    /// [`ACKNOWLEDGE_TIMEOUT`], writes the same frame again, at most `retries` times. Returns the status that
+    /// acknowledges the command.
     ///
     /// # Errors
-    /// The machine refuses the command, or does not acknowledge it.
+    /// The machine refuses the command or does not acknowledge it, or a request fails.
     async fn send_command(&mut self, frame: CommandFrame) -> Result<StatusBlock, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
         let status = self.write_until_acknowledged(frame).await?;
@@ -392,10 +405,10 @@ impl ModbusMachine {
         Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
     }
 
-    /// Reads the status until `holds` returns true for it, and returns that status.
+    /// Reads the status repeatedly until `holds` returns true for it. Returns that status.
     ///
     /// # Errors
-    /// The status shows a fault, or the wait takes longer than `SETTLE_TIMEOUT`.
+    /// The status shows a fault, the wait takes longer than [`SETTLE_TIMEOUT`], or a request fails.
     async fn wait_until(&mut self, holds: impl Fn(&StatusBlock) -> bool) -> Result<StatusBlock, DeviceError> {
         let began = Instant::now();
         loop {
@@ -414,10 +427,10 @@ impl ModbusMachine {
         }
     }
 
-    /// Checks that the job in a status is the intended one.
+    /// Checks that the job in `status` is `job`.
     ///
     /// # Errors
-    /// The machine has another job, cycle or digest of the payloads.
+    /// The job number, the cycle or the digest (checksum of the payloads) differs, or the status has no job.
     fn check_job(&self, job: Job, status: &StatusBlock) -> Result<(), DeviceError> {
         let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
         let fields = [
@@ -428,10 +441,11 @@ impl ModbusMachine {
         self.compare(fields)
     }
 
-    /// Compares pairs of values. A field is its name, the value that was sent, and the value at the machine.
+    /// Compares the values that this client sent with the values at the machine. Each entry of `fields` is the name of
+    /// the value for messages, the value sent, and the value at the machine.
     ///
     /// # Errors
-    /// Returns an error for the first field whose two values differ.
+    /// Returns [`DeviceError::Mismatch`] for the first entry whose two values differ.
     fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
             Some((field, sent, held)) => {
@@ -499,8 +513,12 @@ impl ModbusMachine {
         self.run_command(MachineCommand::Release).await
     }
 
-    /// Ends the job at once. Connects without the pause that other commands observe after an error. If another client
-    /// has used higher sequence numbers, uses a number above those.
+    /// Commands the machine to end the job at once. Returns the status that acknowledges this. Opens a lost connection
+    /// without the pause that follows an error.
+    ///
+    /// If the machine does not acknowledge the command, another client may have used higher sequence numbers. Then this
+    /// function returns the status if the machine already aborts. Otherwise it repeats the command with a number above
+    /// the last acknowledged one.
     async fn abort(&mut self) -> Result<StatusBlock, DeviceError> {
         self.unit.link.skip_pause();
         if self.unit.identity().is_none() {
@@ -640,7 +658,12 @@ impl ModbusMachine {
         }
     }
 
-    /// Waits until the machine reports that it has accepted the payload, and checks that the payload is complete.
+    /// Waits until the machine has accepted the payload of the type `P`. `slot` contains the size and CRC-32 that this
+    /// client has sent; the machine must report the same.
+    ///
+    /// # Errors
+    /// The machine refuses the payload, reports another size or CRC-32, or has not received all bytes within
+    /// [`SETTLE_TIMEOUT`]. Or a request fails.
     async fn wait_until_accepted<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
         let began = Instant::now();
         loop {
@@ -668,8 +691,9 @@ impl ModbusMachine {
         }
     }
 
-    /// Compares the payload in force at the machine with the payload of this kind number that this client has loaded.
-    /// Does nothing if it has loaded none.
+    /// Checks that the payload that the machine would use for the next job (the payload "in force") is the one that
+    /// this client has loaded. `kind` is the number of the kind of payload: 1 plan, 2 correction map, 3 pass. Compares
+    /// size, CRC-32 and identity. Does nothing if this client has loaded no payload of this kind.
     ///
     /// # Errors
     /// The two payloads differ, or the machine cannot be read.
@@ -697,8 +721,12 @@ impl ModbusMachine {
 
     // ---- results ---------------------------------------------------------------------------------------------------
 
-    /// Fetches the complete result of a job, and checks its job and its CRC. `kind` is the payload number of the
-    /// result. Returns the status, the header and the registers of the result.
+    /// Fetches the complete result of `job`. `kind` is the number of the kind of result: 4 measurement, 5 pass record.
+    /// Checks that the result belongs to this job and that its CRC-32 is correct. Returns the status, the header of the
+    /// result and its data registers. Repeats the transfer after a communication error, at most `retries` times.
+    ///
+    /// # Errors
+    /// The job is not complete, the result belongs to another job, `interrupt` is raised, or the transfer fails.
     async fn fetch(
         &mut self,
         job: Job,
@@ -823,8 +851,12 @@ impl ModbusMachine {
         })
     }
 
-    /// Fetches the page number `page` of a result and adds its `due` data registers to `words`. If the machine shows
-    /// another page, repeats the request for a while, because a machine may need a cycle of its program to show it.
+    /// Reads the page with the number `page`, counted from 0, of a result. Appends its `due` data registers to `words`.
+    /// A machine may need a cycle of its program to show a page. So the request is repeated for [`ACKNOWLEDGE_TIMEOUT`]
+    /// if the machine shows another page.
+    ///
+    /// # Errors
+    /// The machine still shows another page, the page has another number of registers than `due`, or a request fails.
     async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
         let map = self.unit.map;
         let mut select = self.unit.writer();
@@ -953,8 +985,9 @@ struct Header {
     identity: [u8; 32],
 }
 
-/// Returns the outcome of the start `intended` according to a status. Returns `None` if the status shows that the start
-/// was not accepted. This counts only if a second status shows it too.
+/// Returns the outcome of the start `intended` that `status` shows: the job runs, has finished, or its outcome cannot
+/// be determined. Returns `None` if the status shows that the machine did not accept the start. The caller must confirm
+/// `None` with a second, later status.
 fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
     let unknown = |why: String| Some(Reconciled::Unknown { reason: why });
@@ -1031,14 +1064,18 @@ macro_rules! modbus_driver {
         pub struct $driver(ModbusMachine);
 
         impl $driver {
-            /// Creates the driver of a machine on a line of its own. Sends nothing before it connects.
+            /// Creates the driver of a machine with its own Modbus line (TCP connection or serial port). Sends nothing
+            /// until the machine is connected.
+            ///
+            /// # Errors
+            /// The thread of the line cannot be started.
             pub fn new(settings: ModbusSettings) -> io::Result<Self> {
                 let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)?;
                 Ok(Self::on(link, settings))
             }
 
-            /// Creates the driver of a machine on a line that it shares with other machines. The address and the
-            /// timeouts of `link` apply, not those in `settings`.
+            /// Creates the driver of a machine on the Modbus line `link`, which other machines may also use. The driver
+            /// uses the address, the request timeout and the quarantine of `link`. It ignores those in `settings`.
             pub fn on(link: Link, settings: ModbusSettings) -> Self {
                 Self(ModbusMachine::new($kind, link, settings))
             }

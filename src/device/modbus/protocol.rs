@@ -59,7 +59,8 @@ impl<'a> Registers<'a> {
         f64::from_bits(self.order.bits(self.slice(at, 4)))
     }
 
-    /// Returns the identity of 32 bytes in the 16 registers from `at` on. The word order does not apply to bytes.
+    /// Returns the identity (a SHA-256, 32 bytes) that is stored in 16 registers from the offset `at`. The high byte of
+    /// each register comes first, whatever the word order. Returns zeros if the registers do not exist.
     pub(super) fn identity(&self, at: usize) -> [u8; 32] {
         let mut identity = [0; 32];
         for (pair, word) in identity.chunks_exact_mut(2).zip(self.slice(at, 16)) {
@@ -188,8 +189,8 @@ pub(super) trait Payload: Identified {
     const NAME: &'static str;
     /// Returns the registers of the payload in a word order.
     fn words(&self, order: WordOrder) -> Vec<u16>;
-    /// Returns the first value that no machine could accept, as the field, its value and the allowed range. Returns
-    /// `None` if there is none.
+    /// Returns the first value in the payload that no machine could accept. The result contains the name of the field,
+    /// its value, and the allowed values in words. Returns `None` if all values are acceptable.
     fn invalid_field(&self) -> Option<(String, f64, &'static str)>;
 }
 
@@ -197,15 +198,15 @@ fn sha256(words: &[u16]) -> [u8; 32] {
     Sha256::digest(bytes_of(words)).into()
 }
 
-/// Returns the first value that is not a finite number, as the field, its value and the allowed range. Returns `None`
-/// if there is none.
+/// Returns the first entry of `fields`, pairs of name and value, whose value is not a finite number. The result
+/// contains the name, the value, and the allowed values in words. Returns `None` if all values are finite.
 fn not_finite<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !value.is_finite());
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number"))
 }
 
-/// Returns the first value that is not a positive, finite number, as the field, its value and the allowed range.
-/// Returns `None` if there is none.
+/// Returns the first entry of `fields`, pairs of name and value, whose value is not finite or not above 0. The result
+/// contains the name, the value, and the allowed values in words. Returns `None` if all values are finite and above 0.
 fn not_positive<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number above 0"))
@@ -374,11 +375,11 @@ pub(super) fn point_registers(format: u16) -> Option<usize> {
     }
 }
 
-/// Decodes one measured point from the registers of its record. In format 2 the coordinates are counts, and `scale_mm`
-/// is the length of one count.
+/// Decodes one measured point from the registers of its record. In format 1 the coordinates are in mm. In format 2 they
+/// are counts, and `scale_mm` is the length of one count in mm. The coordinates of the returned point are in mm.
 ///
 /// # Errors
-/// The status is unknown, or a coordinate is not finite.
+/// The status of the point is unknown, or a coordinate is not finite.
 pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordError> {
     let index = record.u32(0);
     let status = match record.u16(2) {
@@ -397,8 +398,16 @@ pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) ->
     Ok(MeasuredPoint { index, status, quality: record.u16(3), position_mm: at_mm })
 }
 
-/// Decodes a pass record. Returns job, cycle, outcome, and six values: path, volume, depth, idle share, spindle load
-/// and wheel radius.
+/// Decodes the record of a pass. Returns the job number, the cycle number, the outcome, and six values:
+///
+/// - path travelled, in mm
+/// - volume removed, in mm³
+/// - largest depth removed, in mm
+/// - fraction of the path on which the wheel removed no material, from 0 to 1
+/// - mean spindle load, where 1 is full load
+/// - radius of the wheel, in mm
+///
+/// The ranges of the values are not checked.
 ///
 /// # Errors
 /// The outcome is unknown, or a value is not finite.

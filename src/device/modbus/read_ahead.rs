@@ -56,7 +56,9 @@ impl ReadAhead {
         (self.words.len() / PAGE_REGISTERS) as u32
     }
 
-    /// Returns true if `progress`, the number of measured points in the status, is sufficient to fill the next page.
+    /// Returns true if the next page should be read now: the machine has measured enough points to fill it. `progress`
+    /// is the number of measured points in the status. Returns false if the page was already read at this progress and
+    /// was not full. Also returns false if the result would exceed its maximum size.
     fn is_due(&self, progress: u32) -> bool {
         let registers = u64::from(progress) * self.header.registers as u64;
         let end = self.words.len() + PAGE_REGISTERS;
@@ -65,8 +67,12 @@ impl ReadAhead {
 }
 
 impl ModbusMachine {
-    /// Does at most one step of reading preliminary points ahead, after a read of the status. Returns the new points,
-    /// or `None` if there are none.
+    /// Reads preliminary points of `job` while the job still runs. Does at most one step (header or one page) after
+    /// each read of the status. Returns the new points, in the order of the plan.
+    ///
+    /// Returns `None` if there are no new points, a request fails, or `interrupt` is raised. Also returns `None` if
+    /// reading ahead is not possible: the machine does not offer it, the line is too slow, this client did not start
+    /// the job, or earlier requests failed too often.
     pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
         let block = self.last_block.take()?;
         let runs = matches!(
@@ -91,8 +97,10 @@ impl ModbusMachine {
         self.read_ahead_failures.start == start && self.read_ahead_failures.count >= MAX_FAILURES
     }
 
-    /// Counts a failed request of reading ahead, for the job that the START number `start` began. If the machine
-    /// refuses the request, reading ahead stops for this job. A busy machine is not a failure.
+    /// Records that a request to read ahead failed with `error`. `start` is the sequence number of the START that began
+    /// the job. Discards the pages that were read ahead. After [`MAX_FAILURES`] communication errors, nothing more is
+    /// read ahead for this job. After any other error, for example invalid data, reading ahead stops at once. The
+    /// answer that the machine is busy does not count and discards nothing.
     fn count_failure_ahead(&mut self, start: u32, error: &DeviceError) {
         if self.read_ahead_failures.start != start {
             self.read_ahead_failures = ReadAheadFailures { start, count: 0 };
@@ -131,8 +139,8 @@ impl ModbusMachine {
         self.read_page_ahead(page, block.progress.0).await
     }
 
-    /// Returns true if the pages in `ahead` are of this job and START, and came over the present connection from the
-    /// present boot of the machine.
+    /// Returns true if the pages in `ahead` belong to `job` and to the START with the sequence number `start`. They
+    /// must also have been read on the present connection and since the last restart of the machine.
     fn belongs_to(&self, ahead: &ReadAhead, job: Job, start: u32) -> bool {
         let boot_id = self.unit.identity().map(|identity| identity.boot_id);
         self.unit.generation() == Some(ahead.generation)
@@ -140,10 +148,12 @@ impl ModbusMachine {
             && (ahead.job, ahead.start) == (job, start)
     }
 
-    /// Reads the header of the partial result of a running job.
+    /// Reads the header of the partial result of `job`, which still runs, and stores it for the pages to come. `block`
+    /// is the last status. Stores nothing if the machine has no partial result yet.
     ///
     /// # Errors
-    /// The header does not name this job and its plan, or its `done` number is not 0, although the job still runs.
+    /// The header names another job or plan, has a `done` number although the job still runs, or contains an invalid
+    /// value. Or the request fails.
     async fn begin_ahead(&mut self, job: Job, block: &StatusBlock) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
         let words = self.unit.request_once("outbox header", address, LinkRequest::Read { address, count: 56 }).await?;
@@ -174,8 +184,12 @@ impl ModbusMachine {
         Ok(())
     }
 
-    /// Reads the page number `page` of the partial result. Stores it if the machine shows this page and the page is
-    /// full. Returns the new points, or `None` if there are none.
+    /// Reads the page with the number `page`, counted from 0, of the partial result. Stores the page if the machine
+    /// shows this page and it is full. `progress` is the number of measured points in the last status. Returns the
+    /// points that the page completes. Returns `None` if there are none.
+    ///
+    /// # Errors
+    /// The page is neither full nor empty, a point is invalid, or the request fails.
     async fn read_page_ahead(&mut self, page: u32, progress: u32) -> Result<Option<PreliminaryPoints>, DeviceError> {
         let address = self.unit.map.outbox_page;
         let read = self
@@ -211,8 +225,11 @@ impl ModbusMachine {
         Ok((!told.points.is_empty()).then_some(told))
     }
 
-    /// Decodes the points in the stored pages whose index is `told` or above, because the points below were returned
-    /// before.
+    /// Decodes the new points in the stored pages. `told` is the number of points that were returned before; these
+    /// points are skipped.
+    ///
+    /// # Errors
+    /// The record of a point is invalid.
     fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.point_count() * registers];
@@ -221,8 +238,11 @@ impl ModbusMachine {
         points.collect()
     }
 
-    /// Returns the registers of a complete result that were already read while its job ran. Returns `None` if they
-    /// belong to another job, connection, boot, plan or format, or are more than the result has.
+    /// Returns the registers of a result that were read while its job still ran. `header` is the header of the complete
+    /// result, and `done` is the sequence number of the START whose job ended.
+    ///
+    /// Returns `None` if no registers were read ahead. Also returns `None` if they do not fit the complete result:
+    /// another job, connection, restart, plan, format or scale, or too many registers.
     pub(super) fn registers_read_ahead(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
         let ahead = self.read_ahead.as_ref().filter(|ahead| self.belongs_to(ahead, job, done))?;
         let like = |of: &Header| {

@@ -40,7 +40,9 @@ impl WordOrder {
         }
     }
 
-    /// Returns the word order in which the words of a value are in the other order.
+    /// Returns this word order with the words of a value in reverse order: high word first becomes low word first, and
+    /// the reverse. The order of the bytes in each register does not change. Example: [`Self::Big`] becomes
+    /// [`Self::Little`].
     pub fn with_words_swapped(self) -> Self {
         match self {
             Self::Big => Self::Little,
@@ -50,7 +52,8 @@ impl WordOrder {
         }
     }
 
-    /// Returns the word order in which the two bytes of each register are in the other order.
+    /// Returns this word order with the two bytes of each register exchanged. The order of the words does not change.
+    /// Example: [`Self::Big`] becomes [`Self::Badc`].
     pub fn with_bytes_swapped(self) -> Self {
         match self {
             Self::Big => Self::Badc,
@@ -70,7 +73,8 @@ impl WordOrder {
         matches!(self, Self::Badc | Self::Dcba)
     }
 
-    /// Converts registers between the byte order on the line and the byte order in the rest of the program.
+    /// Exchanges the two bytes of each register if the machine sends the low byte first (`badc` and `dcba`). Otherwise
+    /// returns `words` unchanged. The conversion is the same for sent and for received registers.
     pub(super) fn bytes_in_order(self, mut words: Vec<u16>) -> Vec<u16> {
         if self.swaps_bytes() {
             words.iter_mut().for_each(|word| *word = word.swap_bytes());
@@ -169,7 +173,8 @@ impl TcpWire {
         }
     }
 
-    /// Returns `None`, because whether a network address exists is not known before it is used.
+    /// Returns `None`. For a serial port this function reports that the port does not exist. For a network address this
+    /// cannot be known before a connection is tried.
     pub(super) fn missing(&self) -> Option<String> {
         None
     }
@@ -216,7 +221,8 @@ impl RtuWire {
         LineAddress::Rtu { device, baud, parity, stop_bits }
     }
 
-    /// Does nothing, because only the operating system can check the name of a port, see [`Self::missing`].
+    /// Does nothing. The name of a serial port can be checked only on the computer that has the port; [`Self::missing`]
+    /// does that.
     pub(super) fn check_address(&self, _: &MachineTable<'_>, _: &mut Document) {}
 
     /// Reports to the document if the CMM and the grinder have the same unit on one serial line, or different settings
@@ -237,7 +243,7 @@ impl RtuWire {
     }
 
     /// Returns a message if the serial port does not exist on this computer, with the names of the existing ports.
-    /// Returns `None` if the port exists.
+    /// Returns `None` if the port exists or its name is empty.
     pub(super) fn missing(&self) -> Option<String> {
         serial_port::missing(&self.device)
     }
@@ -326,7 +332,8 @@ impl RegisterMap {
         ]
     }
 
-    /// Reports to the document the blocks that overlap or end outside the address range.
+    /// Checks the addresses of the register blocks. Reports to `document` each block that overlaps another block or
+    /// ends after register 65535. `place` gives the table of the machine for the messages.
     pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         let blocks = self.blocks();
         for (k, &(name, first, count)) in blocks.iter().enumerate() {
@@ -431,8 +438,12 @@ pub struct Signal {
 }
 
 impl Signal {
-    /// Checks the signals of a cell file, reports their errors to the document, and returns the signals. Returns `None`
-    /// if a required key of a signal is missing, which the schema has reported.
+    /// Converts the signals of a cell file (`written`) and returns them. A signal without its own word order gets
+    /// `word_order`. `place` gives the table of the machine for the messages.
+    ///
+    /// Reports to `document` each repeated name, each scale of 0, each range that is not ascending, and each address
+    /// after the last register. Such signals are returned all the same. Returns `None` if a required key of a signal is
+    /// missing; the check against the schema has reported that.
     pub fn from_tables(
         written: &[SignalTable],
         word_order: WordOrder,

@@ -4,8 +4,8 @@ use super::protocol::Registers;
 use super::settings::{Signal, SignalType, WordOrder};
 
 impl Signal {
-    /// Decodes the value of the signal from its registers in a word order, in the unit of the signal. The value may be
-    /// NaN or infinite.
+    /// Decodes the value of the signal from its registers `words` with the word order `order`, and multiplies it by the
+    /// scale of the signal. The result is in the unit of the signal. It may be NaN or infinite.
     pub(super) fn value(&self, words: &[u16], order: WordOrder) -> f64 {
         let block = Registers::new(words, order);
         let kept = match self.kind {
@@ -19,9 +19,13 @@ impl Signal {
         kept * self.scale
     }
 
-    /// Returns the probable cause of a bad value. It is the word order, if the value would be good in the other word
-    /// order. Otherwise, for a value that is not finite, it is the entry of the signal in the cell file. Returns `None`
-    /// for a good value, and for a finite value without such a cause.
+    /// Returns in words the probable cause of a wrong value in the registers `words`:
+    ///
+    /// - The word order is wrong, if the value is not in range but would be in range in the other word order.
+    /// - Otherwise, if the value is not finite, the entry of the signal in the cell file is wrong.
+    ///
+    /// Returns `None` for a value in range. Also returns `None` for a finite value that is out of range in both word
+    /// orders.
     pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
         let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
         let value = self.value(words, self.word_order);

@@ -64,7 +64,8 @@ impl ModbusUnit {
         Self { name, link, map, unit, kind, retries, lost_after, verified_generation: None, identity: None, flags: 0 }
     }
 
-    /// Returns the verified identity of the machine; `None` before the first verification.
+    /// Returns the verified identity of the machine. Returns `None` if no connection has verified it yet, or if the
+    /// last call of [`Self::connect`] failed.
     pub(super) fn identity(&self) -> Option<&Identity> {
         self.identity.as_ref()
     }
@@ -74,8 +75,8 @@ impl ModbusUnit {
         self.identity.is_some() && self.flags & OFFERS_READ_AHEAD != 0
     }
 
-    /// Returns the number of the connection on which the identity of the machine was verified, or `None` if it must be
-    /// verified again. That connection may have been lost since then.
+    /// Returns the generation (number of the connection) on which the identity of the machine was verified. Returns
+    /// `None` if the identity must be verified again. The connection with this number may already be lost.
     pub(super) fn generation(&self) -> Option<u64> {
         self.verified_generation
     }
@@ -111,22 +112,33 @@ impl ModbusUnit {
         self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), operation: "identity" })
     }
 
-    /// Reads `count` registers. If necessary, first verifies the identity of the machine on this connection. `what`
-    /// names the operation in errors.
+    /// Reads `count` registers from `address`. `what` is the name of the operation in error messages. If the line was
+    /// reopened, first verifies the identity of the machine again. Repeats the request after a communication error.
+    ///
+    /// # Errors
+    /// Returns [`DeviceError::NotConnected`] if `connect` has not verified the machine. Otherwise returns the last
+    /// error of the request.
     pub(super) async fn read(&mut self, what: &'static str, address: u16, count: u16) -> Result<Vec<u16>, DeviceError> {
         self.exchange(what, address, LinkRequest::Read { address, count }).await
     }
 
-    /// Writes registers. If necessary, first verifies the identity of the machine on this connection. A retry can write
-    /// them more than once. `what` names the operation in errors.
+    /// Writes the registers `words` from `address`. `what` is the name of the operation in error messages. If the line
+    /// was reopened, first verifies the identity of the machine again. Repeats the request after a communication error,
+    /// so the machine may receive the same write more than once.
+    ///
+    /// # Errors
+    /// Returns [`DeviceError::NotConnected`] if `connect` has not verified the machine. Otherwise returns the last
+    /// error of the request.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
         self.exchange(what, address, LinkRequest::Write { address, words: words.into() }).await.map(drop)
     }
 
-    /// Sends a request once, without a retry. Use it for a request whose failure has no consequences.
+    /// Sends the request `ask` once, without a retry. Use it for a request whose failure has no consequences. `what`
+    /// and `address` describe the operation in error messages. Returns the received registers.
     ///
     /// # Errors
-    /// Returns [`DeviceError::NotConnected`] if the identity of the machine is not verified on the present connection.
+    /// Returns [`DeviceError::NotConnected`] if the identity of the machine must be verified again. Otherwise returns
+    /// the error of the request.
     pub(super) async fn request_once(
         &mut self,
         what: &'static str,
@@ -140,8 +152,9 @@ impl ModbusUnit {
         answer.map(|(_, words)| words).map_err(|fault| self.device_error(what, address, fault))
     }
 
-    /// Sends one request. Converts the bytes of each register between the order of docs/modbus.md and the order of the
-    /// machine. Returns the number of the connection (its generation) and the received registers.
+    /// Sends the request `ask` once. If `generation` is given, sends it only on the connection with this number.
+    /// Exchanges the two bytes of each sent and received register if the word order of the machine requires it. Returns
+    /// the generation (number of the connection) and the received registers.
     async fn send(&self, generation: Option<u64>, ask: LinkRequest) -> Result<(u64, Vec<u16>), LinkFault> {
         let order = self.map.word_order;
         let ask = match ask {
@@ -154,8 +167,8 @@ impl ModbusUnit {
         Ok((generation, order.bytes_in_order(words)))
     }
 
-    /// Drops the connection because data received over it are invalid. Returns the error for these data: `what` is
-    /// their name, `expected` and `found` are their values.
+    /// Closes the connection because the machine sent invalid data. Returns the error [`DeviceError::Corrupt`] with the
+    /// name `what` of these data, the `expected` value and the value `found`.
     pub(super) async fn reject_data(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
         if let Some(generation) = self.verified_generation.take() {
             // A stale generation is equally good: then another machine has given the connection up already.
@@ -164,13 +177,17 @@ impl ModbusUnit {
         DeviceError::Corrupt { machine: self.name.clone(), data: what, expected, found }
     }
 
-    /// Returns true if a request must not be retried after this error. Only a failed communication is retried: until
-    /// `lost_after` has passed since `began` if the machine answers that it is busy, otherwise at most `retries` times.
+    /// Returns true if a request that failed with `error` must not be sent again. `tries` is the number of retries so
+    /// far, and `began` is the time of the first request.
+    ///
+    /// Returns false only for a communication error, before `lost_after` has passed since `began`. Unless the machine
+    /// answered that it is busy, `tries` must also be below `retries`.
     fn is_final(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
 
-    /// Counts a retry, and pauses before it if the machine is busy.
+    /// Adds one retry to the statistics of the line. If `error` states that the machine is busy, then waits for
+    /// [`BUSY_PAUSE`]. Otherwise returns at once.
     async fn pause_before_retry(&self, error: &DeviceError) {
         self.link.count_retry();
         if error.is_busy() {
@@ -185,8 +202,9 @@ impl ModbusUnit {
         self.request_with_retries(what, address, ask, false).await
     }
 
-    /// Sends a request with at most `retries` retries, even if the machine answers that it is busy. Used between two
-    /// reads of the status, which must not be delayed long.
+    /// Sends the request `ask` with at most `retries` retries. The limit also holds if the machine answers that it is
+    /// busy, so that the next read of the status is not delayed long. `what` and `address` describe the operation in
+    /// error messages. Returns the received registers.
     pub(super) async fn request_with_limit(
         &mut self,
         what: &'static str,
@@ -251,9 +269,15 @@ impl ModbusUnit {
         }
     }
 
-    /// Verifies the identity of the machine and returns the number of the connection (its generation). Reads the
-    /// identity block, then writes two random words and reads back their complements, which only the machine can
-    /// provide after this moment. Then reads the identity block again; both readings must be equal.
+    /// Verifies the identity of the machine and returns the generation (number of the connection). The steps are:
+    ///
+    /// - Read the identity block.
+    /// - Write two random words and read back their bitwise complements. An older answer cannot contain them.
+    /// - Read the identity block again. Both blocks must be equal.
+    ///
+    /// # Errors
+    /// A request fails, the answers are wrong, it is not the expected machine, or the machine was restarted since the
+    /// last verification.
     async fn verify_identity(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
         let read = LinkRequest::Read { address: first, count: IDENTITY_REGISTERS };
@@ -298,10 +322,11 @@ impl ModbusUnit {
         Ok(())
     }
 
-    /// Decodes an identity block.
+    /// Decodes the 32 registers of an identity block.
     ///
     /// # Errors
-    /// Returns an error that describes the device that answers, for example one with another version or word order.
+    /// The block does not belong to the expected machine: the device, the kind of machine, the version of the register
+    /// map, the word order, the register addresses or the unit of length are wrong.
     pub(super) fn decode_identity(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
         if let Some(how) = layout_fault(words, self.map.word_order) {
@@ -364,8 +389,9 @@ fn is_starting(error: &DeviceError) -> bool {
     matches!(error, DeviceError::Exception { code: 5 | 6, .. })
 }
 
-/// Returns a text that states how the layout of an identity block is wrong: its address is off by one, or the bytes are
-/// in the other order. Returns `None` if the layout is correct, or if there is no identity block.
+/// Returns a text that explains how the registers of an identity block are displaced: they are one address too early or
+/// too late, or the two bytes of each register are exchanged. `order` is the word order in the cell file. Returns
+/// `None` if the block is at the right address, or if `words` contains no identity block.
 fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
     let begins = |from: usize, swap: fn(u16) -> u16| {
         let due = [MAGIC[0], MAGIC[1], VERSION];

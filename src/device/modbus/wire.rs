@@ -50,7 +50,8 @@ modbus_wire!(TcpWire);
 modbus_wire!(RtuWire);
 
 impl ModbusSettings {
-    /// Returns the settings of the driver for a unit on a line. The other values come from the cell file.
+    /// Returns the settings of the driver for the machine with the number `unit` on `line`. All other values, such as
+    /// timeouts, register addresses and signals, come from `making`.
     pub fn from_context(line: LineAddress, unit: u8, making: &DriverContext<'_>) -> Self {
         let timing = making.timing;
         Self {
@@ -71,11 +72,12 @@ impl ModbusSettings {
     }
 }
 
-/// Returns the line of a machine and all settings of its driver. If the other machine of the cell has the same line,
-/// the two share it. `missing` is the message about a port that does not exist.
+/// Returns the Modbus line of the machine with the number `unit`, and all settings of its driver. If the other machine
+/// of the cell already has a line with the same address, both machines share it; otherwise a new line is created.
+/// `missing` is a message that the serial port does not exist, or `None`.
 ///
 /// # Errors
-/// The port does not exist, or the line cannot be created.
+/// The serial port does not exist, or the line cannot be created.
 fn link(
     line: LineAddress,
     unit: u8,

@@ -95,14 +95,17 @@ pub struct Amended {
     pub unit_assumed: bool,
 }
 
-/// Reads the program `base`, corrects it by the map of `amendment`, and writes it to `out`. Returns a summary of the
-/// changes.
+/// Corrects the grinding program `base` with the map of `amendment`, and writes the corrected program to `out`. Returns
+/// a summary of the changes.
 ///
 /// # Errors
-/// A program that already contains the map, that belongs to another part, or that contains a correction other than the
-/// one the map is based on; a line that cannot be corrected; a program without a move at feed, or with less than 5 % of
-/// its feed length over the map; corrected lines that do not match the base program and the map; a file that cannot be
-/// read or written, or `out` equal to `base`. Then `out` is not written.
+/// `out` is not written in any of these cases:
+/// - `base` already contains the map, belongs to another part, or contains another correction than the one on which the
+///   map is based.
+/// - `base` is not a text file, is for an unsupported control, or has a line that cannot be corrected.
+/// - `base` has no move at feed, or less than 5 % of its feed length lies inside the map.
+/// - The corrected lines do not match the base program and the map when they are checked.
+/// - A file cannot be read or written, or `out` is the same file as `base`.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MAX_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
@@ -195,8 +198,8 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
         .map(|what| (what, AGAIN))
 }
 
-/// Returns true if G20 or G21 occurs before the first coordinate or feed, if there is no coordinate and no feed, or if
-/// a line before them cannot be read.
+/// Returns true if the program `text` states its unit (G20 or G21) in or before the first line with a coordinate or a
+/// feed. Also returns true if no line has a coordinate or a feed, or if a line before them cannot be read.
 fn states_unit_first(text: &str) -> bool {
     for line in text.lines() {
         let Ok(block) = block(line) else { return true };
@@ -210,8 +213,11 @@ fn states_unit_first(text: &str) -> bool {
     true
 }
 
-/// Rejects the program `text` if it already contains the map, if it belongs to another part than the map, or if its
-/// correction is not the one that the map requires ([`MapBase`]). `path` only names the program in messages.
+/// Checks that the map of `amendment` can be applied to the program `text`. `path` only names the program in messages.
+///
+/// # Errors
+/// A program that already contains this map; a program that states another part than the map; a program whose
+/// correction is not the one that the map requires ([`MapBase`]).
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();
@@ -342,8 +348,10 @@ impl<'a> Rewriter<'a> {
         self.text.push(b'\n');
     }
 
-    /// Copies a move in machine coordinates (G53), or to the reference point (G28, G30), unchanged. `by` is the number
-    /// of the G word of its motion, 0 or 1; `None` for a move to the reference point.
+    /// Copies a move in machine coordinates (G53) or to the reference point (G28, G30) without a correction. `by` is
+    /// the number of the G word of the motion: 0 for a rapid move, 1 for a move at feed. It is `None` for a move to the
+    /// reference point. If the base program is in incremental mode (G91), G91 is written before the move and G90 after
+    /// it.
     fn machine(&mut self, block: &Block, by: Option<u8>) {
         if self.control.relative {
             self.text.extend_from_slice(b"G91\n");
@@ -364,9 +372,9 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Writes the corrected moves for one move at feed of the base program from `from` to `to`, of `length`
-    /// millimetres. `way` returns the position in the base program for a share of the move, from 0 at its start to 1 at
-    /// its end. `arc` is `None` for a straight move.
+    /// Writes the corrected moves that replace one move at feed of the base program. The base move goes from `from` to
+    /// `to` and is `length` millimetres long. `way` returns the position on the base move for a fraction from 0 (start)
+    /// to 1 (end). `arc` is the arc of the move, and `None` for a straight move.
     ///
     /// # Errors
     /// A displacement above the limit; no nominal surface under a point; a move that would be divided into too many
@@ -415,11 +423,16 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// Returns the displacements by the map at equally spaced points of a move of the base program, both ends included.
-    /// The spacing is fine enough for the map, the arc and the tolerance.
+    /// Returns the displacements, in millimetres, that the map gives to a move of the base program. They belong to
+    /// equally spaced points of the move, both ends included. The spacing is fine enough for the map, the arc and the
+    /// tolerance.
     ///
-    /// `way` returns the position for a share of the move, from 0 to 1. `lateral` is the length of the move over x and
-    /// y, and `length` its length in space, both in millimetres.
+    /// `way` returns the position on the move for a fraction from 0 (start) to 1 (end). `length` is the length of the
+    /// move in space, and `lateral` the length of its projection onto the xy plane, both in millimetres. `arc` is
+    /// `None` for a straight move.
+    ///
+    /// # Errors
+    /// No nominal surface under a point; a move that would be divided into too many pieces.
     fn shifts(
         &self,
         way: &dyn Fn(f64) -> Point,
@@ -448,9 +461,10 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Adds a move to the summary: its largest displacement, its `length` in millimetres, and its length outside the
-    /// map. `way` returns the position for a share of the move, from 0 to 1; `shifts` are the displacements at equally
-    /// spaced shares.
+    /// Adds a move of the base program to the summary of the correction: its largest displacement, its length, and the
+    /// part of its length that lies outside the map, all in millimetres. `way` returns the position on the move for a
+    /// fraction from 0 (start) to 1 (end). `shifts` holds the displacements at equally spaced fractions, both ends
+    /// included.
     ///
     /// # Errors
     /// A displacement above [`Amendment::max_shift_mm`].
@@ -537,7 +551,9 @@ impl<'a> Rewriter<'a> {
     }
 }
 
-/// Returns the displacement, in millimetres, that the map gives to `at`, a position in the base program.
+/// Returns the displacement, in millimetres, that the map gives to `at`, a position in the base program. Without a
+/// nominal surface in `amendment`, the displacement is along z. Otherwise it moves the centre of the grinding ball so
+/// that the ground surface shifts along its normals.
 ///
 /// # Errors
 /// A position with no nominal surface under it.
@@ -554,8 +570,9 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
     })
 }
 
-/// Returns true for words that are not copied to the corrected line: line numbers, and the words of the move, which
-/// each corrected move states anew. `act` is the action of the line.
+/// Returns true for a word that must not be copied to the corrected line. This is so for line numbers, and for words
+/// that each corrected move states again, such as axes, motions, arc centres, G90 and G91. `act` is the action of the
+/// line; R and P belong to the move only if the action is an arc.
 fn is_of_the_move(word: &GcodeWord, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
@@ -579,8 +596,9 @@ fn takes_effect_after(word: &GcodeWord) -> bool {
     word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
 }
 
-/// Returns the indices of the points to keep, except the first point, so that the straight lines between them stay
-/// within `tolerance` millimetres of all points (Douglas-Peucker algorithm).
+/// Simplifies a polyline with the Douglas-Peucker algorithm. Returns the indices, in ascending order, of the points to
+/// keep. The straight lines between these points stay within `tolerance` millimetres of all `points`. The first point
+/// is always kept, but its index is not returned.
 fn simplified_indices(points: &[Point], tolerance: f64) -> Vec<usize> {
     let mut kept = Vec::new();
     let mut open = vec![(0, points.len() - 1)];

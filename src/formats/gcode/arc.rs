@@ -37,12 +37,13 @@ pub(super) enum Centre {
 const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.1];
 
 impl Arc {
-    /// Computes the arc from `from` to `to` in a plane; a helix if both differ along the third axis. If both are equal
-    /// in the plane, the arc is a full turn.
+    /// Computes the arc from `from` to `to` in `plane`, in millimetres. The arc is a helix if the two points differ
+    /// along the axis perpendicular to the plane. If the two points are equal in the plane, the arc is a full turn.
+    /// `centre` is the centre in the plane, or the radius.
     ///
     /// # Errors
-    /// A radius at the end that differs from that at the start by more than [`RADIUS_TOLERANCE`]; a given radius with
-    /// which no arc joins the points.
+    /// A radius that differs between start and end by more than [`RADIUS_TOLERANCE`]; a radius of 0; a given radius
+    /// with which no arc joins the points.
     pub(super) fn new(plane: Plane, from: Point, to: Point, clockwise: bool, centre: Centre) -> Result<Self, Refusal> {
         let [a, b, c] = plane.0;
         let (p, q) = ([from[a], from[b]], [to[a], to[b]]);
@@ -103,11 +104,11 @@ impl Arc {
     }
 }
 
-/// Returns the centre, in the plane, of the arc from `p` to `q` with a given radius. A positive radius gives the
-/// shorter arc, a negative radius the longer one.
+/// Returns the centre, in the coordinates of the plane, of the arc from `p` to `q` with the given `radius`, all in
+/// millimetres. A positive radius gives the shorter arc, a negative radius the longer arc.
 ///
 /// # Errors
-/// A radius less than half the distance of the points; two equal points.
+/// A radius smaller than half the distance of the points, beyond the rounding error; two equal points.
 fn by_radius(p: [f64; 2], q: [f64; 2], radius: f64, clockwise: bool) -> Result<[f64; 2], Refusal> {
     let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
     let chord = dx.hypot(dy);

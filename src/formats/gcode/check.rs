@@ -80,8 +80,8 @@ impl Movement {
 }
 
 impl Round {
-    /// Returns the point at `share` of the arc, from 0 at its start to 1 at its end. The radius changes linearly from
-    /// start to end.
+    /// Returns the point at `share` of the arc, from 0 at its start to 1 at its end, in millimetres. The angle, the
+    /// radius and the coordinate perpendicular to the plane change linearly from the start to the end.
     fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.axes;
         let [p, q] = [self.from[a] - self.centre[0], self.from[b] - self.centre[1]];
@@ -217,8 +217,9 @@ impl Machine {
 }
 
 impl<'a> Check<'a> {
-    /// Creates a check. `header` holds the first lines of the corrected program; its modal words, such as G90, are then
-    /// in force for the corrected program only.
+    /// Creates a check that compares a corrected program with its base program. `header` holds the lines that the
+    /// correction writes at the beginning of the corrected program. Their modal words, such as G90, are applied to the
+    /// corrected program only.
     pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
         let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
         for line in header.lines() {
@@ -281,8 +282,12 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Checks that the base program and the corrected program have the same modal state (unit, plane, feed), and that
-    /// they know the positions of the same axes.
+    /// Compares the modal state after the same line of the base program and of the corrected program. The unit, the
+    /// plane, the feed, the mode of arc centres and the end of the program must be equal. The position must be known
+    /// for the same axes. The corrected program must use absolute coordinates.
+    ///
+    /// # Errors
+    /// A message, if one of these conditions is not met.
     fn same_state(&self) -> Result<(), String> {
         let (base, corrected) = (&self.base, &self.corrected);
         let same = base.inches == corrected.inches && base.plane == corrected.plane && base.feed == corrected.feed;
@@ -295,8 +300,12 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Checks that the moves `found` of the corrected program follow the move `way` of the base program displaced by
-    /// the map, within the tolerance, in order and without a detour. The error describes the difference.
+    /// Checks that the corrected program follows the map in one move at feed. `way` is the move of the base program,
+    /// and `found` are the moves that replace it. The moves `found` must follow the move `way` displaced by the map,
+    /// within the tolerance of the correction, in the right order and without a detour.
+    ///
+    /// # Errors
+    /// A description of the first difference; a point of the move with no nominal surface under it.
     fn along(&self, way: &Movement, found: &[Movement]) -> Result<(), String> {
         let allowed = self.amendment.tolerance_mm + DIGITS_MM;
         let at = |share: f64| {
@@ -352,8 +361,8 @@ fn distance_to_segment(from: Point, to: Point, point: Point) -> f64 {
     (arm - along * share).norm()
 }
 
-/// Returns true if a P word in the line would be the number of turns of an arc, because the line has I, J, K or R and
-/// no other word that takes a P.
+/// Returns true if a P word in `block` would state the number of turns of an arc. This is so if the line has I, J, K or
+/// R, and has none of the words that use P for another purpose (M19, G4, G64).
 fn is_turn(block: &Block) -> bool {
     let has = |letter: u8, of: &[f64]| block.words.iter().any(|w| w.letter == letter && of.contains(&w.value));
     block.words.iter().any(|w| matches!(w.letter, b'I' | b'J' | b'K' | b'R'))
@@ -361,8 +370,8 @@ fn is_turn(block: &Block) -> bool {
         && !has(b'G', &[4.0, 64.0])
 }
 
-/// Adds `by` to the count of each word of a line in `counts`. Words that move the tool, and line numbers, are not
-/// counted.
+/// Adds `by` to the counter of each word of the line `block` in `counts`. The keys of `counts` are words such as `M3`.
+/// Words that move the tool, and line numbers, are not counted.
 fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
     for word in &block.words {
         let moves = match word.letter {

@@ -142,7 +142,8 @@ impl Control {
         Ok(Act::Feed { from, to, arc })
     }
 
-    /// Applies the modal words of a line, and returns the other effects that its words request.
+    /// Applies the modal words of a line (words that stay in force for later lines) to this state. Returns the requests
+    /// of the other words, such as a dwell or a move to the reference point.
     ///
     /// # Errors
     /// An unknown word; a word that moves the tool in a way that the program does not show; words that exclude each
@@ -250,11 +251,16 @@ impl Control {
         Ok(())
     }
 
-    /// Processes the words of rotary axes (A, B, C), which turn the part or the tool. They can only turn to 0, and only
-    /// before the first move at feed, because a map over x and y is valid only there.
+    /// Processes the words of rotary axes (A, B, C), which turn the part or the tool. A rotary axis can only turn to 0,
+    /// and only before the first move at feed, because the map over x and y is valid only in this position. `asked`
+    /// holds the requests of the other words of the line.
     ///
-    /// Returns the word of the first rotary axis in the line, and true if a rotary axis can turn in this line. Returns
-    /// `None` if the line has no word of a rotary axis.
+    /// Returns the first such word of the line, and true if a rotary axis may turn in this line. Returns `None` if the
+    /// line has no word of a rotary axis.
+    ///
+    /// # Errors
+    /// A rotary axis that would turn to another angle, turn after a move at feed, or turn in one line with a dwell, G53
+    /// or a move to the reference point.
     fn turning<'w>(
         &mut self,
         block: &'w Block,
@@ -275,8 +281,9 @@ impl Control {
         Ok(first)
     }
 
-    /// Processes a move in machine coordinates or to the reference point. After it, the positions of the moved axes are
-    /// unknown. `named` holds the values of X, Y and Z in the line, and `axes` is true if one of them occurs.
+    /// Processes a move in machine coordinates (G53) or to the reference point (G28, G30), and returns the action. The
+    /// positions of the moved axes are then unknown. `named` holds the values of X, Y and Z in the line, and `axes` is
+    /// true if the line has at least one of them. A move to the reference point without a named axis moves all axes.
     ///
     /// # Errors
     /// G53 without an axis, with an arc, without a motion, or in G91.
@@ -295,8 +302,8 @@ impl Control {
         Ok(Act::Machine { by: self.motion.filter(|_| asked.machine) })
     }
 
-    /// Returns the end position of a move, in millimetres; `None` for an axis whose position is unknown. `named` holds
-    /// the values of X, Y and Z in the line, in the unit of the program.
+    /// Returns the end position of a move, in millimetres. An axis is `None` if its position is unknown and the line
+    /// does not state it. `named` holds the values of X, Y and Z in the line, in the unit of the program.
     ///
     /// # Errors
     /// A position beyond [`MAX_COORDINATE_MM`]; a relative move (G91) of an axis whose position is unknown.
@@ -403,8 +410,12 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Rejects words that have no meaning in their line, such as I without an arc or P without a dwell. `moves` is true if
-/// the line moves the tool, and `is_arc` if this move is an arc.
+/// Checks that each word of a line has a meaning in this line. `moves` is true if the line moves the tool, and `is_arc`
+/// if its move is an arc. `asked` holds the requests of the words.
+///
+/// # Errors
+/// A word without a meaning, such as I without an arc or P without a dwell; a motion word in one line with a dwell or a
+/// move to the reference point.
 fn check_uses(block: &Block, asked: &BlockRequests, moves: bool, is_arc: bool) -> Result<(), Refusal> {
     for word in &block.words {
         let used = match word.letter {

@@ -442,13 +442,15 @@ pub struct Exactness {
 }
 
 impl Dialect {
-    /// Returns the texts of this dialect for a program with the accuracy `exactness`: the lines for its path mode and
-    /// the words for its arcs.
+    /// Returns the texts of this dialect for a program with the accuracy `exactness`: the lines that set the path mode,
+    /// and the words for arcs. No words for arcs are returned if `exactness` asks for straight lines only.
     ///
     /// # Errors
-    /// A dialect without words for the path mode; a path tolerance that the dialect cannot express and that the control
-    /// is not known to keep; decimals that round points by more than the chord error; arcs that the dialect does not
-    /// have, or with a tolerance out of range.
+    /// - The dialect has no words for the path mode.
+    /// - The dialect cannot express the path tolerance, and it is not known that the control keeps this tolerance.
+    /// - The decimals of the dialect round points by more than the chord error.
+    /// - Arcs are requested that the dialect does not have, or whose tolerance is below the rounding error or above the
+    ///   chord error.
     pub fn post(&self, exactness: &Exactness) -> Result<Post<'_>, DialectError> {
         let dialect = || self.dialect.name.clone();
         let (mode, word, key) = match exactness.mode {
@@ -475,7 +477,8 @@ impl Dialect {
         Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)], arcs })
     }
 
-    /// Returns the words of this dialect for arcs, and the limits for arcs that stay within `within_mm` of the path.
+    /// Returns the words of this dialect for arcs, and the limits for the computation of arcs. `within_mm` is the
+    /// maximum distance of an arc from the path, in millimetres.
     ///
     /// # Errors
     /// A dialect without words for arcs; a `within_mm` below the rounding error of the dialect's decimals.
@@ -503,12 +506,15 @@ impl Dialect {
         1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
     }
 
-    /// Returns the lines with which a program prepares the control for a head that tilts the wheel, and ends this
-    /// state.
+    /// Returns the lines for a head that tilts the wheel: the lines that prepare the control before the moves, and the
+    /// lines that end this state after them.
+    ///
+    /// `rotary.pivot_mm` decides which lines are needed. If it is `None`, the control itself keeps the wheel's centre
+    /// in place, and `[rotary.tool_centre]` of the dialect is returned. Otherwise the program moves the slides, and
+    /// `[rotary.slides]` is returned.
     ///
     /// # Errors
-    /// A dialect without words for this head: with a pivot, `[rotary.slides]` is required; without one,
-    /// `[rotary.tool_centre]`.
+    /// A dialect without the required lines.
     pub fn turning(&self, rotary: &RotaryAxis) -> Result<&Turning, DialectError> {
         let dialect = || self.dialect.name.clone();
         match rotary.pivot_mm {
@@ -797,7 +803,8 @@ const OTHER: [&str; 9] = ["G20", "G70", "G700", "G91", "G93", "G95", "G96", "G96
 pub(super) mod tests {
     use super::*;
 
-    /// Returns a dialect that is delivered with Regrind.
+    /// Reads the dialect `name` from the dialects that are delivered with Regrind (`config/dialects`). Panics if the
+    /// file is missing or not valid.
     pub(in super::super) fn shipped(name: &str) -> Dialect {
         let file = format!("{}/../../config/dialects/{name}.toml", env!("CARGO_MANIFEST_DIR"));
         toml::from_str(&std::fs::read_to_string(file).unwrap()).unwrap()

@@ -37,8 +37,9 @@ pub enum GcodeError {
 }
 
 impl GcodeError {
-    /// Returns the error for a track that follows `moves` earlier moves: its move number, which counts within the
-    /// track, becomes the number in the program.
+    /// Converts the move number of this error. The number was counted from the start of its track. `moves` is the
+    /// number of moves in the program before this track. The returned error has the number counted from the start of
+    /// the program.
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },

@@ -55,7 +55,9 @@ pub struct ProgramMap {
 }
 
 impl ProgramMap {
-    /// Returns true if the node nearest to a position exists and has enough measured points around it.
+    /// Returns true if the map is valid at `place_mm`, a position x, y in millimetres: the nearest node of the grid has
+    /// enough measured points around it. Returns false if the position lies outside the grid by more than half the
+    /// distance of two nodes.
     pub fn covers(&self, place_mm: [f64; 2]) -> bool {
         let counts = self.grid.counts();
         let [column, row] = [0, 1].map(|k| ((place_mm[k] - self.grid.first_mm[k]) / self.grid.spacing_mm[k]).round());
@@ -64,15 +66,18 @@ impl ProgramMap {
     }
 }
 
-/// Reads a map. It has a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, optionally with more columns, and
-/// one row for every node of a regular grid. A 0 in the column `valid` marks a node with too few measured points around
-/// it. In maps that Regrind wrote, these nodes already have extrapolated values. In other maps their values are
-/// replaced by those of the nearest valid nodes. Comments can state `part: sha256 ...`, `map: sha256 ...`, `ground
-/// with: sha256 ...` and `SIMULATION`.
+/// Reads a map of errors or corrections from a CSV file. The header begins with `x_mm,y_mm,error_mm` or
+/// `x_mm,y_mm,correction_mm`, and more columns can follow. The file has one row for every node of a regular grid.
+///
+/// A 0 in the optional column `valid` marks a node with too few measured points around it. If Regrind wrote the map,
+/// the extrapolated value of such a node is used. In a map of another program, such a node receives the value of the
+/// nearest valid node.
+///
+/// Comment lines (`#`) can state `part: sha256 ...`, `map: sha256 ...`, `ground with: sha256 ...` and `SIMULATION`.
 ///
 /// # Errors
-/// A file that cannot be read; other columns; rows that are not numbers; nodes that do not form a complete grid; a map
-/// without a valid node.
+/// A file that cannot be read or is too large; other columns; rows that are not numbers; nodes that do not form a
+/// complete grid; a map without a valid node.
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
     let file = crate::system::open_to_read(path).map_err(unreadable)?;
@@ -142,7 +147,7 @@ impl MapLines {
         Ok(())
     }
 
-    /// Creates the map from all lines that were read.
+    /// Creates the map from all lines that were read. `path` only names the file in messages.
     ///
     /// # Errors
     /// Nodes that do not form a complete grid; no header; no valid node.
@@ -188,8 +193,11 @@ fn columns(header: &str) -> Option<MapKind> {
     }
 }
 
-/// Returns x, y and the value of a row as a point; `None` if one of them is not a number. If `valid` is false, a value
-/// that is not a number becomes NaN instead.
+/// Reads the first three values of a CSV row, x, y and the value of the node, and returns them as a point in
+/// millimetres. If `valid` is false, a third value that cannot be read becomes NaN.
+///
+/// Returns `None` if x or y, or the value of a valid node, is missing, is not a number, or is not below 1e7 mm in
+/// magnitude.
 fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
     Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(f64::NAN))?))
@@ -209,8 +217,9 @@ fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     Some((grid, (0..grid.len()).map(|k| order.point_indices[k] as usize).collect()))
 }
 
-/// Replaces each value that is not `known` by the value of the nearest known node. The distance counts steps along rows
-/// and columns.
+/// Fills nodes without a known value. Each value that is not `known` is replaced by the value of the nearest known
+/// node. The distance is the number of steps along rows and columns. The nodes are stored row by row, with `columns`
+/// nodes in a row.
 fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     let mut known = known.to_vec();
     let mut next: std::collections::VecDeque<usize> = (0..known.len()).filter(|&k| known[k]).collect();
@@ -231,8 +240,9 @@ fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     }
 }
 
-/// Returns the SHA-256 that follows `name` in a comment: with the name `map:`, that of `map: sha256 5f3c...`. Returns
-/// `None` if there is none.
+/// Returns the SHA-256 that `comment` states after the word `name`. For example, `name` is `map:`, and `comment`
+/// contains `map: sha256 5f3c...`. Returns `None` if `comment` does not contain `name` with a complete SHA-256 after
+/// it.
 pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
     let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
     let mut bytes = [0; 32];

@@ -7,12 +7,14 @@ use crate::FormatError;
 use crate::registration::write_rows;
 use regrind_core::geometry::Grid;
 
-/// Writes `toolpath_z.csv` to `path`: `x_mm,y_mm,dz_mm`, one row per node of `grid`, row by row with x fastest. dz are
-/// the `offsets_mm`. The header states `map_identity`, the SHA-256 of the map.
+/// Writes a table of offsets for axis Z to the CSV file `path` (`toolpath_z.csv`). The columns are `x_mm,y_mm,dz_mm`.
+/// The table has one row per node of `grid`, row by row with x fastest. `offsets_mm` holds dz of each node in this
+/// order. The header states `map_identity`, the SHA-256 of the map. If `simulation` is true, the header marks the file
+/// as simulated.
 ///
-/// x and y are the positions of the wheel's centre on the axes; the controller adds dz to Z. The table corrects a
-/// program of the nominal surface at the same level, as in sag compensation over two axes or with levelling meshes. Do
-/// not use the table with a program that already contains the correction.
+/// x and y are the positions of the wheel's centre on the machine axes. The controller adds dz to Z, as in sag
+/// compensation over two axes or with levelling meshes. The table corrects a program of the nominal surface at the same
+/// level. Do not use the table with a program that already contains the correction.
 ///
 /// # Errors
 /// The same as for [`crate::write_deviations`].

@@ -55,16 +55,17 @@ pub struct ProgramHeader {
     pub exactness: Exactness,
 }
 
-/// Writes the program of a tool path to `file`: the header, the moves track by track, the end.
+/// Writes the program of a tool path to `file`: the header, then the moves track by track, then the end. `summary` is
+/// the summary of the same `path`. The file appears complete or not at all.
 ///
-/// Frame: the model frame; the work offset must have its zero there. Units: mm, mm/min. A coordinate that does not
-/// change within a track is omitted. Every track states its complete start again, so that a program can be resumed at
-/// any track, and so that many tracks are formatted in parallel if blocks have no numbers. The file appears complete or
-/// not at all.
+/// Frame: the model frame; the work offset must have its zero in the origin of the model. Units: mm, mm/min. A
+/// coordinate that does not change within a track is omitted. Every track states its complete start position again, so
+/// that a program can be resumed at any track. Many short tracks are formatted in parallel, unless the blocks have
+/// numbers.
 ///
 /// # Errors
 /// A request that the dialect cannot express; a coordinate that is not finite or exceeds the limit of the dialect; a
-/// feed that rounds to 0; a number of moves that differs from `summary`; a file that cannot be written.
+/// feed that rounds to 0; a number of moves that differs from the expected number; a file that cannot be written.
 pub fn write_program(
     file: &Path,
     header: &ProgramHeader,
@@ -167,8 +168,9 @@ const MIN_LENGTH_MM: f64 = 1e-6;
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
-    /// Creates an empty text with no modal state. `count` moves and `numbered` blocks with a number precede it in the
-    /// program.
+    /// Creates an empty text for the blocks of moves. No motion, position or feed is in force yet. `rotary` is the
+    /// rotary axis that tilts the wheel, if there is one. `count` is the number of moves that come earlier in the
+    /// program, and `numbered` the number of earlier blocks with a block number.
     fn new(dialect: &'a Dialect, rotary: Option<&'a RotaryAxis>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let numbers = &dialect.numbers;
@@ -178,10 +180,12 @@ impl<'a> Lines<'a> {
         Self { dialect, rotary, text, last, turned, motion, plane, feed, count, numbered, per_mm, per_deg, feed_per }
     }
 
-    /// Formats all moves of one track into a new text.
+    /// Formats all moves of one track into a new text. `rotary` is the rotary axis that tilts the wheel, if there is
+    /// one.
     ///
     /// # Errors
-    /// A coordinate or a feed that the dialect cannot express. Its move number counts within the track.
+    /// A coordinate or a feed that the dialect cannot express. The error states the number of the move, counted from
+    /// the start of the track.
     fn format_track<T: Iterator<Item: Into<ProgramBlock>> + Clone>(
         dialect: &'a Dialect,
         rotary: Option<&'a RotaryAxis>,
@@ -207,7 +211,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the number of the next block, if the dialect numbers blocks.
+    /// Writes the number of the next block if the dialect numbers blocks, and counts the block in any case.
     #[inline]
     fn number(&mut self) {
         number(&mut self.text, self.dialect, self.numbered);
@@ -239,9 +243,12 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Returns the feed as the control expects it. If the control keeps the wheel's centre in place, this is
-    /// `feed_mm_min`, the feed of the centre. If the program moves the slides, it is the inverse of the duration of the
-    /// block, in 1/min, and valid for this block only. `centre_mm` is the length of the move of the centre.
+    /// Returns the feed in the form that the control expects. `feed_mm_min` is the feed of the wheel's centre, and
+    /// `centre_mm` is the length of the move of the centre.
+    ///
+    /// If the control itself keeps the wheel's centre in place, the result is `feed_mm_min`. If the program moves the
+    /// slides, the result is the inverse time: 1 divided by the duration of the block, in 1/min. An inverse time is
+    /// valid for one block only, so the next block states a feed again.
     fn feed_of(&mut self, feed_mm_min: f64, centre_mm: f64) -> f64 {
         if !self.moves_slides() {
             return feed_mm_min;
@@ -254,8 +261,11 @@ impl<'a> Lines<'a> {
         self.rotary.is_some_and(|rotary| rotary.pivot_mm.is_some())
     }
 
-    /// Writes the block of a rapid or straight move. An axis, a tilt or a feed that is `None` stays unchanged. Words
-    /// that did not change are omitted; if nothing changed, all known axes are written.
+    /// Writes the block of a rapid or straight move without the end of the line. `rapid` is true for a rapid move.
+    /// `to_mm` is the end position; an axis, a tilt or a feed that is `None` stays unchanged.
+    ///
+    /// A word whose value did not change is omitted. If no value changed, all axes whose position is known are written,
+    /// so that the block is still a move.
     ///
     /// # Errors
     /// A value that is not finite or exceeds the limit of the dialect; a feed that rounds to 0.
@@ -294,8 +304,9 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// Writes the block of an arc, after a block for its centre if the dialect has one. The end point in the plane and
-    /// the centre are always written.
+    /// Writes the block of an arc. If the dialect states the centre in its own block, this block is written first. The
+    /// end point in the plane of the arc and the centre are always written. The coordinate perpendicular to the plane
+    /// is written only if it changed. Writes nothing if the dialect has no words for arcs.
     ///
     /// # Errors
     /// A value that is not finite or exceeds the limit of the dialect; a feed that rounds to 0.
@@ -348,8 +359,9 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the two coordinates `centre` of an arc's centre in its plane, in the order of the axes. `letters` are the
-    /// words for x, y and z. `first` is true until a word of the block is written, and is updated.
+    /// Writes the two coordinates of the centre of an arc, in the order x, y, z of the axes. `centre` holds the
+    /// coordinates along the first and the second axis of `plane`, in units of the last written digit. `letters` holds
+    /// the texts before a coordinate for x, y and z. `first` is true if the block has no word yet, and becomes false.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
         for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
@@ -368,8 +380,9 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the word of an axis and its coordinate. `value` counts units of the last written digit. `first` is true
-    /// until a word of the block is written, and is updated.
+    /// Writes one coordinate of a block. `word` is the text of the axis, such as `X`. `value` is the coordinate in
+    /// units of the last written digit: 1234 is 1.234 mm if the dialect has three decimals. `first` is true if the
+    /// block has no word yet, and becomes false.
     #[inline]
     fn place(&mut self, word: &str, value: i64, first: &mut bool) {
         self.between(first);
@@ -381,8 +394,9 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, value, numbers.decimals);
     }
 
-    /// Writes the feed, unless the same feed is already in force. `feed` counts units of the last written digit.
-    /// `first` is true until a word of the block is written, and is updated.
+    /// Writes the feed, unless the same feed is already in force. `feed` is in units of the last written digit: 6005 is
+    /// 600.5 if the dialect has one decimal for feeds. `first` is true if the block has no word yet; it becomes false
+    /// if the feed is written.
     #[inline]
     fn feed(&mut self, feed: i64, first: &mut bool) {
         if feed != self.feed {
@@ -400,7 +414,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Returns a coordinate as a number of units of the last written digit. `axis` is 0 for x, 1 for y, 2 for z.
+    /// Converts a coordinate to a whole number of units of the last written digit: 1.234 mm gives 1234 if the dialect
+    /// has three decimals. `axis` is 0 for x, 1 for y, 2 for z, and names the axis in an error.
     ///
     /// # Errors
     /// A value that is not finite or exceeds the limit of the dialect.
@@ -426,7 +441,9 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, turned, numbers.angle_decimals);
     }
 
-    /// Returns the position of the rotary axis for a tilt of the wheel, as a number of units of the last written digit.
+    /// Returns the angle that the scale of the rotary axis shows for the tilt `tilt_rad` of the wheel. The result is in
+    /// degrees, as a whole number of units of the last written digit: 1.25° gives 125 if the dialect has two decimals
+    /// for angles.
     ///
     /// # Errors
     /// A tilt that is not finite; a program without a rotary axis.
@@ -437,7 +454,8 @@ impl<'a> Lines<'a> {
         Ok((rotary.scale_reading_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
     }
 
-    /// Returns a feed as a number of units of the last written digit.
+    /// Converts a feed to a whole number of units of the last written digit: 600.5 mm/min gives 6005 if the dialect has
+    /// one decimal for feeds.
     ///
     /// # Errors
     /// A feed that rounds to 0.
@@ -451,7 +469,8 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// Appends a feed to `text` without zeros at the end. `feed` counts units of the last written digit.
+/// Appends a feed to `text`, without zeros at the end of its decimals. `feed` is in units of the last written digit:
+/// 6005 is written as `600.5` if the dialect has one decimal for feeds.
 fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     let before = text.len();
     push_decimals(text, feed, dialect.numbers.feed_decimals);
@@ -468,8 +487,8 @@ fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     }
 }
 
-/// Appends the number of a block to `text`, if the dialect numbers blocks. `numbered` is the number of numbered blocks
-/// before it.
+/// Appends the number of a block to `text` if the dialect numbers blocks. `numbered` is the number of earlier blocks
+/// with a number. After the last number of the dialect, the numbers begin again with the first one.
 #[inline]
 fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
     let Some(blocks) = &dialect.blocks else { return };
@@ -521,8 +540,8 @@ impl<'a> Frame<'a> {
         })
     }
 
-    /// Appends `line` to `text`. If `has_number` is true, the line gets a block number and `numbered`, the count of
-    /// numbered blocks, increases by 1.
+    /// Appends `line` and a line end to `text`. If `has_number` is true, a block number is written before `line`, and
+    /// the counter `numbered` of such blocks increases by 1. A line that is only a percent sign never has a number.
     fn line(&self, text: &mut Vec<u8>, line: &str, has_number: bool, numbered: &mut u64) {
         // A percent sign is not a block and has no number.
         if has_number && line != "%" {
@@ -533,8 +552,9 @@ impl<'a> Frame<'a> {
         end_line(text, self.dialect);
     }
 
-    /// Returns the lines of the program before the moves, and the number of numbered blocks among them. A comment
-    /// states the number of lines of the whole program.
+    /// Returns the lines of the program before the moves, and the number of blocks with a number among these lines. The
+    /// comments in these lines state the number of lines of the whole program. `arcs` is `None` if the program has no
+    /// arcs.
     fn head(&self, header: &ProgramHeader, summary: &PathSummary, arcs: Option<&ArcSummary>) -> (String, u64) {
         let lines = |count: u64| {
             let (mut text, mut numbered) = (Vec::new(), 0);
@@ -587,8 +607,9 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// Returns the texts for the comments at the beginning of a program. `h` is the content of the header, `s` the summary
-/// of the path, and `lines` the number of lines of the program.
+/// Returns the texts of the comments at the beginning of a program, one text per comment. `h` is the content of the
+/// header, and `s` the summary of the path. `arcs` is the summary of the arcs; `None` if the program has none. `lines`
+/// is the number of lines of the whole program.
 fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
@@ -634,7 +655,9 @@ fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, l
     said
 }
 
-/// Returns two texts for the header: about the tilt of the wheel, and about the point that X, Y and Z describe.
+/// Returns two texts for the comments in the header of a program. The first text describes the tilt of the wheel and
+/// the range of the rotary axis. The second text states which point X, Y and Z describe: the wheel's centre, or the
+/// position of the slides.
 fn tilt_in_words(rotary: &RotaryAxis, h: &ProgramHeader, s: &PathSummary) -> [String; 2] {
     let about = if rotary.axis == RotationAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };

@@ -23,8 +23,9 @@ pub struct OpenToOthers {
     pub remedy: String,
 }
 
-/// Returns the permission by which other users than the owner can read a file, and the remedy. Returns `None` if no
-/// other user can read it.
+/// Returns the permission that lets users other than the owner read the file `path`, and the command that removes this
+/// permission. Returns `None` if there is no such permission. On Unix, any permission of the group or of other users
+/// counts.
 ///
 /// # Errors
 /// A file that does not exist, or whose permissions the system does not report.
@@ -37,8 +38,8 @@ pub fn is_same_file(one: &Path, other: &Path) -> bool {
     here::is_same_file(one, other).unwrap_or(false)
 }
 
-/// Returns the name of the user with the number `uid`; `None` if the system has no list of users, or the list no such
-/// user.
+/// Returns the name of the user with the number `uid`. Returns `None` if the system has no list of users, or if the
+/// list does not contain this user.
 pub fn user_name(uid: u32) -> Option<String> {
     here::user_name(uid)
 }

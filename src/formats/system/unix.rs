@@ -30,9 +30,9 @@ pub(super) fn user_name(uid: u32) -> Option<String> {
     users.find(|user| user[2].parse() == Ok(uid) && !user[0].is_empty()).map(|user| user[0].clone())
 }
 
-/// Opens a file for reading. Rejects a named pipe, which could block until a program writes, and a device, which can
-/// have no end. They are accepted only under `/dev/fd` and similar folders, where a shell places the input of a
-/// program.
+/// Opens the file `path` for reading. Returns an error for a named pipe, because opening it can block, and for a
+/// device, because it can have no end. Pipes and devices are accepted only as `/dev/stdin` or under `/dev/fd` and
+/// `/proc/self/fd`, where a shell provides the input of a program.
 pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     let kind = fs::metadata(path)?.file_type();
     let is_given =

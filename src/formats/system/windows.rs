@@ -12,7 +12,8 @@ pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// Returns true if both paths lead to the same full path. A hard link (a second name of a file) is not detected.
+/// Returns true if the full paths of `one` and `other`, with all links followed, are equal. Two names of one file by a
+/// hard link are not detected.
 ///
 /// # Errors
 /// A path that does not exist.
@@ -35,17 +36,23 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Returns false for every existing path: on Windows programs communicate by pipes, which are not in a folder.
+/// Returns false for every existing path. On Windows, programs communicate by named pipes, which are not entries of a
+/// folder.
+///
+/// # Errors
+/// No entry at `path`.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     fs::symlink_metadata(path).map(|_| false)
 }
 
-/// Returns an error: on Windows a port has only the name that the system gives it.
+/// Returns an error in every case. On Windows, a device such as a serial port has only the name that the system gives
+/// it, so no link to it can be created.
 pub(crate) fn link_to(_: &Path, _: &Path) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// Does nothing: on Windows the file system keeps a journal of names, and a program cannot flush a folder.
+/// Does nothing and returns `Ok`. On Windows, a program cannot flush a folder, and the file system itself protects the
+/// names of files against a power failure.
 pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
     Ok(())
 }

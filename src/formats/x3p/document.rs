@@ -146,8 +146,8 @@ impl Place<'_> {
     }
 }
 
-/// Returns the first child element with this name, in any namespace: programs use different ones. `None` if there is
-/// none.
+/// Returns the first child element of `node` with the name `name`. The namespace is ignored, because programs write
+/// different ones. Returns `None` if there is no such element.
 fn child<'a, 'd>(node: Node<'a, 'd>, name: &str) -> Option<Node<'a, 'd>> {
     node.children().find(|c| c.is_element() && c.tag_name().name() == name)
 }
@@ -157,8 +157,9 @@ fn text(node: Node<'_, '_>) -> String {
 }
 
 impl Main {
-    /// Parses `main.xml` from its `bytes`; `entry` is its name in the container. Returns its content, and the samples
-    /// or the names of the entries that contain them.
+    /// Parses `main.xml`, the document that describes the map in an X3P file. `bytes` is the document and `entry` its
+    /// name in the X3P container. Returns the content of the document, and the samples. If the samples are in other
+    /// entries of the container, returns the names of these entries instead.
     ///
     /// # Errors
     /// A document that is not valid, that describes a profile or several layers, or that has a rotated frame.
@@ -202,7 +203,7 @@ impl Main {
     }
 }
 
-/// Returns an error if the rotation matrix of the document is not the identity.
+/// Returns an error if the element `axes` contains a rotation matrix that is not the identity.
 fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatError> {
     let Some(rotation) = child(axes, "Rotation") else { return Ok(()) };
     for element in rotation.children().filter(Node::is_element) {
@@ -217,11 +218,12 @@ fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Returns true if the first row of the data is the northern one (largest y). The standard has no element for this, but
-/// some programs write one. Then a note is added to `notes`.
+/// Returns true if the first row of the data is the row with the largest y (`NW` in the element `Origin`), and adds a
+/// note on this to `notes`. Returns false if the element is `SW`, empty or missing. The standard does not have this
+/// element, but some programs write it.
 ///
 /// # Errors
-/// A value other than SW or NW.
+/// A value other than `SW` or `NW`.
 fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>) -> Result<bool, FormatError> {
     let Some(origin) = child(axes, "Origin") else { return Ok(false) };
     match text(origin).as_str() {
@@ -323,8 +325,9 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
     Ok(Samples::Inline(records))
 }
 
-/// Parses a sample in XML: a number for each absolute axis, separated by semicolons. Returns `None` for an empty text,
-/// which means that the sample was not measured.
+/// Parses the element `datum`, one sample in XML. Its text has one number for each absolute axis (an axis whose values
+/// are stored), separated by semicolons. Values of the other axes are 0. Returns `None` if the sample was not measured:
+/// its text is empty, or a number is not finite.
 fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Record, FormatError> {
     let text = text(datum);
     if text.is_empty() {

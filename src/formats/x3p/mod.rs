@@ -62,12 +62,13 @@ impl From<X3pFile> for MapPoints {
     }
 }
 
-/// Reads an X3P file of at most 1 GiB.
+/// Reads an X3P file (surface data of ISO 25178-72) of at most 1 GiB. Returns a height map if the samples are on a
+/// regular grid, otherwise a list of points in millimetres.
 ///
 /// # Errors
-/// A file that is not readable, not a zip container, damaged or encrypted; a file without `main.xml` or its data; a
-/// checksum that differs from the recorded one; an amount of data that differs from the stated size; a profile, several
-/// layers, or a rotated frame.
+/// The file cannot be read, or it is not a zip container, damaged or encrypted. `main.xml` or the measured data are
+/// missing. A checksum differs from the recorded one. The number of samples differs from the stated size. The file
+/// contains a profile, several layers, or a rotated frame.
 pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
@@ -79,10 +80,11 @@ pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
     parse_x3p(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
-/// Parses the bytes of an X3P file; `path` only names the file in messages.
+/// Parses `bytes`, the content of an X3P file. Returns a height map if the samples are on a regular grid, otherwise a
+/// list of points in millimetres. `path` is the name of the file in error messages; nothing is read from this path.
 ///
 /// # Errors
-/// The same as for [`read_x3p`].
+/// The errors of [`read_x3p`], except those of opening and reading the file.
 pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
     let mut container = Container::open(path, bytes)?;
     let xml = container.entry("main.xml", MAX_XML_BYTES)?;
@@ -115,11 +117,13 @@ fn is_zip(head: &[u8]) -> bool {
     head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06")
 }
 
-/// Reads `count` samples from the binary entry `data`, and from the entry `valid` the mask of the measured samples. A
-/// sample that was not measured, or is not finite, is `None`.
+/// Reads `count` samples from the binary entry `data` of the container. `valid` is the entry with the bit mask of the
+/// measured samples; without this entry, all samples count as measured. `axes` gives the number type of x, y and z.
+/// Returns one item per sample, in the order of the file. An item is `None` if its sample was not measured or has a
+/// value that is not finite.
 ///
 /// # Errors
-/// An entry that is missing, damaged, or of another length.
+/// An entry is missing or damaged, or has another length or another checksum.
 fn linked(
     container: &mut Container<'_>,
     axes: &[Axis; 3],
@@ -143,7 +147,9 @@ fn linked(
     Ok(bytes.chunks_exact(width).enumerate().map(|(k, at)| if is_valid(k) { record(at) } else { None }).collect())
 }
 
-/// Creates a map from samples on a regular grid, or else points from samples that have positions of their own.
+/// Converts the raw samples `records` to millimetres, with the axes and the size that `main` (the content of
+/// `main.xml`) states. Returns a height map if the samples form a matrix whose x and y follow from the column and the
+/// row. Otherwise returns points: each sample has its own position, and samples that were not measured are omitted.
 fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, FormatError> {
     let [x, y, z] = &main.axes;
     let mm = |axis: &Axis, raw: f64| 1e3 * (axis.offset_m + raw * axis.increment);
@@ -277,10 +283,11 @@ impl<'a> Container<'a> {
         Ok(bytes)
     }
 
-    /// Decompresses an entry that must have `length` bytes, and verifies its MD5 checksum, if one is recorded.
+    /// Decompresses an entry of the container, and verifies its MD5 checksum. `sealed` has the name of the entry and
+    /// the expected checksum; without a checksum, only the length is verified. The entry must have `length` bytes.
     ///
     /// # Errors
-    /// An entry that is missing or damaged, or that has another length or checksum.
+    /// The entry is missing or damaged, or has another length or another checksum.
     fn sealed(&mut self, sealed: &Sealed, length: u64) -> Result<Vec<u8>, FormatError> {
         let bytes = self.entry(&sealed.entry, length)?;
         if bytes.len() as u64 != length {
@@ -294,11 +301,11 @@ impl<'a> Container<'a> {
         }
     }
 
-    /// Compares the MD5 checksum of `main.xml`, whose bytes are `xml`, with the one in the entry `seal`. A missing
-    /// entry, or an entry without a checksum, is accepted.
+    /// Verifies the MD5 checksum of `main.xml`. `xml` is the content of `main.xml`. `seal` is the name of the entry
+    /// that contains the expected checksum. If this entry is missing or contains no checksum, nothing is verified.
     ///
     /// # Errors
-    /// Another checksum.
+    /// The checksums differ, or the entry `seal` is damaged or too long.
     fn check_sealed(&mut self, seal: &str, xml: &[u8]) -> Result<(), FormatError> {
         if self.find(seal).is_none() {
             return Ok(());

@@ -26,10 +26,13 @@ pub struct MapRecord {
     pub comment: String,
 }
 
-/// Writes the error map of a part as X3P. Its heights are the errors, in metres, over x and y of the model frame;
-/// positive where material is proud. `date` is the time for the header, as in `2026-03-01T12:00:00Z`.
+/// Writes the error map of a part to the file `path` in the X3P format. The heights in the file are the errors in
+/// metres, at x and y of the model frame. An error is positive where the part has too much material. `date` is the time
+/// in the header, such as `2026-03-01T12:00:00Z`. If `simulation` is true, the comment in the file begins with
+/// `SIMULATION.`.
 ///
-/// Nodes that were not measured are NaN and marked in the mask. The same map and date give the same bytes.
+/// Nodes that were not measured are NaN and marked in the mask. The same map, date and `simulation` give the same
+/// bytes.
 ///
 /// # Errors
 /// The same as for [`write_x3p`].
@@ -48,11 +51,12 @@ pub fn write_error_map_x3p(path: &Path, map: &ErrorMap, date: &str, simulation: 
     write_x3p(path, &heights, &record)
 }
 
-/// Writes a map as X3P, heights as 64-bit numbers in metres; samples that were not measured are NaN and marked in the
-/// mask.
+/// Writes a height map to the file `path` in the X3P format. `record` has the statements of the header: date, creator,
+/// instrument and comment. Heights are written in metres as 64-bit floating-point numbers. Samples that were not
+/// measured are NaN, and the mask of valid samples marks them.
 ///
 /// # Errors
-/// A file that cannot be written. An existing file of that name is then unchanged.
+/// The file cannot be written. An existing file at `path` then stays unchanged.
 pub fn write_x3p(path: &Path, map: &HeightMap, record: &MapRecord) -> Result<(), FormatError> {
     let failed = |source: zip::result::ZipError| FormatError::Unwritable {
         path: path.to_owned(),

@@ -28,7 +28,9 @@ fn main() {
     long(records);
 }
 
-/// Commits one record after the other, and beside them writes as much to a file and syncs it.
+/// Measures the time of `count` commits of one record each. For comparison, measures as many writes of 512 bytes to a
+/// plain file, each with a sync to the disk. Prints the median, the 99 % and 99.9 % quantiles, and the maximum of both
+/// series in ms.
 fn commits(count: u64) {
     let home = written::home();
     let folder = home.path().join("run");

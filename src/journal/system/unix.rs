@@ -20,9 +20,10 @@ pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)
 }
 
-/// Creates the folder of a run, which only its owner can read, because a reader can block the writing of the record. If
-/// the parent folder passes its group on to new files (`chmod g+s`), that group can read too. An existing folder keeps
-/// its mode.
+/// Creates the folder of a run and its missing parents. Only the owner can read the folder, because a process that
+/// reads the database can block the process that writes records. If the parent folder passes its group on to new files
+/// (`chmod g+s`), the users of that group can also read the folder. An existing folder is accepted, and its permissions
+/// stay unchanged.
 pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     fs::create_dir_all(above)?;
@@ -42,8 +43,8 @@ pub(crate) fn is_open_to_all(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|found| found.mode() & 0o005 != 0)
 }
 
-/// Returns the permission by which other users can replace files in a folder, and the remedy. Returns `None` if they
-/// cannot.
+/// Returns the reason why other users can replace files in a folder (the permissions of the folder), and the command
+/// that prevents this. Returns `None` if other users cannot replace files.
 pub(crate) fn changeable_by_others(folder: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(folder)?.mode() & 0o7777;
     let open = || OpenToOthers {
@@ -58,8 +59,8 @@ pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
-/// Returns the permission by which other users than the owner can read a file, and the remedy. Returns `None` if they
-/// cannot.
+/// Returns the reason why other users have access to a file (the permissions of the file), and the command that
+/// prevents this. Returns `None` if only the owner has access.
 pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(path)?.mode() & 0o777;
     let open = || OpenToOthers { how: format!("mode {mode:03o}, at most 600"), remedy: "`chmod 600` it".into() };
@@ -95,9 +96,9 @@ pub(crate) fn is_own_file(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
 }
 
-/// Returns the folder in which the lock folder named `folder` is or should be created, one of [`PLACES`]. Prefers one
-/// in which root has created the lock folder. Otherwise returns the first that every user can write, and where nobody
-/// can remove the files of others. Returns `None` if there is none.
+/// Selects the parent folder for `folder`, the name of the lock folder. Returns the first of [`PLACES`] in which root
+/// has already created the lock folder. If there is none, returns the first of [`PLACES`] in which every user can
+/// create files, and users cannot remove files of other users. Returns `None` if there is also no such place.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
     // A folder that root has created, as the package does, comes before any other.
     let by_root =
@@ -131,11 +132,11 @@ pub(crate) struct BadFolder {
 }
 
 impl LockFolder {
-    /// Opens the lock folder `name` in `place`, or creates it.
+    /// Opens the lock folder `name` in the parent folder `place`. Creates the lock folder if it does not exist.
     ///
     /// # Errors
-    /// A link or file in its place; a folder of another user, or one in which users can remove the files of others; a
-    /// folder that cannot be opened.
+    /// `name` is a link or a file. The folder belongs to a user who is neither this user nor root. Users can remove
+    /// files of other users in the folder. The folder cannot be created or opened.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let path = place.join(name);
         let bad = |what: String| {
@@ -181,19 +182,22 @@ impl LockFolder {
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
 
-    /// Opens the lock file `name`, or creates it so that every user of the folder can lock it.
+    /// Opens the lock file `name`. If the file does not exist, creates it with permissions that let every user of the
+    /// lock folder lock it.
     ///
     /// # Errors
-    /// The reason why something in its place cannot be used as a lock file.
+    /// The entry `name` cannot be used as a lock file, for example because it is a link. The error is the reason as a
+    /// text.
     pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         self.file(name, if self.is_for_all { 0o666 } else { 0o660 })
     }
 
-    /// Opens the lock file `name`, or creates it for this user only. No other user can open it, so no other user can
-    /// hold or damage it.
+    /// Opens the lock file `name` of this user. If the file does not exist, creates it so that no other user can open
+    /// it. Other users therefore cannot lock or damage the file.
     ///
     /// # Errors
-    /// The reason why something in its place cannot be used as a lock file.
+    /// The entry `name` cannot be used as a lock file, for example because it belongs to another user. The error is the
+    /// reason as a text.
     pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
         let file = self.file(name, 0o600)?;
         if file.owner != rustix::process::geteuid().as_raw() {
@@ -252,13 +256,14 @@ impl LockFolder {
         if made == Err(Errno::EXIST) { Ok(()) } else { made }
     }
 
-    /// Returns true if `name` still leads to the open `file`. A file that was removed in the meantime locks nothing.
+    /// Returns true if the entry `name` of the lock folder is still the open `file`. Returns false if the entry was
+    /// removed or replaced in the meantime. A lock on a removed file does not exclude other processes.
     pub(crate) fn is_still(&self, name: &str, file: &LockFile) -> bool {
         let found = rustix::fs::statat(&self.folder, name, AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| [found.st_dev, found.st_ino] == file.identity)
     }
 
-    /// Returns the mark of this user in the names of lock files: the number of the user.
+    /// Returns the part of a lock file name that identifies the user of this program: the user number (uid).
     pub(crate) fn own_mark() -> String {
         rustix::process::geteuid().as_raw().to_string()
     }
@@ -267,8 +272,8 @@ impl LockFolder {
 const AS_FOLDER: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
 const AS_FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::NONBLOCK).union(OFlags::CLOEXEC).union(OFlags::NOCTTY);
 
-/// Creates the folder `name` in `place`, in which each user can create files and remove only their own. If another
-/// process creates it first, that folder is accepted.
+/// Creates the folder `name` in the folder `place`. Every user can create files in the new folder, but can remove only
+/// their own files. If another process creates the folder first, that folder is accepted.
 fn make_folder(place: &OwnedFd, name: &str) -> Result<(), Errno> {
     let draft = format!(".{name}-{:016x}", rand::random::<u64>());
     rustix::fs::mkdirat(place, &draft, Mode::from_raw_mode(0o700))?;
@@ -303,8 +308,8 @@ pub(crate) struct LockFile {
 }
 
 impl LockFile {
-    /// Returns the number of the process that holds the lock, and its user, in words; `None` if the system does not
-    /// report them.
+    /// Returns the process that holds the lock and the user of this process, for messages: `process 123 of the user of
+    /// number 1000`. Returns `None` if the operating system does not report the holder.
     pub(crate) fn holder(&self) -> Option<String> {
         let locks = fs::read_to_string("/proc/locks").ok()?;
         let [device, inode] = self.identity;

@@ -32,7 +32,8 @@ pub(crate) fn is_open_to_all(_: &Path) -> bool {
     false
 }
 
-/// Returns `None`: on Windows the person who created the parent folder has chosen who can change its files.
+/// Returns `None`, which means that no risk is reported. On Windows the person who created the parent folder has chosen
+/// who can change the files of a folder.
 pub(crate) fn changeable_by_others(_: &Path) -> io::Result<Option<OpenToOthers>> {
     Ok(None)
 }
@@ -42,7 +43,8 @@ pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// Returns the users other than the owner who can read a file, and the remedy. Returns `None` if there are none.
+/// Returns the names of the users other than the owner who can read a file, and the command that removes their access.
+/// Returns `None` if only the owner can read the file.
 pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let others = regrind_windows::others_who_read(&File::open(path)?)?;
     let own_name = regrind_windows::own_name().unwrap_or_else(|_| "%USERNAME%".into());
@@ -67,7 +69,11 @@ pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
 /// Identity of a file. An open file cannot be deleted or renamed on Windows, so its existence is sufficient.
 pub(crate) type FileIdentity = ();
 
-/// Returns an error if there is no file at `path`.
+/// Checks that `path` exists. The returned identity is empty, because Windows does not let anybody remove or rename an
+/// open file.
+///
+/// # Errors
+/// Nothing exists at `path`, or its metadata cannot be read.
 pub(crate) fn identity(path: &Path) -> io::Result<FileIdentity> {
     std::fs::metadata(path).map(drop)
 }
@@ -83,8 +89,8 @@ pub(crate) fn place_of_locks(_: &str) -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }
 
-/// Returns false: on Windows no control socket is next to a lock file. A named pipe is used instead, which nobody can
-/// remove.
+/// Returns false. This function is used only to find control sockets next to lock files. On Windows there are no such
+/// sockets: a cell uses a named pipe instead, which nobody can remove.
 pub(crate) fn is_own_file(_: &Path) -> bool {
     false
 }
@@ -99,10 +105,10 @@ pub(crate) struct BadFolder {
 }
 
 impl LockFolder {
-    /// Opens the lock folder `name` in `place`, or creates it.
+    /// Opens the lock folder `name` in the parent folder `place`. Creates the lock folder if it does not exist.
     ///
     /// # Errors
-    /// A folder that cannot be created.
+    /// The folder does not exist and cannot be created.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let folder = place.join(name);
         let made = std::fs::create_dir_all(&folder);
@@ -116,10 +122,10 @@ impl LockFolder {
         }
     }
 
-    /// Opens the lock file `name`, or creates it so that every user can lock it.
+    /// Opens the lock file `name`. Creates the file if it does not exist. Every user can lock the file.
     ///
     /// # Errors
-    /// The text of the error of the system.
+    /// The file cannot be created or opened. The error is the message of the operating system.
     pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         let path = self.0.join(name);
         let words = |error: io::Error| error.to_string();
@@ -134,10 +140,10 @@ impl LockFolder {
         Ok(LockFile { lock, holder_file, is_spoiled: false })
     }
 
-    /// Opens the lock file `name` of this user, or creates it.
+    /// Opens the lock file `name` of this user. Creates the file if it does not exist.
     ///
     /// # Errors
-    /// The text of the error of the system.
+    /// The file cannot be created or opened. The error is the message of the operating system.
     pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
         self.shared(name)
     }
@@ -147,7 +153,8 @@ impl LockFolder {
         true
     }
 
-    /// Returns the mark of this user in the names of lock files.
+    /// Returns the part of a lock file name that identifies the user of this program: the letters and digits of the
+    /// user name. Returns an empty text if the user name is unknown.
     pub(crate) fn own_mark() -> String {
         regrind_windows::own_name().unwrap_or_default().chars().filter(char::is_ascii_alphanumeric).collect()
     }

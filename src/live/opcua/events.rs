@@ -68,9 +68,11 @@ pub(super) struct CellEvent {
     fields: Vec<(&'static str, Variant)>,
 }
 
-/// Returns the events that lead from the published status `before` to the status `now`. `on` is the last published
-/// status with an active run: an interrupted run that continues is compared with it, and repeats no event. `own` is the
-/// index of the cell's namespace, `cell` the name of the cell.
+/// Returns the events between two published states of a cell: new cycle results, new alarms, and the end of a run.
+/// `before` is the last published status, and `now` is the new one. `on` is the last published status with an active
+/// run. Results and alarms are compared with `on` if it is of the same run, so that a run that continues after an
+/// interruption repeats no event. `own` is the index of the cell's OPC UA namespace, and `cell` is the name of the
+/// cell.
 pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)

@@ -48,11 +48,12 @@ pub struct UaServer {
 }
 
 impl UaServer {
-    /// Creates an OPC UA server for the cell with the name `cell`. It publishes each status that arrives in `told`.
-    /// Does not listen yet.
+    /// Creates an OPC UA server for the cell with the name `cell`. The server publishes each status that arrives in
+    /// `told`. Connections and rejected writes are reported to `notes`. `turn` is the lock of the publisher; its folder
+    /// stores the certificates of the server. The server accepts clients only after [`UaServer::run`] is called.
     ///
     /// # Errors
-    /// The address is open to other computers.
+    /// The address in `settings` can be reached from other computers (it is not a loopback address).
     pub fn new(
         settings: &OpcUaSettings,
         cell: &str,
@@ -67,10 +68,10 @@ impl UaServer {
         Ok(Self { listen, cell: cell.to_owned(), pki_folder: turn.folder().join("opcua"), status: told, notes })
     }
 
-    /// Serves the status of the cell to OPC UA clients until the source of the status closes.
+    /// Serves the status of the cell to OPC UA clients. Returns `Ok` when the sender of the status channel is dropped.
     ///
     /// # Errors
-    /// The OPC UA server cannot be built, or ends with an error.
+    /// The OPC UA server cannot be built, or ends by itself with an error.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let Some(listener) = self.listener().await else { return Ok(()) };
         let address = listener.local_addr().unwrap_or(self.listen);
@@ -95,8 +96,8 @@ impl UaServer {
         Ok(())
     }
 
-    /// Opens the listener, and retries while the port cannot be bound. Returns `None` if the source of the cell's
-    /// status closes before that.
+    /// Opens the TCP port of the server. While the port cannot be opened, reports this and tries again every second.
+    /// Returns `None` if the sender of the status channel is dropped before the port is open.
     async fn listener(&mut self) -> Option<TcpListener> {
         loop {
             match TcpListener::bind(self.listen).await {
@@ -144,8 +145,9 @@ impl UaServer {
     }
 }
 
-/// Writes each new status from `told` to the nodes, and sends the events that it causes to the clients. Returns when
-/// the source of the status closes.
+/// Updates the OPC UA server with each new status that arrives in `told`. Writes the changed values to `shown`, the
+/// nodes of the cell, and sends new events to the clients via `handle`. The first status causes no event. Returns when
+/// the sender of `told` is dropped.
 async fn show(told: &mut watch::Receiver<CellStatus>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
     let mut before: Option<CellStatus> = None;

@@ -124,7 +124,8 @@ impl InMemoryNodeManagerImpl for CellNodes {
         self.metadata.clone()
     }
 
-    /// Refuses every write of a client, and reports the attempt.
+    /// Rejects every write of a client: sets the status `BadNotWritable` for each node of `nodes`, and reports the
+    /// client, the node and the value to the publisher's event channel. Always returns `Ok`.
     async fn write(
         &self,
         context: &RequestContext,
@@ -165,8 +166,9 @@ impl Tree<'_> {
         NodeId::new(self.namespaces.own, path)
     }
 
-    /// Adds the object types of PackML (OPC 30050). They have their identifiers and names only, without the members
-    /// that the specification defines.
+    /// Adds the object types of PackML (OPC 30050) and the event types of the cell to the address space. The PackML
+    /// types have only their identifiers and names, without the members that the specification defines. The event types
+    /// have all their fields.
     fn types(&mut self) {
         use packml::*;
         let machine: NodeId = ObjectTypeId::FiniteStateMachineType.into();
@@ -250,7 +252,9 @@ impl Tree<'_> {
             .insert(self.space);
     }
 
-    /// Adds the three state machines of PackML below the node `root`. Each is nested in a state of the one above it.
+    /// Adds the three state machines of PackML below the node `root`. They are nested: `BaseStateMachine` contains
+    /// `MachineState`, and `MachineState` contains `ExecuteState`. Each gets a node for its current state, without a
+    /// value.
     fn state_machines(&mut self, root: &NodeId) {
         let mut above = root.clone();
         for machine in MACHINES {
@@ -326,8 +330,8 @@ fn kind_of(figure: &Figure) -> DataTypeId {
     }
 }
 
-/// Returns a unit for OPC UA, by its code in UNECE Recommendation 20. The unit id consists of the bytes of this code.
-/// Unknown units have an empty code.
+/// Returns the OPC UA description of `unit`: `um`, `s` or `%`. The unit id is a number whose bytes are the characters
+/// of the unit's code in UNECE Recommendation 20. Any other unit gets the id 0 and no description.
 fn unit_of(unit: &str) -> EUInformation {
     let (code, name) = match unit {
         "um" => ("4H", "micrometre"),
@@ -345,8 +349,9 @@ fn unit_of(unit: &str) -> EUInformation {
 
 // ---- values -------------------------------------------------------------------------------------------------------------------------
 
-/// Writes to the nodes all values that differ between the published status `before` and the new status `now`. Without
-/// `before`, writes all values.
+/// Writes the values of the cell status `now` to `shown`, the OPC UA nodes of the cell. Writes only values that differ
+/// from those of `before`, the last published status. If `before` is `None`, writes all values. `subscriptions`
+/// notifies the clients of the changes.
 pub(super) fn set(
     shown: &InMemoryNodeManager<CellNodes>,
     subscriptions: &SubscriptionCache,
@@ -396,7 +401,8 @@ fn unknown(then: DateTime) -> DataValue {
     DataValue { status: Some(StatusCode::BadNoData), ..good(Variant::Empty, then) }
 }
 
-/// Returns the PackML state of the cell: Idle without a run, and `None` if the run does not answer.
+/// Returns the PackML state of the cell for the status `told`. Returns Idle if there is no run. Returns `None` if the
+/// program of the run does not answer or is gone, because the state is then unknown.
 fn state(told: &CellStatus) -> Option<StateName> {
     match &told.run_status {
         RunStatus::NoRun => Some(StateName::Idle),
@@ -417,9 +423,10 @@ const MACHINES: [Machine; 3] = [
     Machine { path: "BaseStateMachine/MachineState/ExecuteState", of_type: packml::EXECUTE_STATE_MACHINE_TYPE },
 ];
 
-/// Returns the values of the three nested PackML state machines: name, node id and number of the current state of each,
-/// by the path of the node. A state machine that is nested in another state than the current one has no value. `packml`
-/// is the index of the PackML namespace.
+/// Returns the values for the nodes of the three nested PackML state machines, as pairs of node path and value. For
+/// each machine these are the name, the node id and the number of its current state. `state` is the current state of
+/// the cell, `None` if it is unknown. A value is `None` if the machine is not active in `state`, or if the current
+/// state has no number. `packml` is the index of the PackML namespace.
 fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>)> {
     let own = state.map(|state| (state.to_string(), identifier(state), Some(state_number(state))));
     let cleared = Some(("Cleared".to_owned(), packml::CLEARED, Some(CLEARED_NUMBER)));

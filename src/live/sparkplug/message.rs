@@ -11,8 +11,9 @@ use crate::figures::{Figure, FigureKind, FigureValue};
 /// Values of the figures, in their order.
 pub(super) type Values = Vec<Option<FigureValue>>;
 
-/// Encodes a birth certificate (NBIRTH): the current values of all figures, with their types and units. Its sequence
-/// number is 0. `connection` is the number of the connection (bdSeq).
+/// Encodes a Sparkplug birth certificate (NBIRTH). The message contains every figure (a quantity that the cell
+/// publishes) with its current value, type and properties. `values` holds the values in the order of `figures`.
+/// `connection` is the number of the connection (bdSeq). The sequence number of the message is 0.
 pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
     let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
     let mut metrics = vec![number_of(connection), rebirth];
@@ -22,8 +23,9 @@ pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<
     encoded(metrics, Some(0))
 }
 
-/// Encodes a data message (NDATA) with the figures whose new `values` differ from the published values `told`. Returns
-/// `None` if no value differs.
+/// Encodes a Sparkplug data message (NDATA). The message contains only the figures (quantities that the cell publishes)
+/// whose new value in `values` differs from the last published value in `told`. Both lists have the order of `figures`.
+/// `sequence` is the sequence number of the message. Returns `None` if no value differs.
 pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequence: u8) -> Option<Vec<u8>> {
     let all = figures.iter().zip(values).zip(told);
     let changed: Vec<_> =
@@ -37,8 +39,9 @@ pub(super) fn death(connection: u8) -> Vec<u8> {
     encoded(vec![number_of(connection)], None)
 }
 
-/// Decodes a command of a host application. The flag is true if the command requests a rebirth. The list describes each
-/// other request in it.
+/// Decodes `payload`, a Sparkplug command from a host application. The returned flag is true if the command requests a
+/// rebirth (a new birth certificate). The returned list describes each other request in the command. If the payload is
+/// not a valid command or contains no request, the flag is false, and the list contains one sentence about this error.
 pub(super) fn read_requests(payload: &[u8]) -> (bool, Vec<String>) {
     let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
         return (false, vec!["a message that is not a Sparkplug B command".into()]);
@@ -98,8 +101,8 @@ fn plain(name: &str, kind: DataType) -> Metric {
     metric
 }
 
-/// Returns the properties of a figure for its Sparkplug metric: `readOnly`, `documentation` and, if it has a unit,
-/// `engUnit`.
+/// Returns the Sparkplug properties that a birth certificate contains for `figure` (a quantity that the cell
+/// publishes): `readOnly`, `documentation` and, if the figure has a unit, `engUnit`.
 fn properties(figure: &Figure) -> PropertySet {
     let text = |text: &str| {
         let value = Some(property_value::Value::StringValue(text.to_owned()));

@@ -80,12 +80,14 @@ enum SessionEnd {
 }
 
 impl Node {
-    /// Creates a Sparkplug node for the cell with the name `cell`. It publishes each status that arrives in `told`.
-    /// Does not connect yet.
+    /// Creates a Sparkplug node that publishes the state of the cell named `cell`. The node does not connect before
+    /// [`Self::run`]. `turn` is the lock that only one publisher of the cell can have. The node publishes each status
+    /// that it receives from `told`. It reports events, such as a lost connection, to `notes`.
     ///
     /// # Errors
-    /// A name is not valid in a topic, a password or a certificate cannot be read, or the broker is on another computer
-    /// and no certificates are given.
+    /// The name of the group or of the cell is not valid in a topic. A password or a certificate cannot be read. The
+    /// broker is on another computer and no certificates are given. The file with the number of the connection (bdSeq)
+    /// cannot be opened.
     pub fn new(
         settings: &SparkplugSettings,
         cell: &str,
@@ -106,8 +108,8 @@ impl Node {
         })
     }
 
-    /// Publishes the status of the cell until the source of the status closes. Connects again whenever the connection
-    /// to the broker is lost.
+    /// Publishes the status of the cell until the source of the status closes, and then returns `Ok`. If the connection
+    /// to the broker is lost, connects again after a delay.
     ///
     /// # Errors
     /// The number of the connection (bdSeq) cannot be written to its file.
@@ -135,8 +137,8 @@ impl Node {
         }
     }
 
-    /// Connects to the broker, and publishes until the connection is lost or the source of the status closes.
-    /// `connection` is the number of the connection (bdSeq). Returns why it ended.
+    /// Connects to the broker and publishes the status of the cell. Ends when the connection is lost or when the source
+    /// of the status closes. Returns which of these two happened. `connection` is the number of the connection (bdSeq).
     async fn session(&mut self, connection: u8) -> SessionEnd {
         let options = self.broker.with_last_will(&self.topics.death, message::death(connection));
         let (client, mut broker) = AsyncClient::new(options, WAITING);
@@ -200,10 +202,13 @@ struct Session<'a> {
 }
 
 impl Session<'_> {
-    /// Handles an event of the MQTT connection; `None` means that the connection is closed.
+    /// Handles `event`, an event of the MQTT connection. `None` means that the connection is closed. After the broker
+    /// has accepted the connection, subscribes to the commands of host applications. After the broker has answered the
+    /// subscription, publishes the birth certificate (NBIRTH). Executes or refuses a received command. Ignores every
+    /// other event.
     ///
     /// # Errors
-    /// The connection is lost.
+    /// The connection is closed or has an error, or the subscription cannot be sent.
     fn handle_event(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), SessionEnd> {
         self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
         let stood = self.stood;
@@ -237,7 +242,8 @@ impl Session<'_> {
         }
     }
 
-    /// Publishes a birth certificate (NBIRTH), which contains all values.
+    /// Publishes a birth certificate (NBIRTH) with the current values of all figures (the quantities that the cell
+    /// publishes). If the queue of the MQTT client is full, postpones the certificate by one second.
     fn birth(&mut self) {
         let values = current(&mut self.node.status);
         let birth = message::birth(FIGURES, &values, self.connection);
@@ -249,7 +255,9 @@ impl Session<'_> {
         (self.values, self.sequence, self.due, self.began) = (Some(values), 0, None, Instant::now());
     }
 
-    /// Publishes the values that differ from the last published ones.
+    /// Publishes a data message (NDATA) with the values that differ from the last published values. Publishes nothing
+    /// if no value differs, or if no birth certificate has been published yet. If the queue of the MQTT client is full,
+    /// the next attempt follows after one second. Never returns an error.
     fn publish_changes(&mut self) -> Result<(), SessionEnd> {
         let Some(told) = &self.values else { return Ok(()) };
         let values = current(&mut self.node.status);
@@ -263,7 +271,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Publishes what was postponed: the birth certificate if it is due, otherwise the changed values.
+    /// Publishes a postponed message. Publishes the birth certificate (NBIRTH) if it is due. Otherwise publishes the
+    /// values that differ from the last published values. Never returns an error.
     fn catch_up(&mut self) -> Result<(), SessionEnd> {
         self.due = None;
         match self.values {
@@ -273,8 +282,9 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Handles a command of a host application. Publishes a new birth certificate if the command requests a rebirth,
-    /// but not too often. Refuses and reports every other request.
+    /// Handles `publish`, a command of a host application. If the command requests a rebirth, publishes a new birth
+    /// certificate (NBIRTH), but at the earliest `BETWEEN_BIRTHS` after the last one. Refuses and reports every other
+    /// request. Also refuses and reports a command to a device, because the node has no devices.
     fn handle_command(&mut self, publish: &Publish) {
         let by = format!("somebody at the broker {}", self.node.broker.place);
         let (wants_birth, others) = message::read_requests(&publish.payload);
@@ -293,8 +303,9 @@ impl Session<'_> {
         }
     }
 
-    /// Publishes the death certificate (NDEATH) and disconnects. If this takes too long, the broker publishes the
-    /// certificate.
+    /// Publishes the death certificate (NDEATH), waits until the broker confirms it, and disconnects. `events` are the
+    /// events of the MQTT connection. Gives up after the timeout `FAREWELL`. The broker then publishes the certificate,
+    /// when it notices that the connection is lost. Always returns [`SessionEnd::Ended`].
     async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> SessionEnd {
         let said = async {
             let death = message::death(self.connection);

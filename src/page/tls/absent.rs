@@ -12,7 +12,7 @@ use super::TlsError;
 pub enum Tls {}
 
 impl Tls {
-    /// Rejects every certificate.
+    /// Rejects every certificate, because this program was built without TLS.
     ///
     /// # Errors
     /// Always [`TlsError::NotBuilt`].

@@ -78,7 +78,8 @@ impl DisplayState {
     }
 }
 
-/// Reads the reported states of all cells. Cells that need attention come first.
+/// Reads the last reported state of each cell from the plant, for at most `MAX_CELLS` cells. Cells with an alarm come
+/// first, then cells that have not reported for a time, then the others.
 pub(super) async fn read(link: &DatabaseLink) -> Result<Vec<CellSummary>, PlantError> {
     let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
             coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
@@ -135,7 +136,8 @@ impl CellSummary {
     }
 }
 
-/// Returns a text with the number of cells in each state. States without a cell are omitted.
+/// Returns a text with the number of cells in each state. States without a cell are omitted. If there is no cell, the
+/// text says how to enrol one.
 pub(super) fn tally(cells: &[CellSummary]) -> String {
     let of = |look: DisplayState| (cells.iter().filter(|cell| cell.display_state() == look).count(), look);
     let told = DisplayState::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);

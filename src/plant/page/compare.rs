@@ -73,8 +73,10 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
     Ok(PageContent { title: "Cells".into(), again_s: None, main })
 }
 
-/// Reads the newest parts of each cell that match the selection, in the order of the cell names. Skips the first
-/// `after` cells. Returns up to one cell more than a page shows, so that the caller knows whether there is a next page.
+/// Reads the newest ended runs that match `selection`, at most `PARTS` runs for each cell. The cells are sorted by
+/// name. The first `after` cells are skipped. Retired cells are not included. Returns at most `CELLS` + 1 cells. A page
+/// shows only `CELLS` cells; if there is one more, the caller knows that a next page exists. The PV values of each cell
+/// are sorted in ascending order.
 async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
     let (condition, values) = selection.condition();
     let n = values.len();
@@ -110,9 +112,10 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
     Ok(cells)
 }
 
-/// Returns the p-value of each cell: the probability of a difference at least this large from all other cells, if all
-/// cells are equal. The p-values are of the [`rank_sum`] test, with the correction [`holm`] for the number of cells.
-/// `None` for a cell with too few parts.
+/// Returns a p-value for each cell, in the order of `cells`. The p-value compares the PV values of the cell with those
+/// of all other cells. It is the probability of a difference at least as large as the observed one, if all cells are
+/// equal. The p-values come from the [`rank_sum`] test and are corrected by [`holm`] for the number of cells. The value
+/// is `None` for a cell with too few parts.
 fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     let others = |k: usize| -> Vec<f64> {
         cells
@@ -172,7 +175,9 @@ fn probability(p: f64) -> String {
     if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
 }
 
-/// Draws the box plot of sorted values in µm. The axis goes from `from` to `to` and is the same for all cells.
+/// Draws a box plot of `sorted` as SVG. `sorted` contains values in micrometres, in ascending order. The box extends
+/// from the first to the third quartile, and the whiskers extend from the minimum to the maximum. The axis goes from
+/// `from` to `to` in micrometres; it is the same for all cells. Returns empty HTML if there are no values.
 fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
     let [Some(least), Some(low), Some(median), Some(high), Some(largest)] =
         [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| quantile(sorted, share))

@@ -46,8 +46,9 @@ pub(super) struct Limits {
 }
 
 impl Limits {
-    /// Computes the control limits of individual values and of their moving ranges. Returns `None` for fewer than two
-    /// values.
+    /// Computes the control limits from `values` in the order of measurement. The result contains the mean, the mean
+    /// moving range, and the control limits of both. A moving range is the absolute difference of two consecutive
+    /// values. All results have the unit of `values`. Returns `None` if there are fewer than two values.
     pub(super) fn from_values(values: &[f64]) -> Option<Self> {
         let ranges = ranges(values);
         if ranges.is_empty() {
@@ -82,8 +83,11 @@ struct Across {
     at: f64,
 }
 
-/// Draws the control chart of individual values in µm: the values, their mean and control limits, and the tolerance of
-/// each part. `name` is that of the figure, and `class` the CSS class of the chart.
+/// Draws the control chart of individual values in µm as SVG. `values` are the parts in the order of measurement; each
+/// is one point of the chart. The chart also shows the mean and the control limits from `limits`, and the tolerance of
+/// each part. Does not draw the tolerances if the largest tolerance is at least four times the largest of all values
+/// and control limits. `name` is the name of the figure, such as PV. `class` is the CSS class of the points and of the
+/// line between them.
 pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let mut lines = vec![
@@ -103,8 +107,10 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
     drawn(&format!("{name}, µm"), class, values, &all, &lines, &scale, |value| limits.is_out(value), &steps)
 }
 
-/// Draws the control chart of the moving ranges in µm, with their mean and upper limit. `name` is that of the figure,
-/// and `class` the CSS class of the chart.
+/// Draws the control chart of the moving ranges in µm as SVG. A moving range is the absolute difference of two
+/// consecutive `values`. The chart also shows the mean range and the upper control limit from `limits`. `values` are
+/// the parts in the order of measurement, and must not be empty. `name` is the name of the figure, such as PV. `class`
+/// is the CSS class of the points and of the line between them.
 pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let all = ranges(&all);
@@ -118,8 +124,9 @@ pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &
     drawn(&format!("Moving range of {name}, µm"), class, &values[1..], &all, &lines, &scale, is_out, &[])
 }
 
-/// Returns the tolerance of each part as stepped lines, each in the notation of SVG points. A part without a tolerance
-/// interrupts the line.
+/// Returns the tolerances of the parts as stepped lines, in pixels of the drawing. Each text is one line, in the format
+/// of the `points` attribute of an SVG polyline. A part without a tolerance ends the line, and the next part with a
+/// tolerance begins a new line.
 fn tolerance_line(values: &[Value], scale: &Scale) -> Vec<String> {
     let half = 0.5 * (scale.x(1) - scale.x(0));
     let mut parts: Vec<String> = vec![String::new()];
@@ -195,8 +202,8 @@ fn tooltip(value: &Value, um: f64, is_out: bool) -> Markup {
     html! { title { (shown(&value.serial)) ", " (shown(&value.cell)) ", " (value.when) ": " (format!("{um:.3}")) " µm" (out) } }
 }
 
-/// Moves labels upwards until they do not overlap. `at` are their y coordinates in the drawing, from the top. The
-/// lowest label keeps its position.
+/// Moves labels upwards until they do not overlap. `at` contains the y coordinate of each label in pixels, measured
+/// downwards from the top. Returns the new coordinates in the same order. The lowest label keeps its position.
 fn apart(mut at: Vec<f64>) -> Vec<f64> {
     let mut order: Vec<usize> = (0..at.len()).collect();
     order.sort_by(|a, b| at[*b].total_cmp(&at[*a]));

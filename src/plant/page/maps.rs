@@ -54,7 +54,9 @@ pub(super) async fn maps(
     page(&session, made(&plant, &asked)).await
 }
 
-/// Parses a query such as `run=17&run=18:2`: ids of runs, each with an optional cycle after a colon.
+/// Parses the query of an address, such as `run=17&run=18:2`, into a list of requested maps. Each `run` is the id of a
+/// run, optionally with the number of a cycle after a colon. Ignores other parameters and invalid values. Returns at
+/// most four requests.
 fn parse_requests(query: &str) -> Vec<MapRequest> {
     let named = query.split('&').filter_map(|pair| pair.strip_prefix("run="));
     let one = |text: &str| {
@@ -108,8 +110,10 @@ async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<
     })
 }
 
-/// Returns the entry for a run without an error map, so that the page can show it next to runs with a map. Returns an
-/// error if the plant does not have the run.
+/// Returns the entry of the page for the run `asked.run`, which has no error map for the requested cycle. Instead of
+/// samples, the entry contains a text that says this. The page can then show the run next to runs with a map.
+///
+/// Returns an error if the plant has no such run that made a part, or if the plant cannot be reached.
 async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;
@@ -129,8 +133,11 @@ async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageErro
     })
 }
 
-/// Reads the error map `name` from the files of a run, as `[x, y, error]` with x and y in mm and the error in µm. The
-/// inner `Err` is a text for people about why the map is missing; the outer one means that the plant did not answer.
+/// Reads the error map in the file `name` of the run with the id `run`. Each sample is `[x, y, error]`, with x and y in
+/// mm and the error in µm.
+///
+/// The inner `Err` is a text for people that says why the map cannot be shown, for example because its file has not
+/// arrived at the plant. The outer `Err` means that the plant could not answer the query.
 async fn samples(
     plant: &Shared,
     link: &DatabaseLink,
@@ -155,8 +162,8 @@ async fn samples(
     Ok(parsed.await.unwrap_or_else(|_| Err("it could not be read".into())))
 }
 
-/// Draws error maps next to each other with one colour scale. The scale goes from minus to plus the largest absolute
-/// value of all maps.
+/// Draws error maps next to each other with one common colour scale. The scale is symmetric about zero, and its limit
+/// is the largest absolute error of all maps in µm. A map without samples is replaced by the reason.
 fn side_by_side(maps: &[Map]) -> Markup {
     let all = maps.iter().filter_map(|map| map.samples.as_ref().ok()).flatten();
     let limit = all.fold(0.0_f64, |most, sample| most.max(sample[2].abs()));

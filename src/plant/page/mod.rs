@@ -59,12 +59,15 @@ pub struct PlantPage {
 type Shared = Arc<PlantPage>;
 
 impl PlantPage {
-    /// Creates the page for the plant in this database. The database does not have to be reachable yet.
+    /// Creates the state of the plant's web page. `database` contains the settings for the connection to the plant's
+    /// database. `artefacts` names the folder for files that are too large for the database; it is `None` if there is
+    /// no such folder. Does not connect yet, so the database need not be reachable.
     pub fn new(database: DatabaseSettings, artefacts: Option<ArtefactSettings>) -> Self {
         Self { pool: Pool::new(database), proofs: Proofs::default(), artefacts }
     }
 
-    /// Returns the routes for a person who has signed in.
+    /// Returns the router with all addresses of the plant's web page. The caller must let only people who have signed
+    /// in reach these addresses, and must attach their [`Session`] to each request as an extension.
     pub fn routes(self) -> Router {
         Router::new()
             .route("/", get(home::home))
@@ -83,7 +86,8 @@ impl PlantPage {
             .with_state(Arc::new(self))
     }
 
-    /// Takes a database connection for a few queries. It returns to the pool when the lease is dropped.
+    /// Takes a database connection from the pool for a few queries. The connection returns to the pool when the lease
+    /// is dropped. Returns an error if no connection becomes free in time or if the database cannot be reached.
     async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         self.pool.lease().await
     }
@@ -117,7 +121,8 @@ impl From<PlantError> for PageError {
     }
 }
 
-/// Returns the page whose content `making` computes. If it fails or takes too long, returns a page with the reason.
+/// Returns the HTML page whose content the future `making` computes. If `making` fails, or takes longer than the time
+/// limit (15 s), returns a page with the reason. `session` is the session of the person who has signed in.
 async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
     match within(making).await {
         Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
@@ -125,7 +130,8 @@ async fn page(session: &Session, making: impl Future<Output = Result<PageContent
     }
 }
 
-/// Returns the result of `making`, or an error if it is not there within the time limit of the page.
+/// Waits for the future `making` and returns its result. Returns an error if `making` does not finish within the time
+/// limit of a page (15 s).
 async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result<T, PageError> {
     let late = || {
         let what = format!("no answer within {} s", PATIENCE.as_secs());
@@ -134,8 +140,9 @@ async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
-/// Returns a page with the reason why the requested page cannot be shown. If the plant cannot be reached, the browser
-/// requests the page again after a while.
+/// Returns an error page with the reason `why` the requested page cannot be shown. The status of the response depends
+/// on the reason. If the plant cannot be reached, the browser requests the page again every 5 s. `session` is the
+/// session of the person who has signed in.
 fn unmade(session: &Session, why: &PageError) -> Response {
     let (status, again_s, title, words) = match why {
         PageError::Plant(error) if error.may_pass() => (

@@ -61,9 +61,15 @@ async fn made(plant: &Shared, asked: &PartsQuery) -> Result<PageContent, PageErr
 
 const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";
 
-/// Reads runs of parts whose serial number begins with `serial`. Begins after the run with the id `after`. Returns up
-/// to one row more than a page shows, so that the caller knows whether there is a next page. The rows come in the order
-/// of an index, so that the database need not sort them.
+/// Reads the runs of parts whose serial number begins with `serial`. An empty `serial` selects all parts. Returns the
+/// rows in the order of the list:
+///
+/// - with an empty `serial`, the newest run first;
+/// - otherwise by serial number, and the newest run of each part first.
+///
+/// If `after` is given, begins with the run that follows the run with this id. Returns at most one row more than a page
+/// shows. The caller thus knows whether there is a next page. A database index has the same order, so that the database
+/// need not sort the rows.
 async fn read(link: &DatabaseLink, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
     let most = MAX_ROWS as i64 + 1;
     let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);

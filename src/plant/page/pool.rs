@@ -37,8 +37,10 @@ impl Pool {
         Self { database, places: Semaphore::new(LINKS), idle: Mutex::default() }
     }
 
-    /// Takes a working connection from the pool, or opens a new one if the pool is empty. Returns an error if all
-    /// connections stay in use for too long.
+    /// Takes a connection that still answers from the pool. If there is none, opens a new connection.
+    ///
+    /// Returns an error if all connections are in use and none becomes free within 5 s, or if a new connection cannot
+    /// be opened.
     pub(super) async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         let busy = || PlantError::Unreachable {
             place: "the other end".into(),
@@ -60,7 +62,10 @@ impl Pool {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop()
     }
 
-    /// Opens a new connection and checks that the layout of the database is the one this program knows.
+    /// Opens a new read-only connection to the database and limits the time of its queries.
+    ///
+    /// Returns an error if the database cannot be reached, or if its layout (its tables and functions) is not the one
+    /// that this program uses.
     pub(super) async fn open(&self) -> Result<DatabaseLink, PlantError> {
         let link = DatabaseLink::open(&self.database).await?;
         check_layout(link.client()).await?;

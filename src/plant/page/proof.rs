@@ -54,8 +54,9 @@ impl Default for Proofs {
 }
 
 impl Proofs {
-    /// Returns the stored result of a recent verification of the run `id`; `None` if there is none. `head` is the hash
-    /// of the last record: a result for another hash does not count.
+    /// Returns the stored result of a verification of the run `id`. `head` is the hash of the last record that the
+    /// plant has of this run. Returns `None` if there is no result from the last 60 s, or if the stored result is for
+    /// another `head`.
     pub(super) fn known(&self, id: i32, head: &str) -> Option<Arc<Proof>> {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.retain(|_, (since, ..)| since.elapsed() < LASTS);
@@ -72,11 +73,13 @@ impl Proofs {
     }
 }
 
-/// Verifies the plant's copy of a run, or returns a recent result from the cache. `id` is the id of the run, `head` the
-/// hash of its last record.
+/// Verifies the plant's copy of a run, or returns a result from the cache that is less than 60 s old. `id` is the id of
+/// the run in the plant, `cell` the name of its cell, and `name` the name of the run. `head` is the hash of the last
+/// record that the plant has of this run.
 ///
 /// # Errors
-/// The plant cannot be reached, or has no such run. Faults of the copy are in the proof, not an error.
+/// Fails if the plant cannot be reached or has no such run. A copy that does not pass the verification is not an error:
+/// the returned [`Proof`] then contains the reason.
 pub(super) async fn proven(
     plant: &PlantPage,
     id: i32,
@@ -136,8 +139,8 @@ impl Proof {
     }
 }
 
-/// Replaces the path of the temporary folder in a message by "the copy", because a reader of the page cannot open this
-/// folder.
+/// Returns the message `words`, with the path `folder` replaced by "the copy". `folder` is a temporary folder of the
+/// server, which a reader of the page cannot open.
 fn without(folder: &Path, words: &str) -> String {
     words.replace(&folder.display().to_string(), "the copy")
 }
@@ -146,7 +149,8 @@ fn now() -> String {
     Timestamp::now().strftime("%Y-%m-%d %H:%M:%S").to_string()
 }
 
-/// Returns a random name for a folder. Nobody can guess it, so no other program can have created this folder.
+/// Returns a random name for a temporary folder: 32 hexadecimal digits. Nobody can guess the name, so no other program
+/// can have created this folder before. Returns an error if the operating system supplies no random bytes.
 fn random_word() -> Result<String, PlantError> {
     let mut bytes = [0; 16];
     let failed = |error: getrandom::Error| FormatError::Unwritable {

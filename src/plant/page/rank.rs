@@ -38,8 +38,8 @@ pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     Some(erfc(z / std::f64::consts::SQRT_2).min(1.0))
 }
 
-/// Corrects p-values for the number of tests by the Holm-Bonferroni method. The order stays; a missing p-value stays
-/// `None` and does not count as a test.
+/// Corrects the p-values `found` for the number of tests by the Holm-Bonferroni method. Returns the corrected p-values
+/// (at most 1) in the same order. A `None` in `found` stays `None` and does not count as a test.
 pub(super) fn holm(found: &[Option<f64>]) -> Vec<Option<f64>> {
     let mut order: Vec<usize> = (0..found.len()).filter(|k| found[*k].is_some()).collect();
     order.sort_by(|a, b| found[*a].partial_cmp(&found[*b]).unwrap_or(std::cmp::Ordering::Equal));

@@ -56,7 +56,8 @@ impl Run {
     }
 }
 
-/// Parses the id of a run in an address.
+/// Parses the id of a run from the text `id` in an address. Returns an error for the reader of the page if `id` is not
+/// an integer.
 fn number(id: &str) -> Result<i32, PageError> {
     id.parse().map_err(|_| PageError::NotHere("give the number of a run, as in /runs/17".into()))
 }
@@ -151,7 +152,8 @@ fn about(run: &Run) -> Markup {
     }
 }
 
-/// Describes the result of a verification in words. `None` means that the verification has not ended yet.
+/// Describes the result of the verification of a run in words, as HTML. The verification checks the plant's copy of the
+/// run. If `proof` is `None`, says that the verification has not ended yet.
 fn proof_text(proof: Option<&Proof>) -> Markup {
     let Some(proof) = proof else {
         return html! { p role="status" { "The copy is being fetched and verified; this page then shows the result by itself." } };
@@ -225,8 +227,10 @@ async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }
 
-/// Returns the run whose id is `id`, with the result of the verification of the plant's copy. Waits for the
-/// verification if there is no recent result.
+/// Returns the run with this `id`, and the result of the verification of the plant's copy of the run. Waits for the
+/// verification if there is no recent result in the cache.
+///
+/// Returns an error if `id` is not an integer, if the plant has no such run, or if the plant cannot be reached.
 async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), PageError> {
     let run = {
         let link = plant.lease().await?;
@@ -298,7 +302,8 @@ pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response 
         .into_response()
 }
 
-/// Returns a page with status 422 and the reason `why` a document cannot be created from the plant's copy.
+/// Returns an error page with HTTP status 422 for a document that cannot be created from the plant's copy of a run.
+/// `why` is the reason that the page shows. `session` is the session of the person who has signed in.
 fn not_made(session: &Session, why: &str) -> Response {
     let mut response = unmade(session, &PageError::NotHere(why.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;

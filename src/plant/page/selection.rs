@@ -57,8 +57,15 @@ pub(super) struct Selection {
 }
 
 impl Selection {
-    /// Builds the selection of parts from the query of an address. Defaults: real parts if there are any, the recipe of
-    /// the newest part, and the last [`DAYS`] days.
+    /// Builds the selection of parts from `asked`, the query of an address. A filter that `asked` does not contain gets
+    /// its default:
+    ///
+    /// - real parts if the plant has any, otherwise simulated parts;
+    /// - the recipe of the newest of these parts;
+    /// - today (UTC) as the last day;
+    /// - [`DAYS`] days before the last day as the first day.
+    ///
+    /// Returns an error if a date is invalid or if the plant cannot be reached.
     pub(super) async fn from_query(link: &DatabaseLink, asked: &SelectionQuery) -> Result<Self, PageError> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
@@ -74,7 +81,8 @@ impl Selection {
         Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
     }
 
-    /// Returns the SQL condition of the selection, and the values of its parameters, which begin with `$1`.
+    /// Returns the selection as an SQL condition, and the values of the parameters in this condition. The parameters
+    /// are `$1`, `$2` and so on, in the order of the values.
     pub(super) fn condition(&self) -> (String, Vec<String>) {
         let end = self.until.checked_add(1.day()).unwrap_or(Date::MAX);
         let mut values = vec![format!("{} 00:00Z", self.since), format!("{end} 00:00Z")];
@@ -92,8 +100,9 @@ impl Selection {
         &self.names[0]
     }
 
-    /// Returns the query part of an address for this selection. It states all filters and both dates. So the same parts
-    /// are selected later, when the defaults have changed.
+    /// Returns the selection as the query part of an address. The query contains all filters that are set, both dates,
+    /// and the choice of real or simulated parts, also if they are defaults. So the address keeps its meaning when the
+    /// defaults change later.
     pub(super) fn query(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|((kind, _), name)| *kind == "recipe" || !name.is_empty());
         let mut query: Vec<String> = named.map(|((kind, _), name)| format!("{kind}={}", encoded(name))).collect();
@@ -103,7 +112,7 @@ impl Selection {
         query.join("&")
     }
 
-    /// Describes the selection in a sentence.
+    /// Describes the selection in a short text for people, such as "recipe mirror, begun 2026-07-01 to 2026-07-04".
     pub(super) fn words(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty());
         let named: Vec<String> =
@@ -112,8 +121,9 @@ impl Selection {
         format!("{named}, begun {} to {}", self.since, self.until)
     }
 
-    /// Renders the form in which a person changes the selection. `action` is the address of the page, and `kinds` are
-    /// the filters that it shows.
+    /// Renders the HTML form in which a person changes the selection. `action` is the address to which the form is
+    /// sent. `kinds` are the keys of the filters that the form offers, such as `recipe` or `cell`. The form always
+    /// offers the dates, and the choice of real or simulated parts. Returns an error if the plant cannot be reached.
     pub(super) async fn form(&self, link: &DatabaseLink, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
         let rows = link.query("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();

@@ -54,7 +54,8 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
     Ok(PageContent { title: "Trend".into(), again_s: None, main })
 }
 
-/// Reads the newest parts of a selection, at most `most`, and returns them from the oldest to the newest.
+/// Reads the `most` newest parts of a selection, by the start of their run. Returns the parts from the oldest to the
+/// newest. Omits a part without a finite PV.
 pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
     // The two views have different names for the id of the run.

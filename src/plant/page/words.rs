@@ -4,8 +4,8 @@ use std::fmt::Write;
 
 use regrind_document::visible;
 
-/// Returns a text from a cell or a person for display. Characters that reorder or hide letters are replaced by their
-/// code numbers. The template engine Maud escapes HTML.
+/// Replaces each invisible or misleading character in a text from a cell or a person by its code, such as `<U+202E>`.
+/// Such characters can hide or reorder other letters. Does not escape HTML, because the template engine Maud does this.
 pub(super) fn shown(text: &str) -> String {
     visible(text)
 }
@@ -31,7 +31,8 @@ pub(super) fn ago(seconds: f64) -> String {
     }
 }
 
-/// Formats the range from `least` to `most` seconds, in s, min or h. Gives one number if both are equal after rounding.
+/// Formats the range from `least` to `most`, both in seconds. Both numbers get the same unit (s, min or h), which
+/// depends on `most`. Returns only one number if both are equal after rounding.
 pub(super) fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -43,7 +44,7 @@ pub(super) fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-/// Formats a figure in µm; a dash if there is none.
+/// Formats a number in µm with `digits` decimals, without the unit. Returns a dash if `value` is `None` or not finite.
 pub(super) fn um(value: Option<f64>, digits: usize) -> String {
     value.filter(|value| value.is_finite()).map_or("–".to_owned(), |value| format!("{value:.digits$}"))
 }

@@ -55,9 +55,9 @@ impl Extent {
     }
 }
 
-/// Returns the change of the deviation at a point per unit of a motion of the part. `motion` is 0 to 2 for a shift
-/// along x, y, z (per millimetre), and 3 to 5 for a rotation about x, y, z through the origin of the model frame (per
-/// radian, in millimetres).
+/// Returns the change of the deviation at the point `contact` per unit of a motion of the part. `motion` selects the
+/// motion. 0 to 2 are shifts along x, y, z; the result is in mm per mm. 3 to 5 are rotations about x, y, z through the
+/// origin of the model frame; the result is in mm per radian.
 pub(super) fn motion_effect(contact: &SurfacePoint, motion: usize) -> f64 {
     match motion {
         0..3 => contact.normal[motion],
@@ -70,9 +70,12 @@ pub(super) fn motions(contacts: &[SurfacePoint], free: [bool; 6]) -> Vec<Column<
     (0..6).filter(|&k| free[k]).map(of).collect()
 }
 
-/// Returns the effects of bent guideways (slides) of the machine on the deviations, one column for each kind of bend:
-/// the height of a guideway follows the second or the third Legendre polynomial, along x or along y. `extent` is the
-/// extent of the part.
+/// Returns the effects of bent guideways (slides) of the machine on the deviations at the points `contacts`. There are
+/// four columns: a simple and an S-shaped bend, each along x and along y. Each column has one value for each point: the
+/// change of the deviation per unit of height of the bend.
+///
+/// The height of the guideway follows the second (simple) or third (S-shaped) Legendre polynomial of the position.
+/// `extent` is the extent of the part; its borders are the positions -1 and 1.
 pub(super) fn slides(contacts: &[SurfacePoint], extent: &Extent) -> Vec<Column<&'static str>> {
     let of =
         |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| slide_effect(c, extent, k)).collect() };
@@ -85,9 +88,10 @@ pub(super) fn slide_effect(contact: &SurfacePoint, extent: &Extent, k: usize) ->
 }
 
 impl ParameterKind {
-    /// Returns the change of the deviation at a point per unit of this parameter (millimetre or radian). `term` selects
-    /// the effect of the wheel radius. Returns 0 for wear, because wear depends on the progress along the path and not
-    /// on the place.
+    /// Returns the change of the deviation at the point `contact`, in millimetres, per unit of this parameter
+    /// (millimetre or radian). `term` selects the formula for the effect of the wheel radius.
+    ///
+    /// For wear, returns 0, because the effect of wear depends on the progress along the path and not on the place.
     pub(super) fn effect(self, contact: &SurfacePoint, term: WheelTerm) -> f64 {
         let n = contact.normal;
         match self {
@@ -134,8 +138,8 @@ pub(super) fn rms(values: &[f64]) -> f64 {
 }
 
 impl OrthonormalBasis {
-    /// Builds an orthonormal basis of the columns by Gram-Schmidt, applied twice for accuracy. A column that is a
-    /// linear combination of the columns before it is left out.
+    /// Builds an orthonormal basis from vectors of the same length (`columns`). The method is Gram-Schmidt, applied
+    /// twice for accuracy. A vector that is a linear combination of the vectors before it adds nothing to the basis.
     pub(super) fn new<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
         let mut basis = Self { columns: Vec::new() };
         for column in columns {

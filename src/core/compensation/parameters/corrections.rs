@@ -43,20 +43,21 @@ impl ExplainedDeviation {
         slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
     }
 
-    /// Returns how much of the deviation at a point the machine parameters and bent guideways explain, in millimetres.
-    /// The estimates are shrunk towards 0 by their priors. A motion of the part that is contained in the sum is
-    /// removed.
+    /// Returns the part of the deviation at the point `contact` that machine parameters and bent guideways explain, in
+    /// millimetres. The estimates of parameters and bends are shrunk towards 0 by their priors. If their combined
+    /// effect contains a motion of the part, this motion is subtracted, because registration has already removed it
+    /// from the deviations.
     pub fn at(&self, contact: &SurfacePoint) -> f64 {
         self.deviation_with_motion_mm(contact) - self.motion.at(contact)
     }
 }
 
-/// Returns how much of a map the machine parameters and bent guideways explain, in millimetres; 0 at every node if they
-/// cannot be estimated.
+/// Returns the part of an error map that machine parameters and bent guideways explain, in millimetres, with one value
+/// for each of `nodes`. Returns 0 for all nodes if the parameters cannot be estimated.
 ///
 /// Shapes: `values_mm` is the map at the nodes of `grid`. `contacts` are the points at which the part was measured; the
-/// estimate uses the map at these points. `nodes` are the surface points under the nodes of `grid`; the result has one
-/// value for each of them.
+/// parameters are estimated from the map at these points. `nodes` are the points of the surface at the x and y of the
+/// nodes of `grid`. `options` are the options of the estimation.
 pub fn explained_by_parameters(
     values_mm: &[f64],
     grid: &Grid,
@@ -117,11 +118,14 @@ pub struct ParameterCorrections {
 }
 
 impl ParameterCorrections {
-    /// Returns the parameter corrections that compensate the estimated values of the parameters from the pass
-    /// `since_cycle` on. Returns `None` if all values are 0.
+    /// Returns the parameter corrections that compensate wrong values of the machine parameters, with the resulting
+    /// displacement of the surface at each node. `values` holds the estimated difference of each parameter from its
+    /// value in the recipe. `since_cycle` is the number of the first pass with these corrections. Returns `None` if all
+    /// values are 0.
     ///
-    /// Shapes: `values` in the order of [`ParameterKind::ALL`]; `contacts` are the points at which the part was
-    /// measured, `nodes` the surface points under the nodes of the correction. Units: millimetres, radians.
+    /// Shapes: `values` is in the order of [`ParameterKind::ALL`]. `contacts` are the points at which the part was
+    /// measured; they determine which motion of the part registration removes. `nodes` are the points of the surface at
+    /// the nodes of the correction. Units: millimetres, radians.
     pub fn from_values(
         values: [f64; ParameterKind::COUNT],
         since_cycle: u16,
@@ -157,8 +161,9 @@ impl ParameterCorrections {
 }
 
 impl SurfacePoint {
-    /// Returns the point of `surface`, with its normal, at the x and y of each node of `grid`. For a node outside the
-    /// known surface, returns the nearest known point. The deviations of the returned points are 0.
+    /// Returns one point with its normal for each node of `grid`: the point of `surface` at the x and y of the node. If
+    /// the surface is not known there or is too steep, returns the nearest known point. If no point is known at all,
+    /// returns the origin with the normal +z. The deviations of the returned points are 0.
     pub fn under_nodes(surface: &HeightField, grid: &Grid) -> Vec<Self> {
         let at = |k: usize| {
             let [x, y] = grid.place_mm(k);

@@ -101,8 +101,10 @@ pub struct ParameterOptions {
 }
 
 impl ParameterOptions {
-    /// Returns options with all six motions of the part free and no tolerances, so that parameters are only reported
-    /// and none is compensated. `wheel_radius_mm` is the radius as stated to the grinder.
+    /// Returns default options in which registration fits all six motions of the part (three shifts, three rotations)
+    /// and no parameter has a tolerance. So every parameter is only reported, and none is compensated.
+    ///
+    /// `wheel_radius_mm` is the radius of the wheel, in millimetres, as the operator states it to the grinder.
     pub fn new(wheel_radius_mm: f64) -> Self {
         Self {
             wheel_radius_mm,
@@ -113,8 +115,9 @@ impl ParameterOptions {
         }
     }
 
-    /// Returns true if the parameter with the index `k` in [`ParameterKind::ALL`] cannot be told from a motion of the
-    /// part that a datum locks, because the uncertainty of the datum is not stated.
+    /// Returns true if two conditions are met: the parameter with the index `k` in [`ParameterKind::ALL`] has the same
+    /// effect as a motion of the part that a datum locks, and the uncertainty of the datum is not stated. Such a
+    /// parameter cannot be separated from an error of the datum.
     fn lacks_locked_sigma(&self, k: usize) -> bool {
         let held = |motion: usize| !self.free_motions[motion];
         ParameterKind::ALL[k].motion().is_some_and(held) && self.locked_sigmas.is_none()
@@ -238,17 +241,29 @@ pub enum ParameterError {
     Field(#[from] ModelError),
 }
 
-/// Estimates the machine parameters from the deviations of the part, by generalised least squares together with a
-/// Gaussian random field for the form error.
+/// Estimates the machine parameters (wheel radius, wheel setting, tilt of the part, wear) from the deviations of the
+/// part. The method is generalised least squares, with a Gaussian random field as the model of the form error.
 ///
-/// Shapes: contacts in any order; `progress` is the progress along the path at each contact, from 0 to 1. `None` stands
-/// for a raster whose tracks follow each other along y. Frames: the model frame. Units: millimetres, radians. Equation:
-/// deviation = motion of the part + bent guideways + sum of (parameter times its effect) + field + noise.
+/// Returns the value and the uncertainty of each parameter, and the residuals after correction of the significant
+/// parameters.
+///
+/// `contacts` are the measured points with normal and deviation, in any order. `progress` is the progress along the
+/// grinding path at each contact, from 0 (start) to 1 (end). With `None` the path is a raster whose tracks follow each
+/// other along y.
+///
+/// Frame: the model frame. Units: millimetres, radians. Equation: deviation = motion of the part + bent guideways + sum
+/// of (parameter times its effect) + random field + noise.
 ///
 /// # Errors
-/// Returns an error if there are fewer than 30 points, if a value is not finite, if `progress` has another length than
-/// `contacts`, if the z component of a normal is below 0.05, if the radius or a tolerance is not above 0, if an
-/// uncertainty of the datum is negative, or if the points do not determine the field.
+/// Returns an error in each of these cases:
+///
+/// - There are fewer than 30 points.
+/// - A coordinate, normal, deviation or progress is not finite.
+/// - `progress` and `contacts` have different lengths.
+/// - The z component of a normal is below 0.05.
+/// - The wheel radius or a tolerance is not a finite number above 0.
+/// - An uncertainty of the datum is negative or not finite.
+/// - The points do not determine the random field.
 pub fn estimate_parameters(
     contacts: &[SurfacePoint],
     progress: Option<&[f64]>,
@@ -355,11 +370,14 @@ impl Columns {
         self.motions.iter().chain(&self.slides).map(|c| &c.values)
     }
 
-    /// Returns two lists with an entry for each candidate parameter. The first is true if the candidate is separable
-    /// from motions, guideways and the other separable candidates. The second is the share of the effect of the
-    /// candidate, from 0 to 1, that these others cannot imitate.
+    /// Tests which candidate parameters are separable from motions of the part, bent guideways and the other separable
+    /// candidates.
     ///
-    /// Of two candidates with the same effect, only the first is separable.
+    /// Returns two lists with one entry for each candidate. The second list holds the independent share of the effect
+    /// of the candidate, from 0 to 1: the part of the effect that the others named above cannot imitate. The first list
+    /// is true if the candidate is separable: its independent share is above 0.02.
+    ///
+    /// If two candidates have the same effect, only the first is separable.
     fn separability(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
@@ -378,12 +396,15 @@ impl Columns {
         (told.iter().zip(&shares).map(|(told, share)| *told && *share > MIN_OWN_SHARE).collect(), shares)
     }
 
-    /// Fits guideways and candidate parameters together with the motions of the part and a random field. `told[k]` is
-    /// true if candidate k is separable; other candidates are not fitted. `rms_mm` is the rms of the deviations without
-    /// motions.
+    /// Fits the bends of the guideways and the separable candidate parameters, together with the motions of the part
+    /// and a random field for the form error. Returns values and covariance of guideway bends and candidates.
+    ///
+    /// `told[k]` is true if candidate `k` is separable. The value of any other candidate stays 0. `rms_mm` is the root
+    /// mean square of the deviations without the part that motions explain, in millimetres. If `rms_mm` is practically
+    /// 0, all values are 0.
     ///
     /// # Errors
-    /// Returns an error if the points do not determine the field.
+    /// Returns an error if the points do not determine the random field.
     fn fitted(
         &self,
         contacts: &[SurfacePoint],
@@ -426,12 +447,15 @@ impl Columns {
         Ok(ColumnFit { values, covariance, sizes, rms_mm, slides })
     }
 
-    /// Estimates the values of the `chosen` columns and of the motions, with their covariance. `unseen` is an
-    /// orthonormal basis of the motions of the part. The result lists the motions first; values of chosen columns are
-    /// in units of these columns.
+    /// Estimates the coefficients of the `chosen` columns and of the motions of the part, with their covariance, by
+    /// generalised least squares. A column is the effect of one unit of a parameter or guideway bend at every contact.
+    ///
+    /// `unseen` is an orthonormal basis of the effects of the motions. The result lists the motions first and then the
+    /// chosen columns, in the given order. The coefficient of a column is the value of its parameter or bend, in
+    /// millimetres or radians.
     ///
     /// # Errors
-    /// Returns an error if the points do not determine the field of the model.
+    /// Returns an error if the points do not determine the random field of the form error.
     fn effects(
         &self,
         contacts: &[SurfacePoint],
@@ -460,7 +484,12 @@ impl Columns {
         Ok(found)
     }
 
-    /// Returns the names, for people, of the effects that the candidate with the index `k` cannot be separated from.
+    /// Returns names, for messages to people, of the effects from which the candidate parameter with the index `k`
+    /// cannot be separated.
+    ///
+    /// Returns one name if the cause is a datum without a stated uncertainty, or a free motion with the same effect.
+    /// Otherwise returns at most three names of the motions, guideway bends and parameters that imitate the candidate
+    /// best.
     fn inseparable_from(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
         let before = self.candidates.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| (c.kind, &c.values));
         let others = self.motions.iter().chain(&self.slides).map(|c| (c.kind.to_owned(), &c.values));
@@ -475,9 +504,13 @@ impl Columns {
 }
 
 impl ColumnFit {
-    /// Returns the estimate of each parameter, in the order of [`ParameterKind::ALL`]. `alike` holds for each parameter
-    /// the names of the effects that it is not separable from, `own_shares` its independent share. `message` and
-    /// `rms_reduction_mm` of the estimates stay empty.
+    /// Returns the estimate of each parameter, in the order of [`ParameterKind::ALL`].
+    ///
+    /// For each parameter, `alike` holds the names of the effects from which the parameter is not separable. If this
+    /// list is empty, the parameter is separable; otherwise its value and uncertainty are 0. `own_shares` holds the
+    /// independent share of the effect of each parameter, from 0 to 1.
+    ///
+    /// In the returned estimates `message` is empty and `rms_reduction_mm` is 0. The caller sets both.
     fn parameters(
         &self,
         alike: Vec<Vec<String>>,
@@ -514,9 +547,11 @@ impl ColumnFit {
         found
     }
 
-    /// Returns the posterior mean of some parameters: T (T + S)^-1 b. b are the fitted values, S is the covariance of
-    /// b, and T the diagonal matrix of the prior variances. `chosen` holds the index and the prior variance of each
-    /// parameter. Returns zeros if T + S is not positive definite.
+    /// Returns the posterior mean of the parameters in `chosen`, in the same order. `chosen` holds the index of each
+    /// parameter and its prior variance.
+    ///
+    /// Equation: T (T + S)^-1 b. Here b is the vector of the fitted values, S is the covariance of b, and T is the
+    /// diagonal matrix of the prior variances. Returns zeros if T + S is not positive definite.
     fn expected(&self, chosen: &[(usize, f64)]) -> DVector<f64> {
         let at = |k: usize| self.slides + chosen[k].0;
         let n = chosen.len();
@@ -526,13 +561,17 @@ impl ColumnFit {
         solved.map_or_else(|| DVector::zeros(n), |solved| DVector::from_fn(n, |k, _| chosen[k].1 * solved[k]))
     }
 
-    /// Returns the posterior mean of all guideway bends and parameters together. The prior of a parameter with a
-    /// tolerance is this tolerance. All others share one prior strength, which is estimated from the fitted values
-    /// (empirical Bayes, Morris 1983).
+    /// Returns the posterior mean of all guideway bends and all parameters, estimated together. The result lists the
+    /// guideway bends first; a value that was not fitted is 0.
+    ///
+    /// The prior standard deviation of a parameter with a tolerance is half of this tolerance. All other values share
+    /// one prior strength: the prior rms, in millimetres, of the effect of a value. This strength is estimated from the
+    /// fitted values (empirical Bayes, Morris 1983).
     ///
     /// Equation: T (T + S)^-1 b, with the fitted values b, their covariance S and the diagonal matrix T of the prior
-    /// variances. The result is the mean over trial prior strengths from 0.1 % of the rms of the deviations up to the
-    /// whole rms, each weighted by its marginal likelihood given b.
+    /// variances. The equation is evaluated for several trial strengths, from 0.1 % to 100 % of the rms of the
+    /// deviations. The result is the weighted mean over the trial strengths. The weight is the marginal likelihood of
+    /// b.
     fn joint_expectation(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);

@@ -11,7 +11,7 @@ const MIN_NAMED_SHARE: f64 = 0.2;
 pub(super) const UNSTATED_LOCKED_SIGMA: &str =
     "the uncertainty of the datum, which is not stated (registration.lock_uncertainty_um)";
 
-/// Returns the name of a parameter, for people.
+/// Returns the English name of a parameter for messages to people, for example "wheel radius".
 pub fn name(kind: ParameterKind) -> &'static str {
     match kind {
         ParameterKind::WheelRadius => "wheel radius",
@@ -25,7 +25,7 @@ pub fn name(kind: ParameterKind) -> &'static str {
 }
 
 impl ParameterKind {
-    /// Returns the name of the parameter, for people.
+    /// Returns the English name of this parameter for messages to people, for example "wheel radius".
     pub fn name(self) -> &'static str {
         name(self)
     }
@@ -56,8 +56,11 @@ impl ParameterKind {
     }
 }
 
-/// Returns the names of at most three of the `others` that imitate the column `target` best, the largest contribution
-/// first. If `target` has no effect, returns a text that says so.
+/// Returns the names of at most three columns of `others` that together imitate the column `target` best (least
+/// squares). The largest contribution is first. A column is the effect of a parameter, motion or guideway bend at every
+/// point; `others` holds pairs of name and column.
+///
+/// If `target` is practically 0 at all points, returns one text that says that there is no effect.
 pub(super) fn inseparable_names(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
     let size = dot(target, target).sqrt();
     if size * size <= MIN_EFFECT_MM2 * target.len() as f64 {

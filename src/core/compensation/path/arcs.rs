@@ -105,16 +105,19 @@ pub struct ArcSummary {
 }
 
 impl ToolPath {
-    /// Returns the moves of the wheel's centre, one list for each track. An arc replaces straight moves where it
-    /// deviates from the path by no more than the tolerance in `options`.
+    /// Returns the moves of the wheel's centre as program blocks, one iterator for each track. An arc replaces several
+    /// straight moves if the arc deviates from the path by at most the tolerance in `options`. All other moves stay
+    /// straight.
     ///
     /// Frame: model. Units: mm, mm/min.
     pub fn arcs_by_track(&self, options: &ArcOptions) -> Vec<ArcBlocks<MovesWithMiddles<'_>>> {
         self.moves_by_track().into_iter().map(|moves| ArcBlocks::new(MovesWithMiddles(moves), options)).collect()
     }
 
-    /// Converts the whole path into arcs and returns the numbers of moves, arcs and lines, the largest deviation, and
-    /// the largest corner angles with and without arcs. Tracks are converted in parallel.
+    /// Converts the whole path into arcs and returns a comparison with the path in straight lines. The result contains
+    /// the numbers of moves, arcs and lines, the largest deviation of an arc from the path, and the largest corner
+    /// angle with arcs and without. A corner angle is the change of direction between two successive moves. The tracks
+    /// are converted in parallel.
     pub fn arc_summary(&self, options: &ArcOptions) -> ArcSummary {
         let one = |k: usize| {
             let mut one = ArcSummary::default();
@@ -205,9 +208,11 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> ArcBlocks<S> {
         }
     }
 
-    /// Searches the arc from the current point that replaces the most points. Returns the number of replaced points and
-    /// the arc, or the number of points that stay lines and `None`. The search doubles the number of points, then
-    /// bisects.
+    /// Searches the longest arc that begins at the current point and stays within the tolerance. Returns the number of
+    /// path points that the arc replaces, and the arc. If no arc fits, returns the number of points that stay straight
+    /// moves, and `None`.
+    ///
+    /// The search doubles the number of points until the fit fails, and then bisects.
     fn longest_arc(&mut self) -> (usize, Option<Arc>) {
         let least = self.options.min_lines.max(2);
         let from = self.from;
@@ -282,8 +287,9 @@ enum ArcFit {
     Neither,
 }
 
-/// Fits an arc, or a straight line, that begins at `from`, ends at the last sample, and follows all samples within the
-/// tolerance in `options`. Returns [`ArcFit::Neither`] if neither an arc nor a line does.
+/// Fits an arc or a straight line through successive points of the path. The curve begins at `from` and ends at the
+/// last point of `samples`. No point may deviate from the curve by more than the tolerance in `options`. Returns
+/// [`ArcFit::Neither`] if no arc and no line meets the tolerance.
 fn fit_arc(from: Point, samples: &[PathPoint], options: &ArcOptions) -> ArcFit {
     let Some(frame) = Chord::new(from, samples, options) else { return ArcFit::Neither };
     let Some([low, high]) = frame.curvature_interval(samples, options.tolerance_mm) else { return ArcFit::Neither };
@@ -336,14 +342,15 @@ impl Chord {
         [x * s + y * t, y * s - x * t]
     }
 
-    /// Returns the interval of the values 1 / t for which an arc over the chord passes all samples within `within_mm`.
-    /// t is the signed distance of the centre of the arc from the chord, positive to the left. Returns `None` if no
-    /// value is suitable.
+    /// Returns the interval `[low, high]` of the values 1 / t for which an arc through both ends of the chord passes
+    /// all samples within `within_mm`. t is the signed distance, in mm, of the centre of the arc from the chord,
+    /// positive to the left. Returns `None` if no value is suitable.
     ///
-    /// With (u, v) the [`Self::coordinates`] of a point and h half of the chord, the point is at a signed distance d
-    /// from the circle about (0, t) through (+-h, 0) if u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2.
-    /// Multiplied by 1 / t, this is linear in 1 / t except for d^2 and the factor (1 + h^2 / t^2)^(1/2) of d. The
-    /// bounds omit both. The factor is at least 1 and would only make the interval wider.
+    /// Derivation: (u, v) are the [`Self::coordinates`] of a point, h is half the length of the chord, and d is the
+    /// signed distance of the point from the circle with the centre (0, t) through (h, 0) and (-h, 0). Then u^2 + v^2 -
+    /// h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2. After multiplication by 1 / t, this is linear in 1 / t, except for
+    /// d^2 and for the factor (1 + h^2 / t^2)^(1/2) of d. The bounds omit d^2 and this factor. The factor is at least 1
+    /// and would only make the interval wider.
     fn curvature_interval(&self, samples: &[PathPoint], within_mm: f64) -> Option<[f64; 2]> {
         let widest = MAX_CHORD_RATIO / self.half;
         let [mut low, mut high] = [-widest, widest];
@@ -363,8 +370,8 @@ impl Chord {
         Some([low, high])
     }
 
-    /// Returns true if the coordinate across the plane of the arc changes linearly along the chord: no sample deviates
-    /// from this by more than `within_mm`.
+    /// Returns true if the coordinate perpendicular to the plane of the arc changes linearly along the chord. The
+    /// coordinate of each sample may deviate from the straight line between both ends by at most `within_mm`.
     fn is_level(&self, samples: &[PathPoint], within_mm: f64) -> bool {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
@@ -374,12 +381,16 @@ impl Chord {
         })
     }
 
-    /// Returns the arc whose centre is at the signed distance 1 / `bend` to the left of the chord. The centre is
-    /// rounded to the last written digit. [`Arc::deviation_mm`] is an upper bound of the deviation of this arc from the
-    /// path.
+    /// Returns the arc that begins at `from`, ends at the last sample, and has its centre at the signed distance 1 /
+    /// `bend` from the chord. `bend` is in 1/mm, positive if the centre is to the left of the chord. The centre is
+    /// rounded to the last digit that a program writes. [`Arc::deviation_mm`] of the result is an upper bound of the
+    /// deviation of this arc from the path.
     ///
-    /// Returns `None` if the centre is beyond the maximum coordinate, if the difference of the radii at both ends is
-    /// too large, or if a sample is not between the ends of the arc.
+    /// Returns `None` in each of these cases:
+    ///
+    /// - A coordinate of the centre, or its offset from the start, exceeds the maximum coordinate in `options`.
+    /// - The radius at the end differs too much from the radius at the start.
+    /// - A sample is not between the ends of the arc.
     fn arc(&self, from: Point, samples: &[PathPoint], bend: f64, options: &ArcOptions) -> Option<Arc> {
         let [s, t] = self.along;
         let centre_mm = [self.middle[0] - t / bend, self.middle[1] + s / bend].map(|v| written(v, options));
@@ -464,9 +475,10 @@ fn written(value_mm: f64, options: &ArcOptions) -> f64 {
     (value_mm * options.steps_per_mm).round() / options.steps_per_mm
 }
 
-/// Calls `tell` for every block with its corner angle, in rad: the angle between the end direction of the previous
-/// block and the start direction of this block. The angle is 0 for rapid moves and for the first two moves at feed of a
-/// track.
+/// Calls `tell` once for every block, with the block and its corner angle in rad. The corner angle is the angle between
+/// the direction at the end of the previous block and the direction at the start of this block, from 0 to pi. The angle
+/// is 0 for rapid moves, and for the first two moves at feed after a rapid move, because these have no previous
+/// direction.
 fn corners(blocks: impl Iterator<Item = ProgramBlock>, mut tell: impl FnMut(&ProgramBlock, f64)) {
     let (mut from, mut heading): (Option<Point>, Option<Vector>) = (None, None);
     for block in blocks {

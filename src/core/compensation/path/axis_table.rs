@@ -13,15 +13,18 @@ use crate::geometry::{Grid, Point};
 
 const STEPS: usize = 40;
 
-/// Computes a compensation table for the axes of a grinder: the offset of Z at every node of `grid`, in millimetres;
-/// positive leaves material. The nodes are positions of the axes X and Y.
+/// Computes a compensation table for the axes of a grinder. Returns the offset of the Z axis at every node of `grid`,
+/// in millimetres. A positive offset raises the wheel, so that more material remains. The nodes are positions of the
+/// axes X and Y.
 ///
-/// `before` is the surface without the correction, `after` the surface with it. The offset is the difference of the
-/// heights at which the wheel touches them. The grid can extend beyond the part, where the surfaces are extrapolated. A
-/// node at which the wheel cannot touch takes the offset of the nearest node at which it can.
+/// `before` is the surface without the correction, `after` is the surface with the correction. An offset is the height
+/// of the wheel's centre in contact with `after` minus the height in contact with `before`.
+///
+/// The grid can extend beyond the part; the surfaces are extrapolated there. If the wheel cannot touch the surface at a
+/// node, the node takes the offset of the nearest node at which contact is possible.
 ///
 /// # Errors
-/// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.
+/// Returns [`PathError::CannotTouch`] if contact is possible at no node of the grid.
 pub fn axis_offsets(
     before: &TargetSurface,
     after: &TargetSurface,

@@ -105,8 +105,9 @@ pub enum PathError {
 }
 
 impl PathError {
-    /// Returns true if the part can perhaps still be ground: only the path planning of this program fails
-    /// ([`PathError::NotAHeight`]). A controller that plans its own path from the correction map may succeed.
+    /// Returns true if the error is a limit of the path planning in this program, not of the part or of the machine.
+    /// This is only the case for [`PathError::NotAHeight`]. A controller that plans its own path from the correction
+    /// map may then still grind the part.
     pub fn is_planning_failure(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }

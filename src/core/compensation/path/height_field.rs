@@ -31,8 +31,8 @@ pub struct HeightField {
 }
 
 impl HeightField {
-    /// Fits a bicubic spline through `values` at the nodes of the grid `on`. At the border, its slope across the border
-    /// is 0.
+    /// Fits a bicubic spline through the heights `values`, in millimetres, one for each node of the grid `on`. At the
+    /// border of the grid, the slope of the spline perpendicular to the border is 0.
     pub fn spline(on: Grid, values: &[f64]) -> Self {
         let Grid { columns, rows, .. } = on;
         let mut nodes: Vec<[f64; 4]> = values.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
@@ -50,8 +50,11 @@ impl HeightField {
         Self::new(on, nodes)
     }
 
-    /// Fits Hermite's bicubic through `values` and `slopes` (along x and y) at the nodes of the grid `on`. A node
-    /// without a value (NaN) is extrapolated from its neighbours.
+    /// Creates a height field by bicubic Hermite interpolation on the grid `on`. `values` holds the height of each
+    /// node, in millimetres. `slopes` holds the slopes of each node along x and along y. The field has exactly these
+    /// heights and slopes at the nodes.
+    ///
+    /// A height of NaN marks a node without a value. The height of such a node is extrapolated from neighbouring nodes.
     pub fn hermite(on: Grid, values: &[f64], slopes: &[[f64; 2]]) -> Self {
         let h = on.spacing_mm;
         let mut nodes: Vec<[f64; 4]> =
@@ -84,8 +87,8 @@ impl HeightField {
         self.per_mm.map(|p| 1.0 / p)
     }
 
-    /// Returns height, slopes and second derivatives at a place `[x, y]`, in millimetres. Beyond the border the field
-    /// continues linearly.
+    /// Returns height, slopes and second derivatives of the field at the point `[x, y]`, in millimetres. Outside the
+    /// grid the field is extrapolated linearly from the border.
     #[inline]
     pub fn at(&self, [x, y]: [f64; 2]) -> Jet {
         let (i, u, over_u) = cell((x - self.grid.first_mm[0]) * self.per_mm[0], self.grid.columns);
@@ -101,8 +104,9 @@ impl HeightField {
         jet
     }
 
-    /// Returns height and derivatives in the cell of column `i` and row `j`, at the position (`u`, `v`) within it; both
-    /// are from 0 to 1. The derivatives are per cell, not per millimetre.
+    /// Returns height and derivatives of the field at a point in the cell of column `i` and row `j`. `u` and `v` are
+    /// the position of the point in the cell along x and along y, from 0 to 1. The derivatives are with respect to `u`
+    /// and `v`, not to millimetres.
     #[inline]
     fn within(&self, i: usize, j: usize, u: f64, v: f64) -> Jet {
         let below = j * self.grid.columns + i;
@@ -126,9 +130,12 @@ impl HeightField {
     }
 }
 
-/// Finds the cell of the coordinate `at` on an axis with `nodes` nodes. Returns the index of the cell, the position in
-/// the cell (0 to 1), and how far the coordinate is beyond the border (signed, 0 inside). `at` and all results are in
-/// cells.
+/// Finds the cell of a grid axis that contains the coordinate `at`. The axis has `nodes` nodes, at least 2. `at` is
+/// measured from the first node, in units of the node spacing.
+///
+/// Returns the index of the cell, the position in the cell (0 to 1), and the signed distance beyond the border in units
+/// of the node spacing. This distance is 0 inside the grid. For a coordinate outside, cell and position are those of
+/// the nearest border.
 #[inline]
 fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     let kept = at.clamp(0.0, (nodes - 1) as f64);
@@ -136,8 +143,10 @@ fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     (i, kept - i as f64, at - kept)
 }
 
-/// Extrapolates height and derivatives from the border: `[du, dv]` is the signed distance beyond the border along both
-/// axes, in cells. The continuation is linear along each axis.
+/// Extrapolates `jet` (height and derivatives at the border of the grid) to a point outside the grid. `du` and `dv` are
+/// the signed distances of the point beyond the border along x and y, in units of the node spacing. They are 0 along an
+/// axis on which the point is inside. The extrapolation is linear along each axis and keeps the mixed derivative. The
+/// second derivative along an extrapolated axis becomes 0.
 #[cold]
 fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
     let ([su, sv], twist) = (jet.slope, jet.second_derivatives[1]);
@@ -172,8 +181,9 @@ impl HermiteBasis {
         }
     }
 
-    /// Returns value, slope and second derivative, at the parameter of this basis, of the cubic with the value `z0` and
-    /// the slope `m0` at 0, and the value `z1` and the slope `m1` at 1.
+    /// Evaluates a cubic polynomial on the interval 0 to 1 at the position for which this basis was built. Returns
+    /// value, slope and second derivative. The cubic has the value `z0` and the slope `m0` at 0, and the value `z1` and
+    /// the slope `m1` at 1.
     #[inline]
     fn curve(&self, z0: f64, m0: f64, z1: f64, m1: f64) -> [f64; 3] {
         let sum = |w: &[f64; 4]| w[0] * z0 + w[1] * m0 + w[2] * z1 + w[3] * m1;
@@ -181,8 +191,9 @@ impl HermiteBasis {
     }
 }
 
-/// Returns the slopes at the nodes of the cubic spline through `count` equally spaced values, per step. The slopes at
-/// both ends are 0. The tridiagonal system is solved by the Thomas algorithm.
+/// Computes the cubic spline through `count` equally spaced values. `value(i)` returns the value at node `i`. Returns
+/// the slope at every node, as change per node spacing. The slopes at the first and at the last node are 0. The Thomas
+/// algorithm solves the tridiagonal system.
 fn spline_slopes(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     // m[i-1] + 4 m[i] + m[i+1] = 3 (f[i+1] - f[i-1]), m[0] = m[n-1] = 0.
     let (mut slope, mut factor) = (vec![0.0; count], vec![0.0; count]);
@@ -197,8 +208,9 @@ fn spline_slopes(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     slope
 }
 
-/// Fills nodes without a value, ring by ring outwards. A new height is the weighted mean of the linear extrapolations
-/// from the neighbours that have a value.
+/// Extrapolates the nodes whose height is NaN, ring by ring outwards from the known nodes. A new height is the weighted
+/// mean of linear extrapolations from the up to eight neighbours that have a value. Then the slopes of all new nodes
+/// are set to differences of the heights. Nothing is changed if no node has a value.
 fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let near = |k: usize| {
         let (i, j) = (k % columns, k / columns);
@@ -239,8 +251,8 @@ fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     }
 }
 
-/// Sets the twist (mixed derivative by x and y) of every node to the mean of two differences: of the x slope along y,
-/// and of the y slope along x.
+/// Sets the twist (the mixed second derivative with respect to x and y) of every node. The twist is the mean of two
+/// finite differences: the change of the x slope along y, and the change of the y slope along x.
 fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let twists: Vec<f64> = (0..nodes.len())
         .into_par_iter()
@@ -255,9 +267,9 @@ fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     nodes.iter_mut().zip(twists).for_each(|(node, twist)| node[3] = twist);
 }
 
-/// Returns the derivative per step at the index `at` of `count` equally spaced values: the central difference inside, a
-/// one-sided difference at both ends, all of second order. With two values, returns their difference; with one value,
-/// 0.
+/// Returns the finite-difference derivative at the index `at` of `count` equally spaced values, as change per step.
+/// `value(i)` returns the value with the index `i`. The difference is central inside and one-sided at both ends, of
+/// second order everywhere. With two values, returns their difference. With fewer, returns 0.
 fn difference(at: usize, count: usize, value: impl Fn(usize) -> f64) -> f64 {
     match at {
         _ if count < 2 => 0.0,

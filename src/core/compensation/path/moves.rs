@@ -127,8 +127,11 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Advances `walk` along its track by the longest step that the chord error allows. The returned state also holds
-    /// the length of the step to try next.
+    /// Advances `walk`, the current position on a track, by one step. The step is as long as three limits allow: the
+    /// chord error (the distance between the straight step and the curved path), the maximum step of the options, and
+    /// the node spacing of the target surface.
+    ///
+    /// Returns the new position, together with the length of the step to try next.
     #[inline]
     fn along(&mut self, mut walk: SpanWalk) -> SpanWalk {
         let path = self.path;
@@ -187,7 +190,8 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the rapid move, at the safe height, to the place above the start of the track of `walk`.
+    /// Returns the rapid move in x and y, at the safe height, that ends above the current point of `walk`: the start of
+    /// the next track. The move includes the tilt angle if the path tilts the wheel.
     fn over(&self, walk: &SpanWalk) -> Move {
         let to_mm = [walk.at.programmed_point.x, walk.at.programmed_point.y];
         match self.path.options().tilt {
@@ -196,9 +200,11 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Returns the feed at the last point, in mm/min: the feed of the options, but on a spiral with an acceleration
-    /// limit a at most (0.8 a / k)^(1/2), where k is the curvature of the path. A reduced feed is rounded down to two
-    /// digits so that it seldom changes.
+    /// Returns the feed for the current point of the path, in mm/min.
+    ///
+    /// This is the feed of the options, except on a spiral with an acceleration limit a. There the feed is at most (0.8
+    /// a / k)^(1/2), where k is the curvature of the path. A reduced feed is rounded down to two significant digits, so
+    /// that the feed seldom changes.
     fn feed_mm_min(&self) -> f64 {
         let options = self.path.options();
         let (TrackPattern::Spiral, Some(limit)) = (options.pattern, options.spiral_acceleration_mm_s2) else {

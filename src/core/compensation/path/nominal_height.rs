@@ -15,15 +15,15 @@ const STEPS: usize = 8;
 /// Minimum z component of a normal: 84° of slope. A steeper surface is not a height over x and y.
 const MIN_NZ: f64 = 0.1;
 
-/// Returns the nominal surface as a height field over x and y, and the outline of the part. If `nominal` has no
-/// outline, the outline is the bounding box of its points.
+/// Converts the nominal surface into a height field over x and y. Returns this field and the outline of the part. If
+/// `nominal` has no outline, the outline is the bounding box of its points in x and y.
 ///
-/// A grid that is regular in x and y becomes the field directly, with slopes from its normals. Any other surface is
-/// sampled on a new grid with about as many nodes as it has points.
+/// If the points form a regular grid in x and y, they become the nodes of the field, with slopes from their normals.
+/// Any other surface is sampled on a new regular grid. The new grid has about as many nodes as the surface has points.
 ///
 /// # Errors
-/// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° at some point or faces away from +z, and
-/// [`PathError::Empty`] if the points cover no area or give no surface.
+/// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° at some point or faces away from +z. Returns
+/// [`PathError::Empty`] if the points cover no area or do not form a surface.
 pub fn nominal_height_field(nominal: &Nominal) -> Result<(HeightField, Aperture), PathError> {
     let [low, high] = bounds(nominal.points().map(|p| [p.x, p.y]));
     let outline = nominal.outline().cloned().unwrap_or(Aperture::from_corners([low, high]));
@@ -34,10 +34,11 @@ pub fn nominal_height_field(nominal: &Nominal) -> Result<(HeightField, Aperture)
     Ok((field, outline))
 }
 
-/// Returns the height field of a surface whose nodes form a regular grid in x and y. Returns `Ok(None)` if they do not.
+/// Returns the height field of a surface whose points form a regular grid in x and y. Returns `Ok(None)` if the points
+/// form no regular grid.
 ///
 /// # Errors
-/// Returns [`PathError::NotAHeight`] if the surface is too steep at a node or faces away from +z.
+/// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° at a point or faces away from +z.
 fn regular(nominal: &Nominal) -> Result<Option<HeightField>, PathError> {
     let (NominalKind::Grid { columns, rows }, [patch]) = (nominal.kind(), nominal.patches()) else { return Ok(None) };
     let nodes = patch.nodes();
@@ -129,12 +130,14 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<HeightField,
     Ok(HeightField::hermite(on, &heights, &slopes))
 }
 
-/// Finds the height and the slopes of a surface at `[x, y]` by Newton's method along z. `start_mm` is the first height
-/// to try; `place` is the facet near which the search begins, and is updated. The height is NaN if the place is off the
-/// part or the method does not converge.
+/// Finds the height, in mm, and the slopes of a surface at `[x, y]`, by Newton's method along z. `start_mm` is the
+/// first height to try. `place` is the facet of the surface at which the search begins; the function replaces it by the
+/// facet that it found.
+///
+/// The height is NaN if `[x, y]` is not on the part or if Newton's method does not converge.
 ///
 /// # Errors
-/// Returns [`PathError::NotAHeight`] if the surface is too steep or faces away from +z.
+/// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° or faces away from +z.
 fn height_at(
     surface: &OffsetSurface,
     [x, y]: [f64; 2],

@@ -147,12 +147,12 @@ impl PathOptions {
         self.check_tilt()
     }
 
-    /// Checks if the tilt of the wheel is possible; without a tilt there is nothing to check.
+    /// Checks if the tilt of the wheel is possible. Returns `Ok` if the options contain no tilt.
     ///
     /// # Errors
-    /// Returns an error if there is no rotary axis, if the wheel comes from below, if the angle is not finite, or if a
-    /// ball whose tilt follows the normal leads by less than 2°: it would touch with its pole, which has no cutting
-    /// speed.
+    /// Returns an error if the machine has no rotary axis, if the wheel comes from below, or if the angle is not
+    /// finite. Returns an error if the wheel is a ball, the tilt follows the normal of the surface, and the angle
+    /// between the normal and the head is below 2°. Such a ball would touch with its pole, which has no cutting speed.
     fn check_tilt(&self) -> Result<(), PathError> {
         let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {

@@ -38,9 +38,12 @@ pub struct Scallops {
 }
 
 impl Scallops {
-    /// Computes the scallops (ridges between tracks) that a pass leaves on the surface `wanted`. `track_mm` is the
-    /// distance between tracks. `wheel_at` returns the wheel in its orientation at a contact. A place where the wheel
-    /// does not fit counts as height 0; [`ToolPath::new`] rejects such a path.
+    /// Computes the scallops that a pass leaves on the surface `wanted`. Scallops are the ridges between tracks.
+    /// `outline` is the outline of the part, `pattern` is raster or spiral, and `track_mm` is the distance between
+    /// tracks, projected onto the xy plane. `wheel_at` returns the wheel, with the direction of its spindle, for a
+    /// contact.
+    ///
+    /// The height counts as 0 at a place where the wheel does not fit. [`ToolPath::new`] rejects such a path.
     pub fn compute(
         wanted: &TargetSurface,
         outline: &Aperture,
@@ -67,8 +70,8 @@ impl Scallops {
         }
     }
 
-    /// Returns the largest distance between tracks, in millimetres, at which the scallops exceed neither `height_mm`
-    /// nor `rms_mm`. Returns infinity if there are no scallops at any distance.
+    /// Returns the largest distance between tracks, in millimetres, at which the height of the scallops is at most
+    /// `height_mm` and their root mean square is at most `rms_mm`. Returns infinity if the wheel leaves no scallops.
     pub fn max_track_mm(&self, height_mm: f64, rms_mm: f64) -> f64 {
         let by = |most: f64, found: f64| if found > 0.0 { (most / found).sqrt() } else { f64::INFINITY };
         self.track_mm * by(height_mm, self.height_mm).min(by(rms_mm, self.rms_mm))
@@ -108,8 +111,9 @@ pub(super) fn relative_to_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2
     std::array::from_fn(|k| place[k] - 0.5 * (low[k] + high[k]))
 }
 
-/// Returns the groove that the wheel leaves at a place. `bend` are the curvatures of the surface there, and `[x, y]` is
-/// the place relative to the middle of the part ([`relative_to_middle`]).
+/// Returns the groove that the wheel leaves at one place of the surface. `bend` holds contact point, normal and
+/// curvatures of the surface at this place. `[x, y]` is the place in mm, relative to the middle of the part
+/// ([`relative_to_middle`]). `pattern` gives the direction of the track: along x for a raster, tangential for a spiral.
 pub(super) fn groove(bend: &SurfaceCurvature, [x, y]: [f64; 2], wheel: &Wheel, pattern: TrackPattern) -> Groove {
     // Direction of the track over x and y; the next track is at a right angle to it.
     let radius = x.hypot(y);

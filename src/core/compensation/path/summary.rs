@@ -22,10 +22,16 @@ pub struct MachineLimits {
 }
 
 impl MachineLimits {
-    /// Returns the distance that the machine needs from standstill to a feed, in millimetres.
+    /// Returns the distance, in millimetres, that the machine needs to accelerate from standstill to the feed
+    /// `feed_mm_min`.
     ///
-    /// v is the feed, a the limit of the acceleration and j the limit of the jerk. The distance is v / 2 (v / a + a /
-    /// j), or v (v / j)^(1/2) if a is not reached. Without a jerk limit it is v^2 / (2 a). With neither limit it is 0.
+    /// Symbols: v is the feed, a is the maximum acceleration and j is the maximum jerk.
+    ///
+    /// - With both limits: v / 2 (v / a + a / j). If the machine does not reach the acceleration a (v j < a^2): v (v /
+    ///   j)^(1/2).
+    /// - With a jerk limit only: v (v / j)^(1/2).
+    /// - With an acceleration limit only: v^2 / (2 a).
+    /// - With no limit: 0.
     pub fn run_up_mm(&self, feed_mm_min: f64) -> f64 {
         let speed = feed_mm_min / 60.0;
         match (self.acceleration_mm_s2, self.jerk_mm_s3) {
@@ -182,9 +188,12 @@ impl PathSummary {
         }
     }
 
-    /// Adds a move at feed to the point `at`. `last` is the point before, and `before` the curvature of the chord
-    /// before; both are updated. `centre_mm` is the distance that the wheel's centre moves; with `None` it is the
-    /// distance between the two points.
+    /// Adds a move at feed that ends at the point `at`: updates the number of points, extent, length, time, and the
+    /// largest speed, acceleration and jerk.
+    ///
+    /// `last` is the end point of the previous move, and `before` is the curvature of the path along the previous move.
+    /// The function replaces `last` and `before` by the values of this move. `centre_mm` is the distance that the
+    /// wheel's centre moves, in mm. If `centre_mm` is `None`, this distance is the distance between `last` and `at`.
     #[inline]
     fn add_feed(
         &mut self,
@@ -226,7 +235,9 @@ impl PathSummary {
         }
     }
 
-    /// Updates the largest jerk with two successive chords, `before` and `now`. `at` is the point between them.
+    /// Computes the jerk at the point `at` between two successive straight moves, and stores it in this summary if it
+    /// is the largest so far. `before` and `now` hold the curvature of the path along each of the two moves and their
+    /// lengths. `feed_mm_min` is the feed at `at`.
     #[inline]
     fn update_jerk(&mut self, before: ChordCurvature, now: ChordCurvature, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
@@ -256,12 +267,17 @@ impl PathSummary {
         }
     }
 
-    /// Checks the path against the limits of a machine. An unknown limit is not checked.
+    /// Checks the path against the limits of a machine. A limit that is `None` is not checked.
     ///
     /// # Errors
-    /// Returns an error for the first excess, checked in this order: travel of an axis, speed of an axis, range of the
-    /// head, angular speed of the head, acceleration across the path, jerk on the part, and run-up: the distance to
-    /// reach the feed must not be longer than overrun plus lead.
+    /// Returns an error for the first limit that the path exceeds. The order of the checks is:
+    ///
+    /// - travel of each axis X, Y, Z
+    /// - speed of each axis
+    /// - angle range and angular speed of the head, if the path tilts the wheel
+    /// - acceleration across the path
+    /// - jerk while the wheel is on the part or its overrun
+    /// - run-up: the distance that the machine needs to reach the feed must not be longer than overrun plus lead
     pub fn check(&self, limits: &MachineLimits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {

@@ -45,8 +45,9 @@ pub(super) struct SurfaceCurvature {
 }
 
 impl TargetSurface {
-    /// Creates the target surface: the nominal surface, shifted along its normals by the level of the correction plus
-    /// the correction. Beyond the grid of the correction, the correction becomes constant within `level_off_mm`.
+    /// Creates the target surface of a pass. Each point of the nominal surface is shifted along its normal by the level
+    /// (the remaining allowance) plus the value of the correction. Outside the grid of the correction, its values are
+    /// extrapolated and become constant within the distance `level_off_mm`, in millimetres.
     ///
     /// # Errors
     /// Returns [`PathError::Correction`] if a value of the correction is not finite.
@@ -66,16 +67,18 @@ impl TargetSurface {
         Contact { point, normal: tangents[0].cross(&tangents[1]).normalize() }
     }
 
-    /// Returns the point of the target surface for x and y of the nominal surface, and the derivatives of this point by
-    /// x and by y.
+    /// Returns the point of the target surface that belongs to `place_mm`, the position `[x, y]` on the nominal surface
+    /// in mm. Also returns the two tangent vectors: the derivatives of this point with respect to x and y of the
+    /// nominal surface.
     #[inline]
     fn tangents(&self, place_mm: [f64; 2]) -> (Point, [Vector; 2]) {
         let e = self.correction.at(place_mm);
         self.offset_point(place_mm, &Jet { value: self.level_mm + e.value, ..e })
     }
 
-    /// Returns the nominal point at `place_mm`, shifted along its normal by the value of `e`, and the derivatives of
-    /// the shifted point by x and by y. `e` holds the shift with its slopes, in millimetres.
+    /// Shifts the nominal point at `place_mm` (`[x, y]`, in mm) along its normal. `e` holds the shift in millimetres
+    /// and the slopes of the shift along x and y. Returns the shifted point, and its derivatives with respect to x and
+    /// to y.
     #[inline]
     fn offset_point(&self, place_mm: [f64; 2], e: &Jet) -> (Point, [Vector; 2]) {
         let s = self.nominal.at(place_mm);
@@ -122,9 +125,9 @@ impl TargetSurface {
         }
     }
 
-    /// Returns the factor by which a step in the tangent plane is multiplied when a point is projected onto the curved
-    /// surface: 1 / (1 - h k). `height_mm` (h) is the height of the point above the surface; k is the mean curvature at
-    /// `place_mm`, positive in a hollow. The factor is at most 1.9.
+    /// Returns the factor that corrects a step in the tangent plane when a point above a curved surface is projected
+    /// onto the surface: 1 / (1 - h k). h is `height_mm`, the height of the point above the surface. k is the mean
+    /// curvature of the surface at `place_mm`, in 1/mm, positive in a hollow. The factor is at most 1.9.
     fn projection_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
         let [a, _, c] = self.curvature_at(place_mm).second_form_per_mm;
         (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)
@@ -138,12 +141,14 @@ impl TargetSurface {
     }
 }
 
-/// Returns by how much the centre of a ball moves when the surface that the ball touches is shifted along its normals,
-/// in mm. Returns `None` if the projection of the centre does not converge.
+/// Returns the displacement vector, in mm, of the centre of a ball when the surface that the ball touches is shifted
+/// along its normals. Returns `None` if the projection of the centre onto the surface does not converge.
 ///
-/// `centre` is the centre of the ball in contact with `nominal`, and `shift` is the shift along the normals. Let P be
-/// the projection of the centre onto the nominal surface, R the distance from P to the centre, n the normal at P, e the
-/// shift there, and n' the normal of the shifted surface. The result is P + e n + R n' minus the centre.
+/// `nominal` is the surface before the shift. `centre` is the centre of the ball in contact with `nominal`. `shift` is
+/// the shift along the normals, in millimetres.
+///
+/// Equation: P + e n + R n' - `centre`. P is the projection of the centre onto `nominal`, R is the distance from P to
+/// the centre, n is the normal at P, e is the shift at P, and n' is the normal of the shifted surface.
 pub fn ball_displacement(nominal: &TargetSurface, shift: &HeightField, centre: &Point) -> Option<Vector> {
     let mut place = [centre.x, centre.y];
     for _ in 0..STEPS {
@@ -176,12 +181,12 @@ pub fn ball_displacement(nominal: &TargetSurface, shift: &HeightField, centre: &
 /// for the curvature.
 const STEPS: usize = 100;
 
-/// Fits a spline through the values of a correction and extends it beyond its grid, where it becomes constant within
-/// `length_mm` (L).
+/// Fits a bicubic spline through the values of a correction, in millimetres, and extends the spline beyond the grid.
+/// Outside the grid the spline becomes constant within the distance `length_mm` (L).
 ///
-/// At a distance s beyond the border the correction differs from its value at the border by g L (t - t^3 + t^4 / 2),
-/// where g is the slope across the border and t = s / L is at most 1. So the slope is continuous at the border and 0
-/// from L on.
+/// At a distance s outside the grid, the extended value is the value at the border plus g L (t - t^3 + t^4 / 2). Here g
+/// is the slope at the border, in the direction away from the grid, and t is s / L, at most 1. So the slope is
+/// continuous at the border and 0 from L on.
 pub fn correction_spline(correction: &Correction, length_mm: f64) -> HeightField {
     let grid = correction.grid;
     let spacing_mm = [0, 1].map(|k| {

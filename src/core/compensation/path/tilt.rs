@@ -100,16 +100,19 @@ impl RotaryAxis {
         if self.reversed { 0.0 - angle_rad } else { angle_rad }
     }
 
-    /// Returns the offset, in mm, that the linear axes must add to keep the wheel's centre in place when the head tilts
-    /// by `angle_rad`: (R - 1) v, where R is the rotation and v the vector from the wheel's centre to the pivot with
-    /// the head upright. Returns 0 if the control itself keeps the centre in place.
+    /// Returns the offset, in mm, that must be added to the positions of the linear axes so that the wheel's centre
+    /// does not move when the head tilts by `angle_rad`. The head rotates about a pivot point that is not the wheel's
+    /// centre.
+    ///
+    /// Equation: (R - 1) v, where R is the rotation by `angle_rad`, and v is the vector from the wheel's centre to the
+    /// pivot of the upright head. Returns 0 if the controller itself keeps the centre in place (`pivot_mm` is `None`).
     #[inline]
     pub fn pivot_shift_mm(&self, angle_rad: f64) -> Vector {
         self.pivot_mm.map_or_else(Vector::zeros, |pivot| self.rotated(&pivot, angle_rad) - pivot)
     }
 
-    /// Returns the angle, in rad, by which the head must rotate to bring its upright axis z onto a surface normal. Only
-    /// the component of the normal across the rotary axis counts.
+    /// Returns the angle, in rad, by which the head must rotate so that its axis (z of the upright head) points along
+    /// the surface normal. The normal is first projected onto the plane perpendicular to the rotary axis.
     #[inline]
     fn normal_tilt_rad(&self, normal: &Vector) -> f64 {
         match self.axis {
@@ -202,9 +205,12 @@ impl PathOptions {
         })
     }
 
-    /// Computes how far a straight step `from` - `to` is from the path at the middle of the step, where the wheel
-    /// should be at `middle`. During a step the control moves linear axes and head in proportion. An error of the tilt
-    /// angle counts as the distance by which it moves the ring of the wheel.
+    /// Computes how far a straight step of the machine is from the curved path at the middle of the step. The step goes
+    /// from `from` to `to`; the path is at `middle` half-way.
+    ///
+    /// During a step the controller moves the linear axes and the head in proportion. If the tilt changes, its error at
+    /// the middle is included: the angle error, multiplied by the radius of the wheel's ring, is added to the distance.
+    /// The result is in millimetres.
     #[inline]
     pub(super) fn step_deviation(
         &self,
@@ -233,15 +239,17 @@ impl PathOptions {
         StepDeviation { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
     }
 
-    /// Returns the largest height, in mm, by which the linear axes can be above the wheel's centre because of the tilt,
-    /// at any angle in the range of the axis. Returns 0 if the path does not tilt the wheel.
+    /// Returns the maximum height, in mm, by which the tilt can raise the position of the linear axes above the wheel's
+    /// centre, at any angle in the range of the rotary axis. Returns 0 if the path does not tilt the wheel.
     pub(super) fn lift_mm(&self) -> f64 {
         self.tilting_axis().map_or(0.0, RotaryAxis::max_lift_mm)
     }
 
-    /// Returns the height that rapid moves must clear at a contact, in mm: the height of the wheel's centre at the
-    /// position `stand`. If the wheel is tilted, it is at least the height of the contact, lifted by `lifted_mm`, plus
-    /// the reach of the wheel.
+    /// Returns the minimum height for rapid moves above a contact, in mm. This is the z of the wheel's centre at
+    /// `stand` (position and tilt of the wheel).
+    ///
+    /// If the wheel is tilted, the result is at least the z of the contact point, moved by `lifted_mm` along its
+    /// normal, plus the largest radius of the wheel.
     #[inline]
     pub(super) fn clearance_height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &WheelPosition) -> f64 {
         match self.tilt {
@@ -254,12 +262,19 @@ impl PathOptions {
     }
 }
 
-/// Completes the error `refused` of an upright wheel that cannot reach a place: searches a constant tilt with which the
-/// wheel can grind the part, and adds it to the error.
+/// Searches a constant tilt of the head with which the wheel can grind the whole part, after planning with an upright
+/// wheel failed with the error `refused`.
 ///
-/// Tries tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns [`PathError::NeedsTilt`]
-/// with the first tilt for which `would_do` returns true. Returns `refused` unchanged if there is none, if a tilt
-/// cannot help, or if the head cannot tilt.
+/// Tries angles in steps of 5° up to 90° to either side, within the range of the rotary axis. `would_do` returns true
+/// if the path is possible with the given options. Returns [`PathError::NeedsTilt`], which contains `refused` and the
+/// first possible angle.
+///
+/// Returns `refused` unchanged in each of these cases:
+///
+/// - No tried angle is possible.
+/// - The error is not one that a tilt can remove.
+/// - The head has no rotary axis.
+/// - The options already contain a tilt, or the wheel comes from below.
 pub(super) fn suggest_tilt(
     refused: PathError,
     options: &PathOptions,

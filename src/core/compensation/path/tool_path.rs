@@ -23,17 +23,17 @@ pub struct ToolPath {
 }
 
 impl ToolPath {
-    /// Plans the tracks of a wheel over a part. `wanted` is the target surface of the pass, `outline` the outline of
+    /// Plans the tracks of a wheel over a part. `wanted` is the target surface of the pass, `outline` is the outline of
     /// the part.
     ///
-    /// Checks the options and the fit of the wheel: slope of the surface, hollows in every direction, and contact of
-    /// the wheel's body with the part away from the contact point. [`super::PathSummary::check`] checks travel, speed
-    /// and acceleration.
+    /// Checks the options, and checks that the wheel fits the surface: slope, radius of hollows in every direction, and
+    /// no contact between the body of the wheel and the part away from the contact point. Travel, speed and
+    /// acceleration are not checked here, but in [`super::PathSummary::check`].
     ///
     /// # Errors
-    /// Returns an error for invalid options, for a wheel that does not fit, and for more than 1e6 tracks. Each error
-    /// gives place, value, limit and remedy. If a constant tilt of the head solves the problem, the error is
-    /// [`PathError::NeedsTilt`] with that angle.
+    /// Returns an error for invalid options, for a wheel that does not fit, for an outline without tracks, and for 1e6
+    /// tracks or more. Each error gives place, value, limit and remedy. If a constant tilt of the head solves the
+    /// problem, the error is [`PathError::NeedsTilt`] with this angle.
     pub fn new(wanted: TargetSurface, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
         let grain_mm = wanted.min_node_spacing_mm();
@@ -66,7 +66,7 @@ impl ToolPath {
         wheel_fit::on_grid(&self.outline, wheel_fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
     }
 
-    /// Returns the distance between neighbouring tracks, seen along z, in millimetres.
+    /// Returns the distance between neighbouring tracks, projected onto the xy plane, in millimetres.
     pub fn track_mm(&self) -> f64 {
         self.tracks.track_mm
     }
@@ -81,8 +81,8 @@ impl ToolPath {
         self.flipped_height_mm(self.safe_z_mm)
     }
 
-    /// Returns the safe height of rapid moves as the wheel sees it, in millimetres: for a wheel from below, z is
-    /// mirrored.
+    /// Returns the safe height of rapid moves in the frame of the wheel, in millimetres. This frame is the model frame,
+    /// but with z reversed if the wheel comes from below.
     pub(super) fn travel_mm(&self) -> f64 {
         self.safe_z_mm
     }
@@ -114,8 +114,11 @@ impl ToolPath {
         &self.outline
     }
 
-    /// Returns position and tilt of the wheel at the parameter `t` of a track ([`Span::place`]). They are NaN if the
-    /// rim of the wheel cannot touch there; [`ToolPath::new`] rejects such a path.
+    /// Returns position and tilt of the wheel at the point of the track `span` with the curve parameter `t`
+    /// ([`Span::place`]). In the leads before and after the track the wheel is lifted off the surface.
+    ///
+    /// All values are NaN if the rim of the wheel cannot touch at this point. [`ToolPath::new`] rejects a path with
+    /// such a point.
     #[inline]
     pub(super) fn wheel_position(&self, span: &Span, t: f64) -> WheelPosition {
         let contact = self.target.at(span.place(t));
@@ -130,8 +133,8 @@ impl ToolPath {
         self.options.wheel_position(&contact, lifted).unwrap_or(none)
     }
 
-    /// Returns the height that rapid moves must clear at the parameter `t` of a track, in mm; NaN if the wheel cannot
-    /// touch there.
+    /// Returns the minimum height for rapid moves above one point of a track, in mm. The point is on `span` at the
+    /// curve parameter `t`. Returns NaN if the wheel cannot touch the surface at this point.
     fn clearance_height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
@@ -140,11 +143,12 @@ impl ToolPath {
             .map_or(f64::NAN, |stand| self.options.clearance_height_mm(&contact, lifted, &stand))
     }
 
-    /// Returns the largest height, in mm, that rapid moves must clear. It is searched in steps of about 1 mm along some
-    /// of the tracks; the safe height that is added to it covers the places between.
+    /// Returns the largest z, in mm, of the wheel along the tracks: rapid moves must be higher. At most about 200
+    /// tracks are searched, in steps of about 1 mm. The caller adds the safe height, which allows for the points
+    /// between.
     ///
     /// # Errors
-    /// Returns [`PathError::CannotTouch`] if the wheel cannot touch at one of these places.
+    /// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at one of the searched points.
     fn max_clearance_height_mm(&self) -> Result<f64, PathError> {
         let highest = |span: &Span| {
             let (from, to) = span.with_leads(&self.options);

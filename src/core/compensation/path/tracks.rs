@@ -51,7 +51,8 @@ impl Span {
         }
     }
 
-    /// Returns the length of the curve from the parameter 0 to `t`, seen along z, in mm.
+    /// Returns the arc length of the curve from the parameter 0 to the parameter `t`, projected onto the xy plane, in
+    /// mm. The length is negative if `t` is negative.
     #[inline]
     fn arc_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -60,8 +61,9 @@ impl Span {
         }
     }
 
-    /// Returns the derivative of the length of the track, seen along z, by the parameter at `t`, in mm per unit of the
-    /// parameter.
+    /// Returns the derivative of the arc length of the track with respect to the curve parameter, at the parameter `t`.
+    /// The arc length is projected onto the xy plane. The unit is mm per mm (1) on a straight track, and mm per rad on
+    /// a spiral.
     #[inline]
     pub(super) fn length_per_parameter_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -70,13 +72,15 @@ impl Span {
         }
     }
 
-    /// Returns the length of the track between the parameters `from` and `to`, seen along z, in mm.
+    /// Returns the length of the track between the curve parameters `from` and `to`, projected onto the xy plane, in
+    /// mm. The length is never negative.
     pub(super) fn length_mm(&self, from: f64, to: f64) -> f64 {
         (self.arc_mm(to) - self.arc_mm(from)).abs()
     }
 
-    /// Returns the parameter of the place that is `by_mm` along the track from the parameter `t`; `by_mm` can be
-    /// negative. On a spiral, Newton's method finds it.
+    /// Returns the curve parameter of the point whose arc length from the point with the parameter `t` is `by_mm`, in
+    /// mm. `by_mm` is positive in the direction of increasing parameter and can be negative. On a spiral, Newton's
+    /// method solves for the parameter.
     fn parameter_beyond(&self, t: f64, by_mm: f64) -> f64 {
         match self.curve {
             TrackCurve::Line { .. } => t + by_mm,
@@ -104,11 +108,13 @@ impl Span {
 }
 
 impl Tracks {
-    /// Lays tracks over the outline of the part, `track_mm` apart.
+    /// Computes the tracks, raster or spiral, over the outline of the part. `track_mm` is the distance between tracks
+    /// in the xy plane, in millimetres. On a raster it is the maximum: the distance is reduced so that a track runs
+    /// along each edge.
     ///
     /// # Errors
-    /// Returns [`PathError::TooManyTracks`] if the size of the part makes 1e6 tracks or more, and [`PathError::Empty`]
-    /// if no track is on the part.
+    /// Returns [`PathError::TooManyTracks`] if the size of the part requires 1e6 tracks or more, or is not a number.
+    /// Returns [`PathError::Empty`] if no track is on the part.
     pub(super) fn lay(outline: &Aperture, options: &PathOptions, track_mm: f64) -> Result<Self, PathError> {
         let [low, high] = outline.bounds();
         let size = [high[0] - low[0], high[1] - low[1]];
@@ -123,9 +129,11 @@ impl Tracks {
         if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }
     }
 
-    /// Returns how far the wheel is lifted off the surface at the parameter `t` of a track, in millimetres: s^2 / (2
-    /// rho) at a distance s beyond an end of `span`, with the lead radius rho of the options. Returns 0 between the
-    /// ends.
+    /// Returns the distance, in millimetres, by which the wheel is lifted off the surface at the curve parameter `t` of
+    /// the track `span`. Returns 0 between the two ends of the track.
+    ///
+    /// In the leads the distance is s^2 / (2 rho). s is the length from the nearer end of the track to the point at
+    /// `t`, projected onto the xy plane. rho is the lead radius of the options.
     #[inline]
     pub(super) fn lift_mm(&self, span: &Span, t: f64, options: &PathOptions) -> f64 {
         let ahead = (span.to - span.from).signum();
@@ -185,8 +193,9 @@ fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
     Tracks { spans, track_mm }
 }
 
-/// Returns the pieces of `curve` that are on the part or within `overrun_mm` of its outline, between the parameters
-/// `least` and `most`, in ascending order.
+/// Returns the pieces of `curve` that are on the part or at most `overrun_mm` outside its outline. Only the curve
+/// parameters from `least` to `most` are searched. The pieces are in ascending order of the parameter. Pieces shorter
+/// than 1/720 of this parameter range can be missed.
 fn on_part(curve: &Span, outline: &Aperture, overrun_mm: f64, least: f64, most: f64) -> Vec<Span> {
     let inside = |t: f64| {
         let [x, y] = curve.place(t);

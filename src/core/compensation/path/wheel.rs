@@ -79,8 +79,9 @@ impl Wheel {
         }
     }
 
-    /// Returns the principal curvatures of the wheel at the contact with this `normal`, in 1/mm: first around the
-    /// spindle, then across. The returned unit vector is the direction of the first curvature.
+    /// Returns the two principal curvatures of the wheel at the contact point, in 1/mm, and the unit vector of the
+    /// direction of the first one. `normal` is the unit normal of the surface at the contact. The first curvature is in
+    /// the direction of rotation about the spindle. The second is at a right angle to it, along the profile of the rim.
     pub(super) fn curvatures(&self, normal: &Vector) -> ([f64; 2], Vector) {
         match self {
             Self::Sphere { radius_mm } => ([1.0 / radius_mm; 2], normal.cross(&Vector::y()).normalize()),

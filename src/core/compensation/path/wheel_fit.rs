@@ -23,12 +23,16 @@ const MARGIN: f64 = 1.05;
 const MAX_BODY_DEPTH_MM: f64 = 1e-4;
 /// Maximum slope that a wheel can grind. On steeper slopes the machine's spindle is in the way.
 const MAX_SLOPE_RAD: f64 = 1.2;
-/// Checks at places all over the part that the wheel fits the surface `wanted`. Returns the distance between tracks,
-/// seen along z, in mm: the distance of the options, or the largest distance at which the scallops stay within their
-/// limit everywhere.
+/// Checks that the wheel fits the surface `wanted` on a grid of places over the part and along its border. Returns the
+/// distance between tracks, projected onto the xy plane, in mm.
+///
+/// If the options give this distance, it is returned. If they give a maximum scallop height instead, the result is the
+/// largest distance at which no scallop (ridge between tracks) is higher, up to the limit in the options.
 ///
 /// # Errors
-/// Returns the error at the place where the wheel fits worst.
+/// Returns an error if the wheel does not fit at one of the places. If a hollow is too narrow at every failing place,
+/// the error describes the place that requires the smallest wheel. Returns [`PathError::Empty`] if there is no place on
+/// the part.
 pub(super) fn track_mm(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let places = places(outline, PLACES);
     let one = |place: &[f64; 2]| fit_at(&wanted.curvature_at(*place), *place, outline, options);
@@ -47,9 +51,12 @@ pub(super) fn may_fit(wanted: &TargetSurface, outline: &Aperture, options: &Path
     places(outline, FEW).iter().all(|place| fit_at(&wanted.curvature_at(*place), *place, outline, options).is_ok())
 }
 
-/// Combines the results of [`fit_at`] at two places: returns the smaller distance, or the error if there is one. Of two
-/// [`PathError::Hollow`] errors, returns the one that requires the greater reduction of the wheel, because that wheel
-/// fits at both places. Of two other errors, returns `a`, so that the same path always gives the same message.
+/// Combines the results of [`fit_at`] at two places. Returns the smaller of two distances. Returns the error if only
+/// one result is an error.
+///
+/// If both are [`PathError::Hollow`], returns the error that requires the smaller wheel, because this wheel fits at
+/// both places. If both are errors and at least one is another error, returns `a`, so that the same path always gives
+/// the same message.
 fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
     let room = |e: &PathError| match e {
         PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
@@ -62,8 +69,8 @@ fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64,
     }
 }
 
-/// Returns places `[x, y]` on the part, in mm: the points of a `count` x `count` grid that lie on the part, and 4
-/// `count` points on its border.
+/// Returns test places `[x, y]` on the part, in mm. They are the points of a `count` x `count` grid over the bounding
+/// box that lie on the part, followed by 4 x `count` points on the border of the part.
 fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let mut places = on_grid(outline, count);
     places.extend(outline.outline_mm(4 * count));
@@ -78,12 +85,16 @@ pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     grid.filter(|[x, y]| outline.contains(*x, *y)).collect()
 }
 
-/// Checks slope, contact and hollows at one place of the part; `bend` are the curvatures of the surface there. Returns
-/// the distance between tracks, seen along z, in mm, at which the scallops reach their maximum height. Returns infinity
-/// if the options give the distance itself.
+/// Checks at one place of the part that the wheel fits the surface: slope, contact and radius of hollows. `bend` holds
+/// normal and curvatures of the surface at `place`, `[x, y]` in mm.
+///
+/// Returns the distance between tracks, projected onto the xy plane, in mm, at which the scallops (ridges between
+/// tracks) reach the maximum height in the options. Returns infinity if the options give the distance between tracks
+/// instead of a height.
 ///
 /// # Errors
-/// Returns an error if the surface is too steep, if the rim cannot touch, or if a hollow is too narrow for the wheel.
+/// Returns an error if the surface is not finite or too steep, if the rim cannot touch, or if a hollow is too narrow
+/// for the wheel.
 fn fit_at(
     bend: &SurfaceCurvature,
     place: [f64; 2],
@@ -116,16 +127,20 @@ fn fit_at(
     Ok((8.0 * height / groove.curvature_per_mm).sqrt() / groove.stretch)
 }
 
-/// Returns the second fundamental form of the wheel at the contact, in 1/mm, in the two tangent directions of `bend`:
-/// curvature along the first, mixed term, curvature along the second.
+/// Returns the second fundamental form (the curvatures) of the wheel at the contact point, in 1/mm. The three values
+/// are the curvature in the first tangent direction of `bend`, the mixed term, and the curvature in the second tangent
+/// direction.
 pub(super) fn wheel_curvatures(bend: &SurfaceCurvature, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
     let [c, s] = [0, 1].map(|k| direction.dot(&bend.tangents[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
 }
 
-/// Returns the error for a hollow that is too narrow for the wheel, with the direction in which the wheel has the least
-/// room. `bend` are the curvatures of the surface at `[x_mm, y_mm]`, `wheel` those of the wheel ([`wheel_curvatures`]).
+/// Returns the error for a hollow of the surface that is too narrow for the wheel. The error names the tangent
+/// direction in which the wheel has the least clearance.
+///
+/// `bend` holds the curvatures of the surface at `[x_mm, y_mm]`. `wheel` holds the second fundamental form of the wheel
+/// at this contact, in 1/mm, from [`wheel_curvatures`].
 fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
     let in_direction = |q: &[f64; 3], angle: f64| {
         let (s, c) = angle.sin_cos();
@@ -145,15 +160,17 @@ fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> 
     }
 }
 
-/// Checks that the body of the wheel does not cut the part away from the contact point. Places all over the part are
-/// tried as contacts, each against all surface points within reach of the wheel.
+/// Checks that the body of the wheel does not cut into the part away from the contact point. Contacts all over the part
+/// are tested. For each contact, all sampled surface points within the radius of the wheel are tested. A cut of up to
+/// 0.1 µm is allowed.
 ///
-/// The check of the curvatures shows that a wheel fits near its contact. This check finds a touch elsewhere: of the far
-/// side of a cup, the flank of a disc, or the opposite wall of a valley.
+/// Another check compares the curvatures of wheel and surface, and shows only that the wheel fits near the contact.
+/// This check finds collisions of other areas: the far side of a cup, the flank of a disc, or the opposite wall of a
+/// valley.
 ///
 /// # Errors
-/// Returns [`PathError::CannotTouch`] if the wheel cannot touch at one of the places, otherwise [`PathError::Body`] for
-/// the deepest cut.
+/// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at one of the contacts. Otherwise returns
+/// [`PathError::Body`] for the deepest cut.
 pub(super) fn check_body(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> Result<(), PathError> {
     let ground: Vec<([f64; 2], Point)> =
         places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();

@@ -8,8 +8,9 @@ const COMMON: Hyperparameters =
 const SESSION_FIELD: Field = Field::new(4e-3, 150.0);
 const POINTS_PER_SESSION: usize = 40;
 
-/// Simulates points of a part of 102 x 62 mm that is measured in several sessions, each with a random field of its own:
-/// first the known sessions, then the unseen ones, of the same part.
+/// Simulates measurements of one part of 102 x 62 mm in several sessions. Each session has 40 points and an additional
+/// random field with the standard deviation `own_mm`. `known` and `unseen` are the numbers of sessions in the two
+/// groups. Returns the known sessions, then the unseen sessions.
 fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
     let n = POINTS_PER_SESSION * (known + unseen) as usize;
     let places: Vec<[f64; 2]> = (0..n)
@@ -33,7 +34,9 @@ fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
     [of(0..known), of(known..known + unseen)]
 }
 
-/// Returns a session after its best fit of height and tilts.
+/// Returns the observations of one session. A best fit of height and two tilts is subtracted from its deviations.
+/// `places` and `found` have the positions and the deviations of all sessions, in mm. `session` is the index of the
+/// session.
 fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observations {
     let rows = session * POINTS_PER_SESSION..(session + 1) * POINTS_PER_SESSION;
     let (places, found) = (&places[rows.clone()], &found[rows]);
@@ -42,7 +45,8 @@ fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observations {
     Observations { fixed_effects: effects, ..Observations::without_effects(places.to_vec(), left) }
 }
 
-/// Returns the share of the deviations of the unseen sessions that lie within the 95 % interval.
+/// Returns the share (0 to 1) of the deviations of the unseen sessions that lie within their 95 % prediction intervals.
+/// The intervals are predicted from the known sessions with `between`.
 fn within(between: &BetweenSessionVariance, [known, unseen]: &[Sessions; 2]) -> f64 {
     let told = between.predict(known, unseen).unwrap();
     let hit = told.iter().zip(unseen.deviations_mm());

@@ -50,7 +50,7 @@ impl Conic {
         Ok(Self { curvature_per_mm, conic: error::check_finite("conic", conic)? })
     }
 
-    /// Returns the curvature at the vertex in 1/mm.
+    /// Returns the curvature at the vertex in 1/mm: positive if the centre of curvature is at +z, 0 for a plane.
     pub fn curvature_per_mm(&self) -> f64 {
         self.curvature_per_mm
     }
@@ -79,10 +79,11 @@ impl TryFrom<&ConicDefinition> for Conic {
     }
 }
 
-/// Returns the checked conic to which polynomials are added; the plane if `written` is `None`.
+/// Checks the conic `written` in the definition, to which polynomials are added, and returns it. Returns the plane if
+/// `written` is `None`.
 ///
 /// # Errors
-/// Returns an error if the radius or the conic constant is not valid.
+/// Returns an error if the radius or the conic constant is not valid. The key in the error starts with `base`.
 pub(super) fn base_conic(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
     written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.in_table("base")))
 }
@@ -150,7 +151,8 @@ impl Asphere {
         Some((sag, slope))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation sums, as a measure of its computing time: the conic and all
+    /// powers.
     pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }

@@ -260,10 +260,11 @@ impl Formula {
 }
 
 impl SamplingDefinition {
-    /// Checks the values, and returns the rule for the node spacing.
+    /// Checks the two keys `spacing_mm` and `accuracy_nm`. Returns the rule for the node spacing: a fixed spacing, or
+    /// an accuracy from which the spacing is computed.
     ///
     /// # Errors
-    /// Returns an error if a value is outside its range, or if not exactly one of the two keys is given.
+    /// Returns an error if a value is outside its range, or if none or both of the keys are given.
     fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
             (Some(spacing), None) => {
@@ -283,12 +284,14 @@ impl SamplingDefinition {
 }
 
 impl DefinedSurface {
-    /// Joins a formula with the outline of the part. Both are in the frame of the surface.
+    /// Joins a formula with the aperture (the outline of the part) and the rule for the node spacing. Formula and
+    /// aperture are in the frame of the surface.
     ///
     /// # Errors
-    /// Returns an error if the aperture is not a valid outline, reaches beyond the normalisation radius or to a place
-    /// where the formula has no value, or does not contain the centre of an off-axis section in the frame of its
-    /// parent.
+    /// Returns an error if the aperture is not a valid outline, reaches beyond the normalisation radius of the
+    /// polynomials, or contains a place where the formula has no value. Returns an error for an off-axis section that
+    /// is described in the frame of its parent (the whole surface), if the aperture does not contain the centre of the
+    /// section.
     pub fn new(formula: AnalyticSurface, aperture: Aperture, sampling: Sampling) -> Result<Self, DefinitionError> {
         aperture.validate()?;
         if let AnalyticSurface::OffAxis(section) = &formula {
@@ -319,7 +322,7 @@ impl DefinedSurface {
         SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| with_location(text, error))
     }
 
-    /// Returns the formula.
+    /// Returns the formula of the surface, without the aperture.
     pub fn formula(&self) -> &AnalyticSurface {
         &self.formula
     }
@@ -329,23 +332,23 @@ impl DefinedSurface {
         &self.aperture
     }
 
-    /// Returns the rule for the node spacing.
+    /// Returns the rule for the node spacing: a fixed spacing, or an accuracy from which the spacing is computed.
     pub fn sampling(&self) -> Sampling {
         self.sampling
     }
 }
 
-/// Adds line and column to an error about a value. Returns the error unchanged if the text does not contain the key of
-/// the value.
+/// Adds line and column in `text` to an error about a value. Returns the error unchanged if it has no key, or if `text`
+/// contains neither the key nor a table on its path.
 fn with_location(text: &str, error: DefinitionError) -> DefinitionError {
     let Some(span) = error.key().and_then(|key| key_span(text, &key)) else { return error };
     let (line, column) = line_and_column(text, span.start);
     DefinitionError::Located { line, column, source: Box::new(error) }
 }
 
-/// Returns the byte range of the value of a key; `path` is the path of the key, such as `surface.radius_mm`. If the
-/// text does not contain the key, returns the range of the name of the innermost table on the path; `None` if there is
-/// no such table either.
+/// Returns the byte range in `text` of the value of a key. `path` is the path of the key, such as `surface.radius_mm`.
+/// If the key is missing, returns the range of the name of the innermost table on the path that exists. Returns `None`
+/// if none of these tables exists, or if `text` is not TOML.
 fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     let root = DeTable::parse(text).ok()?;
     let mut table = root.get_ref();
@@ -361,11 +364,12 @@ fn key_span(text: &str, path: &str) -> Option<Range<usize>> {
     found
 }
 
-/// Converts the table `{ kind = "a", b = 1 }` to `{ a = { b = 1 } }`, for the enums whose variant is an outer key.
-/// Every value keeps its place in the text. `name` is the name of the table, for messages.
+/// Converts the table `{ kind = "a", b = 1 }` to `{ a = { b = 1 } }`. The second form is needed to read an enum whose
+/// variant is an outer key. `text` is the whole TOML text, and `name` is the name of the table; both are for error
+/// messages. Each value keeps its position in `text`, so that later errors give the correct line.
 ///
 /// # Errors
-/// Returns an error with line and column if the value is no table, or if `kind` is missing or no string.
+/// Returns an error with line and column if `table` is not a table, or if `kind` is missing or not a string.
 fn deserialize_by_kind<'t>(
     text: &str,
     name: &str,
@@ -387,7 +391,8 @@ fn deserialize_by_kind<'t>(
     Ok(ValueDeserializer::from(Spanned::new(span, DeValue::Table(outer))))
 }
 
-/// Creates an error with the line and column of the byte range `span`; at the start of the text if `span` is `None`.
+/// Creates a TOML error with `message`, and with the line and column where the byte range `span` of `text` starts. Uses
+/// the start of `text` if `span` is `None`.
 fn toml_error(text: &str, span: Option<Range<usize>>, message: &str) -> DefinitionError {
     let (line, column) = line_and_column(text, span.map_or(0, |span| span.start));
     DefinitionError::Toml { line, column, message: message.to_owned() }

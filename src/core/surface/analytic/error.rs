@@ -86,14 +86,14 @@ pub enum DefinitionError {
 }
 
 impl DefinitionError {
-    /// Creates the error for a value outside its range. `key` is the path of the key; `limit` and `remedy` are texts
-    /// for the message.
+    /// Creates the error for a value outside its range. `key` is the path of the key in the definition file. `limit` is
+    /// a text with the valid range, and `remedy` is a text that says what to do.
     pub(super) fn out_of_range(key: &str, value: f64, limit: &'static str, remedy: &'static str) -> Self {
         Self::OutOfRange { key: key.to_owned(), value, limit, remedy }
     }
 
-    /// Puts `table`, the name of the enclosing table, and a dot before the key of the error. Errors without a stored
-    /// key do not change.
+    /// Puts `table`, the name of the enclosing table, and a dot before the key of the error, so that `radius_mm`
+    /// becomes `surface.radius_mm`. Returns errors that store no key unchanged.
     pub(super) fn in_table(mut self, table: &str) -> Self {
         match &mut self {
             Self::OutOfRange { key, .. }
@@ -127,10 +127,10 @@ impl DefinitionError {
     }
 }
 
-/// Returns `value` unchanged if it is finite.
+/// Returns `value` unchanged if it is finite. `key` is the name of the key in the definition file.
 ///
 /// # Errors
-/// Returns an error about `key` if the value is infinite or NaN.
+/// Returns an error that names `key` if the value is infinite or NaN.
 pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
     if value.is_finite() {
         return Ok(value);
@@ -138,10 +138,11 @@ pub(super) fn check_finite(key: &str, value: f64) -> Result<f64, DefinitionError
     Err(DefinitionError::out_of_range(key, value, "a finite number", "write a number, or remove the key"))
 }
 
-/// Returns the curvature in 1/mm for a radius of curvature, which may be infinite.
+/// Returns the curvature in 1/mm for the radius of curvature `radius_mm`. An infinite radius gives the curvature 0.
+/// `key` is the name of the key in the definition file.
 ///
 /// # Errors
-/// Returns an error about `key` if the radius is NaN or less than 1e-6 mm in magnitude.
+/// Returns an error that names `key` if the radius is NaN or less than 1e-6 mm in magnitude.
 pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionError> {
     if radius_mm.abs() >= 1e-6 {
         return Ok(1.0 / radius_mm);
@@ -150,10 +151,11 @@ pub(super) fn checked_curvature(key: &str, radius_mm: f64) -> Result<f64, Defini
     Err(DefinitionError::out_of_range(key, radius_mm, limit, "for no curvature write inf"))
 }
 
-/// Returns `length_mm` unchanged if it is positive and at most 1e6 mm.
+/// Returns `length_mm` unchanged if it is positive and at most 1e6 mm. `key` is the name of the key in the definition
+/// file.
 ///
 /// # Errors
-/// Returns an error about `key` for any other length.
+/// Returns an error that names `key` for any other length, and for NaN.
 pub(super) fn check_positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError> {
     if length_mm > 0.0 && length_mm <= 1e6 {
         return Ok(length_mm);

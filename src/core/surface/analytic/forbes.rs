@@ -42,10 +42,11 @@ pub struct QconDefinition {
 }
 
 impl Qcon {
-    /// Returns the sag z and the derivative dz/dq for q = h^2, where h is the distance from the axis. Returns `None` at
-    /// the edge of the conic and beyond, and farther than 1.5 normalisation radii from the axis.
+    /// Returns the sag z of the Qcon asphere and its derivative dz/dq, where `q` = h^2 and h is the distance from the
+    /// axis. Returns `None` at the edge of the base conic (where its slope is infinite) and beyond. Also returns `None`
+    /// farther than 1.5 normalisation radii from the axis.
     ///
-    /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
+    /// Units: `q` in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
         let (sag, slope) = self.base.sag_and_derivative(q)?;
         let [v, per_mm2] = square(q, self.normalisation_radius_mm)?;
@@ -95,10 +96,11 @@ pub struct QbfsDefinition {
 }
 
 impl Qbfs {
-    /// Returns the sag z and the derivative dz/dq for q = h^2, where h is the distance from the axis. Returns `None` at
-    /// the edge of the best-fit sphere and beyond, and farther than 1.5 normalisation radii from the axis.
+    /// Returns the sag z of the Qbfs asphere and its derivative dz/dq, where `q` = h^2 and h is the distance from the
+    /// axis. Returns `None` at the edge of the best-fit sphere (where its slope is infinite) and beyond. Also returns
+    /// `None` farther than 1.5 normalisation radii from the axis.
     ///
-    /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
+    /// Units: `q` in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
         let (sag, slope) = self.sphere.sag_and_derivative(q)?;
         let [v, per_mm2] = square(q, self.normalisation_radius_mm)?;
@@ -129,8 +131,8 @@ impl TryFrom<&QbfsDefinition> for Qbfs {
     }
 }
 
-/// Returns u^2 and its derivative with respect to q. Here q = h^2 in mm^2, h is the distance from the axis, and u = h /
-/// `normalisation_radius_mm`. Returns `None` farther than 1.5 normalisation radii from the axis.
+/// Returns [u^2, d(u^2)/dq], where u = h / `normalisation_radius_mm`, h is the distance from the axis in mm, and `q` =
+/// h^2 in mm^2. The derivative is in 1/mm^2. Returns `None` farther than 1.5 normalisation radii from the axis.
 fn square(q: f64, normalisation_radius_mm: f64) -> Option<[f64; 2]> {
     let per_mm2 = 1.0 / (normalisation_radius_mm * normalisation_radius_mm);
     let v = q * per_mm2;
@@ -140,7 +142,8 @@ fn square(q: f64, normalisation_radius_mm: f64) -> Option<[f64; 2]> {
 /// Returns the coefficients unchanged if there are at most 200 and all are finite.
 ///
 /// # Errors
-/// Returns an error about the first coefficient that is too many or not finite.
+/// Returns an error that names the first coefficient that is not finite, or coefficient 200 (counted from 0) if there
+/// are more than 200.
 fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError> {
     let expected = "at most 200 coefficients are summed";
     if coefficients_mm.len() > MAX_COEFFICIENTS {
@@ -153,9 +156,10 @@ fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError
 }
 
 /// Converts the coefficients `a` of the polynomials Qbfs_m to the coefficients of the polynomials P_m of [`p_series`],
-/// Forbes 2010, eq. (A.13) to (A.16) and (3.8).
+/// by Forbes 2010, eq. (A.13) to (A.16) and (3.8). Both lists have the same length and unit.
 ///
-/// P_m = f_m Qbfs_m + g_(m-1) Qbfs_(m-1) + h_(m-2) Qbfs_(m-2). So the coefficients of P follow from the last one down.
+/// P_m = f_m Qbfs_m + g_(m-1) Qbfs_(m-1) + h_(m-2) Qbfs_(m-2), with the constants f, g and h of Forbes. So the
+/// coefficients of P are computed from the last one to the first.
 fn p_coefficients(a: &[f64]) -> Vec<f64> {
     let count = a.len();
     let (mut f, mut g, mut h) = (vec![2.0, 19f64.sqrt() / 2.0], vec![-0.5], vec![]);
@@ -174,8 +178,8 @@ fn p_coefficients(a: &[f64]) -> Vec<f64> {
     b
 }
 
-/// Returns sum b_m P_m(v) and its derivative with respect to v, by Clenshaw's recurrence, Forbes 2010, eq. (3.9) and
-/// (3.10).
+/// Returns the sum of b_m P_m(v) over all m, and the derivative of this sum with respect to `v`. `b` contains the
+/// coefficients b_m. Uses Clenshaw's recurrence, Forbes 2010, eq. (3.9) and (3.10).
 ///
 /// P_0 = 2, P_1 = 6 - 8v, P_(m+1) = (2 - 4v) P_m - P_(m-1).
 fn p_series(b: &[f64], v: f64) -> (f64, f64) {

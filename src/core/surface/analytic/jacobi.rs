@@ -1,11 +1,11 @@
 //! Jacobi polynomials P_k^(0, b), the common root of Zernike's and Forbes' polynomials.
 
-/// Sums series of Jacobi polynomials: returns sum_k c_k P_k^(0, b)(t) and its derivative with respect to t, for N
-/// series at once.
+/// Sums N series of Jacobi polynomials at once. Returns for each series the sum over k of c_k P_k^(0, b)(t), and its
+/// derivative with respect to `t`.
 ///
-/// Shapes: `coefficients[k]` holds the k-th coefficient of every series. The three-term recurrence (Abramowitz and
-/// Stegun, 22.7.1, alpha = 0) runs upwards, which is stable for t in [-1, 1]. Its derivative is taken term by term, so
-/// that it is exact.
+/// Shapes: `coefficients[k]` contains the k-th coefficient of every series. The three-term recurrence (Abramowitz and
+/// Stegun, 22.7.1, alpha = 0) runs from low to high degree, which is stable for `t` in [-1, 1]. The recurrence itself
+/// is differentiated, so the derivative is exact and no difference quotient.
 pub(super) fn series<const N: usize>(coefficients: &[[f64; N]], b: u32, t: f64) -> [(f64, f64); N] {
     let b = f64::from(b);
     let mut sums = [(0.0, 0.0); N];
@@ -30,8 +30,8 @@ pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
     }
 }
 
-/// Returns the Jacobi polynomial P_n^(0, b) and its derivative at t, by the three-term recurrence from those of degree
-/// n - 1 (`here`) and n - 2 (`below`).
+/// Returns the value and the derivative of the Jacobi polynomial P_n^(0, b) at `t`, by the three-term recurrence.
+/// `here` is the pair (value, derivative) of degree n - 1, and `below` the pair of degree n - 2. `n` is at least 1.
 fn step(n: f64, b: f64, t: f64, here: (f64, f64), below: (f64, f64)) -> (f64, f64) {
     if n == 1.0 {
         // The general step divides 0 by 0 here when b is 0.

@@ -89,13 +89,14 @@ impl AnalyticSurface {
         self.sag_and_gradient(x, y).map(|(z, _)| z)
     }
 
-    /// Returns the unit normal on the +z side at (x, y), in millimetres; `None` if the formula has no value or no
-    /// finite slope there.
+    /// Returns the unit normal on the +z side of the surface at (`x`, `y`), which are in millimetres. Returns `None` if
+    /// the formula has no value or no finite slope at this place.
     pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
         self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
     }
 
-    /// Returns the normalisation radius, the radius of the disc on which the polynomials are defined; `None` if the
+    /// Returns the normalisation radius in mm: the radius of the disc on which the polynomials of the formula are
+    /// defined. For an off-axis section, this is the radius of its parent (the whole surface). Returns `None` if the
     /// formula is not limited to a disc.
     fn normalisation_radius_mm(&self) -> Option<f64> {
         match self {
@@ -107,8 +108,8 @@ impl AnalyticSurface {
         }
     }
 
-    /// Returns the distance from the axis of the formula to the farthest point of an aperture, in millimetres. For an
-    /// off-axis section this is the axis of its parent.
+    /// Returns the largest distance, in mm, between the axis of the formula and a point of `aperture`. For an off-axis
+    /// section, the axis is that of its parent (the whole surface).
     fn reach_mm(&self, aperture: &Aperture) -> f64 {
         let Self::OffAxis(section) = self else { return aperture.reach_mm() };
         let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
@@ -137,7 +138,8 @@ fn normal_from_gradient([gx, gy]: [f64; 2]) -> Vector {
 
 #[cfg(test)]
 mod test_support {
-    /// Places on a disc: the axis, rings of 24 in an irregular rhythm, and a last ring near the rim.
+    /// Returns 241 test places (x, y) on a disc of the given radius: the centre, and ten rings of 24 places. The
+    /// distances between the rings are irregular. The outermost ring is at 0.99 of the radius.
     pub fn disc(radius: f64) -> Vec<[f64; 2]> {
         let ring = |r: f64| {
             (0..24).map(move |i| {
@@ -149,8 +151,9 @@ mod test_support {
         std::iter::once([0.0, 0.0]).chain(rings).collect()
     }
 
-    /// Returns the largest error of a gradient at the places of [`disc`]. Compares the gradient of `surface`, which
-    /// returns sag and gradient at (x, y), with central differences of fourth order of the sag.
+    /// Returns the largest error of a gradient at the places of [`disc`] with the given radius. `surface` returns the
+    /// sag and its gradient at (x, y). The error is the difference between this gradient and a numerical gradient,
+    /// computed from the sag by central differences of fourth order. Panics if `surface` returns `None` at a place.
     pub fn gradient_error(surface: &impl Fn(f64, f64) -> Option<(f64, [f64; 2])>, radius: f64) -> f64 {
         let h = 5e-4 * radius;
         let difference =

@@ -94,8 +94,9 @@ impl OffAxis {
         &self.parent
     }
 
-    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y) in the frame of the section. Returns `None` if the
-    /// parent has no value or no finite slope there, or if, in the tilted frame, the surface does not face +z there.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (`x`, `y`) in the frame of the section. Returns `None` if
+    /// the parent (the whole surface) has no value or no finite slope at this place. In the tilted frame, also returns
+    /// `None` if no surface point that faces +z is found at this place.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -109,8 +110,9 @@ impl OffAxis {
         }
     }
 
-    /// Converts the place (x, y) in the frame of the section to the place in the xy plane of the parent's frame.
-    /// Returns `None` if the section, in the tilted frame, has no value at this place.
+    /// Converts the place (`x`, `y`) in the frame of the section to the frame of its parent (the whole surface).
+    /// Returns x and y of the same surface point in the parent's frame. Returns `None` if, in the tilted frame, the
+    /// section has no value at this place.
     ///
     /// Units: millimetres.
     pub(super) fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
@@ -125,12 +127,15 @@ impl OffAxis {
         }
     }
 
-    /// Returns the sag z at (x, y) in the tilted frame, and its gradient. Solves p_z = f(p_x, p_y) for z by Newton's
-    /// method, with p = centre + R (x, y, z); f is the sag of the parent, and R rotates the tilted frame to the
-    /// parent's frame. `start` is the first estimate of z. Returns `None` if the iteration does not converge.
+    /// Returns the sag z at (`x`, `y`) in the tilted frame of the section, and its gradient (dz/dx, dz/dy). Solves p_z
+    /// = f(p_x, p_y) for z by Newton's method, with p = centre + R (x, y, z). Here f is the sag of the parent (the
+    /// whole surface), and R rotates the tilted frame to the parent's frame. `start` is the first estimate of z in mm.
     ///
-    /// The gradient follows from the implicit function theorem: with m = R^T (-f_x, -f_y, 1), a normal in the tilted
-    /// frame, it is (-m_x / m_z, -m_y / m_z).
+    /// Returns `None` if the iteration does not converge in 30 steps, meets a place where the parent has no value, or
+    /// meets a place where the surface does not face +z.
+    ///
+    /// The gradient follows from the implicit function theorem. With the normal m = R^T (-f_x, -f_y, 1) in the tilted
+    /// frame, the gradient is (-m_x / m_z, -m_y / m_z).
     fn newton(&self, x: f64, y: f64, start: f64) -> Option<(f64, [f64; 2])> {
         let mut z = start;
         let scale = self.centre.coords.amax().max(x.abs()).max(y.abs());
@@ -166,7 +171,8 @@ impl OffAxis {
         Some((z, gradient))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation sums, as a measure of its computing time. In the tilted frame,
+    /// this is five times the number of the parent surface, because Newton's method takes about five steps.
     pub(super) fn term_count(&self) -> usize {
         // Newton's method takes some five steps.
         self.parent.term_count() * if self.frame == SectionFrame::Tilted { 5 } else { 1 }

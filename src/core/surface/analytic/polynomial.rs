@@ -67,7 +67,8 @@ impl XyPolynomial {
         Some((z, [gx, gy]))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation sums, as a measure of its computing time: the base conic and all
+    /// powers.
     pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }

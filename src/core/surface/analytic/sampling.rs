@@ -41,11 +41,12 @@ pub struct SampledSurface {
 }
 
 impl DefinedSurface {
-    /// Samples the surface on a grid that covers the bounding box of the aperture, and one ring of nodes around the
-    /// box.
+    /// Samples the surface on a grid. The grid covers the bounding box of the aperture, and one more ring of nodes
+    /// around this box. `spacing_mm` is the largest node spacing. The spacing along x and along y is reduced a little,
+    /// so that each divides the side of the box.
     ///
-    /// Units: millimetres. The spacing along x and along y is reduced a little, so that it divides the sides of the
-    /// box. Nodes farther than 1.5 spacings outside the aperture, and nodes at which the formula has no value, are NaN.
+    /// Units: millimetres. A node is NaN if it is farther than 1.5 spacings outside the aperture, or if the formula has
+    /// no value at this node.
     ///
     /// # Errors
     /// Returns an error if the spacing is not positive or above 1e6 mm, if there would be more than 2e7 nodes, or if
@@ -72,11 +73,11 @@ impl DefinedSurface {
         })
     }
 
-    /// Returns the node spacing in millimetres that the definition gives. If it gives an accuracy instead, finds the
-    /// spacing for this accuracy.
+    /// Returns the node spacing in mm. If the definition gives an accuracy instead of a spacing, computes the spacing
+    /// that reaches this accuracy.
     ///
     /// # Errors
-    /// Returns an error if the accuracy is not positive, or if no spacing reaches it.
+    /// Returns an error if the accuracy is not positive, or if no spacing reaches the accuracy.
     pub fn spacing_mm(&self) -> Result<f64, DefinitionError> {
         match self.sampling() {
             Sampling::Spacing { spacing_mm } => Ok(spacing_mm),
@@ -84,15 +85,16 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns a node spacing in mm at which the surface between the nodes differs from the formula by at most
-    /// `accuracy_mm`.
+    /// Returns a node spacing in mm at which the interpolated surface between the nodes differs from the formula by at
+    /// most `accuracy_mm`. The difference is estimated along the normal.
     ///
-    /// In cells about fixed places all over the aperture and along its outline, the cubic triangles between the nodes
-    /// are compared with the formula, along the normal. The spacing is halved and then bisected until twice the largest
-    /// difference is within `accuracy_mm`.
+    /// Tests square cells at fixed places over the whole aperture and along its outline. In each cell, compares the
+    /// formula with the cubic triangles that interpolate between the nodes. The spacing starts at an eighth of the
+    /// shorter side of the aperture's bounding box. It is halved until twice the largest difference is within
+    /// `accuracy_mm`, and then refined by bisection.
     ///
     /// # Errors
-    /// Returns an error if the accuracy is not positive, or if no spacing reaches it.
+    /// Returns an error if the accuracy is not positive, or if 14 halvings do not reach the accuracy.
     fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
         error::check_positive("sampling.accuracy_mm", accuracy_mm)?;
         let [least, most] = self.aperture().bounds();
@@ -122,7 +124,8 @@ impl DefinedSurface {
         Ok(fine)
     }
 
-    /// Checks the cost of a sampling with this number of nodes. `spacing_mm` is for the message.
+    /// Checks that a sampling with this number of nodes is not too large. `spacing_mm` is the node spacing, for the
+    /// error message only.
     ///
     /// # Errors
     /// Returns an error if there are more than 2e7 nodes, or if the computation would take more than about a minute.
@@ -149,11 +152,11 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns the largest error of the cubic triangles, in millimetres, in the square cell about (x, y) whose side is
-    /// `h` mm.
+    /// Returns the largest error, in mm, of the cubic triangles that interpolate the surface in the square cell with
+    /// the centre (`x`, `y`) and the side `h` in mm.
     ///
-    /// The error is infinite if a cell of this size that contains the place can have a corner at which the formula has
-    /// no value. The sampled surface could then have a gap at the place.
+    /// Returns infinity if the formula has no value at a corner of the cell, or at a corner of the square with twice
+    /// the side. A grid with this spacing could then have a gap at (`x`, `y`).
     fn cell_error(&self, [x, y]: [f64; 2], h: f64) -> f64 {
         let corner = |i: f64, j: f64| {
             let place = [x + (i - 0.5) * h, y + (j - 0.5) * h];
@@ -190,12 +193,13 @@ const TEST_WEIGHTS: [[f64; 3]; 7] = [
     [0.25, 0.25, 0.5],
 ];
 
-/// Returns the sag, at the barycentric `weights`, of the cubic triangle through three corners with given places, sags
-/// and gradients.
+/// Returns the sag of a cubic triangle at one point, in mm. The three corners have the given `places` (x, y), `sags`
+/// and `gradients`. `weights` are the barycentric coordinates of the point.
 ///
-/// Along each edge it is the cubic Hermite polynomial. The one free coefficient, in the middle, is chosen so that
-/// quadratics are exact: in Bernstein's form it is a quarter of the sum of the six edge coefficients, minus a sixth of
-/// the sum of the three corner coefficients. With the edge length h the error is O(h^4) on the edges and O(h^3) inside.
+/// Along each edge the triangle is the cubic Hermite polynomial. One coefficient, in the middle, is free. It is chosen
+/// so that quadratic surfaces are exact: in Bernstein's form it is a quarter of the sum of the six edge coefficients,
+/// minus a sixth of the sum of the three corner coefficients. With the edge length h, the error is O(h^4) on the edges
+/// and O(h^3) inside.
 fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f64; 2]; 3], weights: [f64; 3]) -> f64 {
     let (mut sag, mut edge_sum) = (0.0, 0.0);
     for i in 0..3 {

@@ -39,8 +39,9 @@ pub struct ToroidDefinition {
 }
 
 impl Toroid {
-    /// Creates a toroid: `curve`, in the (y, z) plane, rotated about a line parallel to y at the distance `radius_x_mm`
-    /// from the vertex. An infinite radius makes a cylinder.
+    /// Creates a toroid. The curve `curve` in the (y, z) plane is rotated about a line that is parallel to y and meets
+    /// the z axis at z = `radius_x_mm`. A negative radius puts this line on the -z side. An infinite radius makes a
+    /// cylinder along x.
     ///
     /// # Errors
     /// Returns an error if the radius is NaN or less than 1e-6 mm in magnitude.
@@ -48,8 +49,9 @@ impl Toroid {
         Ok(Self { rotation_per_mm: error::checked_curvature("radius_x_mm", radius_x_mm)?, curve })
     }
 
-    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` if the circle of rotation does not
-    /// reach x, or if the curve has no value at y.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` if y is at or beyond the edge of the
+    /// curve. Returns `None` if |x| is not less than the radius of the circle on which the curve point at y rotates, or
+    /// if this curve point is not on the vertex side of the axis of rotation.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -64,7 +66,8 @@ impl Toroid {
         Some((g + c * x * x / (w + root), [c * x / root, w * 2.0 * y * slope / root]))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation of the sag sums, as a measure of its time: the terms of the
+    /// curve plus 1 for the rotation.
     pub(super) fn term_count(&self) -> usize {
         1 + self.curve.term_count()
     }

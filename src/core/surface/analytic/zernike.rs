@@ -121,7 +121,8 @@ impl Zernike {
         Some((sag + z, [2.0 * x * slope + gu * scale, 2.0 * y * slope + gv * scale]))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation of the sag sums, as a measure of its time. The base conic counts
+    /// 1. For each |m| in use, every degree n up to the highest given one counts 2: a cosine and a sine.
     pub(super) fn term_count(&self) -> usize {
         1 + self.orders.iter().map(|(_, coefficients)| 2 * coefficients.len()).sum::<usize>()
     }
@@ -158,8 +159,11 @@ impl TryFrom<&ZernikeDefinition> for Zernike {
     }
 }
 
-/// Returns the degree n and the azimuthal order m of an index in Noll's numbering; `None` for index 0. The terms are
-/// sorted by n, then by |m|. Even indices are cosines (m >= 0), odd indices sines (m < 0).
+/// Returns the degree n and the azimuthal order m of the term number `index` in Noll's numbering, which starts at 1.
+/// Returns `None` for index 0.
+///
+/// The terms are sorted by n, then by |m|. If m is not 0, an even index is a cosine (m > 0) and an odd index is a sine
+/// (m < 0).
 fn noll(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index.checked_sub(1)?);
     let m = if n % 2 == 0 { place.div_ceil(2) * 2 } else { place / 2 * 2 + 1 };
@@ -187,8 +191,8 @@ fn fringe(index: u32) -> Option<(u32, i32)> {
     Some((2 * group - m, if rest % 2 == 0 { m as i32 } else { -(m as i32) }))
 }
 
-/// Returns the row of the element with the index `place`, and its position in the row, in a triangle whose rows have 1,
-/// 2, 3, ... elements. All are counted from 0.
+/// Returns the row of element `place`, and the position of the element in its row. The elements form a triangle whose
+/// rows have 1, 2, 3, ... elements, and are numbered row by row. Elements, rows and positions are counted from 0.
 fn triangular(place: u32) -> (u32, u32) {
     let row = ((8 * u64::from(place) + 1).isqrt() - 1) / 2;
     (row as u32, (u64::from(place) - row * (row + 1) / 2) as u32)

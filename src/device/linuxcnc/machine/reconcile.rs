@@ -12,8 +12,12 @@ use crate::linuxcnc::job::Stage;
 use crate::linuxcnc::program::ProgramRecord;
 
 impl LinuxcncGrinder {
-    /// Returns whether the start of the job has led to a running or finished job, or that the controller runs another
-    /// program. Returns `None` if none of these is seen yet, or if there is no job.
+    /// Reads the status and returns the outcome of the start of the current job: running, finished, or unknown because
+    /// the controller runs another program. Returns `None` if there is no job, or if the controller is idle and the end
+    /// of the job is not yet known.
+    ///
+    /// # Errors
+    /// Returns an error if the status cannot be read.
     pub(super) async fn start_outcome(&mut self) -> DeviceResult<Option<Reconciled>> {
         let (seen, status) = self.read_status().await?;
         let Some(work) = &self.job else { return Ok(None) };
@@ -30,9 +34,13 @@ impl LinuxcncGrinder {
         })
     }
 
-    /// Finds out if the start of the job was never carried out. First takes control again, so that no line of an older
-    /// connection can begin the job. The job was not started if it is not seen to run for more than a second after
-    /// that, and if its log file has neither a begin nor an end.
+    /// Finds out if the start of the current job was never carried out. First takes control again, so that a delayed
+    /// order of an older connection cannot start the job. Then watches the controller for `record_timeout`, at least
+    /// 1.05 s. Returns the outcome at once if the job runs or has ended. After the time, returns `NotStarted` if the
+    /// log file shows neither a begin nor an end; otherwise returns `Unknown` with the reason.
+    ///
+    /// # Errors
+    /// Returns an error if control cannot be taken, or if the status or the log file cannot be read.
     pub(super) async fn confirm_not_started(&mut self) -> DeviceResult<Reconciled> {
         self.take_control().await?;
         let fenced = Instant::now();
@@ -54,7 +62,11 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Finds the program of the start `intended` that an earlier process prepared, and assigns it to the job.
+    /// Finds the program that an earlier process prepared for the start `intended`. Stores the program and its path in
+    /// the current job if this job has the same job number and token. Does nothing if no such program exists.
+    ///
+    /// # Errors
+    /// Returns an error if the folder of programs cannot be read.
     pub(super) async fn find_prepared_program(&mut self, intended: &Armed) -> DeviceResult<()> {
         let (cycle, token) = (intended.job.batch_id().cycle.saturating_sub(1), intended.token);
         if let Some(program) = self.in_folders(move |folders| folders.prepared(cycle, token)).await? {
@@ -66,8 +78,9 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
-    /// Finds the program of a job that was restored before the connection existed, so that a running program is
-    /// recognised as that of the job.
+    /// Finds the program of a job that the driver restored before it had a connection. Stores the program in the job,
+    /// so that the driver recognises this program when the controller runs it. Does nothing if there is no job or if
+    /// its program is known. An error becomes a note.
     pub(super) async fn find_restored_program(&mut self) {
         let Some(work) = self.job.as_ref().filter(|work| work.program.is_none()) else { return };
         let intended = Armed { job: work.job, start_sequence: work.sequence, token: work.token, boot_id: 0 };

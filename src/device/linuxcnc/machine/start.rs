@@ -51,10 +51,11 @@ impl LinuxcncGrinder {
         Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
     }
 
-    /// Checks that the machine is ready for a job.
+    /// Checks that `seen`, the state of the controller, allows a new job: the stop circuit is closed, the drives are
+    /// on, no program runs or is paused, and the axes are homed.
     ///
     /// # Errors
-    /// It is not ready; only a person at the machine can correct this.
+    /// Returns an error for the first condition that is not met. Only a person at the machine can correct it.
     pub(super) fn check_ready(&self, seen: &ControllerState) -> DeviceResult<()> {
         match () {
             () if seen.stop_circuit_open || !seen.drives_on => {
@@ -74,9 +75,13 @@ impl LinuxcncGrinder {
         DeviceError::NotReady { machine: self.machine(), reason: why }
     }
 
-    /// Makes the controller write `token` into a new log file, and reads it back. This proves three facts: this
-    /// computer and the controller see the same folder, the controller can write in it, and later lines of the log file
-    /// belong to this preparation.
+    /// Makes the controller write `token`, the random number of this preparation, into the log file of `program`; the
+    /// controller creates this file anew. Then reads the file until the token is visible. The token proves that this
+    /// computer and the controller see the same folder, that the controller can write into it, and that later lines of
+    /// the file belong to this preparation.
+    ///
+    /// # Errors
+    /// Returns an error if the controller refuses a line, or if the token is not visible within `settle_timeout`.
     async fn open_record(&mut self, program: &FramedProgram, token: u32) -> DeviceResult<()> {
         let record = path(&self.folders.remote, &program.name, RECORD);
         self.controller.enter(ControllerMode::Mdi, MachineCommand::Prepare).await?;
@@ -103,10 +108,12 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Sends the start, and waits until the program is seen to run or has logged its begin.
+    /// Sends the order that starts the program of the job. Waits until the controller reports that the program runs, or
+    /// until the log file shows its begin. Returns the status.
     ///
     /// # Errors
-    /// The controller refuses the start, or nothing begins in time.
+    /// Returns an error if the controller refuses the start and the program does not begin, if the program does not
+    /// begin within `settle_timeout`, or if the connection fails.
     pub(super) async fn send_start(&mut self) -> DeviceResult<Status> {
         let heard = self.controller.order(Set::Run, MachineCommand::Start).await;
         let refused = match heard {
@@ -129,7 +136,11 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Returns the status if the program of the job is seen to run or has logged its begin, otherwise `None`.
+    /// Returns the status if the program of the job has begun: the controller reports it as running or paused, or its
+    /// log file shows a begin. Returns `None` if neither is true or if there is no job.
+    ///
+    /// # Errors
+    /// Returns an error if the status or the log file cannot be read.
     async fn has_begun(&mut self) -> DeviceResult<Option<Status>> {
         let (seen, status) = self.read_status().await?;
         let Some(work) = self.job.clone() else { return Ok(None) };

@@ -15,8 +15,13 @@ use crate::linuxcnc::protocol::ControllerMode;
 const STANDSTILL_AFTER: Duration = Duration::from_secs(5);
 
 impl LinuxcncGrinder {
-    /// Reads the state of the controller and updates the job. If the job may be over, also reads the log file of its
-    /// program. Returns the state of the controller and the status of the machine.
+    /// Reads the state of the controller and updates the current job from it. Also reads the log file of the program if
+    /// the job has begun and the controller does not report a running program. Returns the state of the controller and
+    /// the status of the machine.
+    ///
+    /// # Errors
+    /// Returns an error if another client has taken control, if the connection fails, or if the log file cannot be
+    /// read.
     pub(super) async fn read_status(&mut self) -> DeviceResult<(ControllerState, Status)> {
         let owned = self.controller.has_control;
         let seen = self.controller.read_state(owned).await?;
@@ -36,8 +41,9 @@ impl LinuxcncGrinder {
         Ok((seen, status))
     }
 
-    /// Adds a note if the controller reports a running program and the machine does not move. A controller whose task
-    /// has died continues to report its last state, and has no heartbeat that would show this.
+    /// Adds a note for the operator if the controller reports a running program, but the line number and the position
+    /// have not changed for 5 s. Such a controller may have failed: without a heartbeat, a failed controller continues
+    /// to report its last state.
     fn note_standstill(&mut self, seen: &ControllerState) {
         match &self.last_motion {
             Some((line, at, since)) if (*line, at) == (seen.line, &seen.position) => {
@@ -58,8 +64,12 @@ impl LinuxcncGrinder {
         self.notes.drain(..more);
     }
 
-    /// Updates the job of this driver from the state of the controller. Reads the log file of its program unless the
-    /// program runs.
+    /// Updates the stage of the current job from `seen`, the state of the controller. Reads the log file of the program
+    /// if the job has begun and the controller does not report a running program. Does nothing if there is no job or if
+    /// the job has ended.
+    ///
+    /// # Errors
+    /// Returns an error if the log file cannot be read.
     async fn update_job(&mut self, seen: &ControllerState) -> DeviceResult<()> {
         let Some(mut work) = self.job.take() else { return Ok(()) };
         let begun = self.update_stage(&mut work, seen).await;
@@ -104,8 +114,7 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
-    /// Returns the status of the machine, in the terms that all drivers use, from the state of the controller and the
-    /// job.
+    /// Converts `seen`, the state of the controller, and the current job to the machine status that all drivers report.
     fn make_status(&mut self, seen: &ControllerState) -> Status {
         let is_clear = seen.interpreter == Interpreter::Idle && self.clear_at.as_ref() == Some(&seen.position);
         if !is_clear {
@@ -136,7 +145,8 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Returns the machine state for a controller on which no job of this driver is active.
+    /// Returns the machine state if this driver has no active job: EXECUTE or HELD if a program runs or is paused,
+    /// ABORTED after an abort without a job, FAULTED if the stop circuit is open or the drives are off, otherwise IDLE.
     fn idle_state(&self, seen: &ControllerState) -> MachineState {
         match seen.interpreter {
             Interpreter::Running => MachineState::Execute,
@@ -147,7 +157,12 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Returns true if the controller is idle and only a person can say how the job ended.
+    /// Returns true if the outcome of the current job is unknown: the controller is idle, and the log file shows
+    /// neither a begin nor an end of the program. Only a person can then state how the job ended. Returns false in all
+    /// other cases, also if no job has begun.
+    ///
+    /// # Errors
+    /// Returns an error if the status or the log file cannot be read.
     pub(super) async fn is_unresolved(&mut self) -> DeviceResult<bool> {
         let (seen, _) = self.read_status().await?;
         let Some(work) = self.job.clone().filter(|work| work.stage == Stage::Begun) else { return Ok(false) };
