@@ -299,11 +299,11 @@ def verify(path, kept, trusted):
     closed = chain.ended is not None
     lacks, is_sealed = None, not chain.keys or chain.signed == chain.ended
     if closed and not is_sealed and (not under_way or trusted):
-        lacks = "its end is not signed, although the run names a key"
+        lacks = "the end of the record is not signed, although the run has a key"
     elif not anchored and (folder or not closed):
         lacks = "journal.anchor is missing: it is unknown whether the end of the record was cut off"
     elif not closed and not under_way:
-        lacks = "the run was interrupted: no program drives it, and its record has no end"
+        lacks = "the run was interrupted: its program no longer runs, and the record has no end"
     return {
         "run": str(path), "sound": True, "records": chain.records, "head": chain.head, "anchored": anchored, "closed": closed,
         "under_way": under_way, "artefacts": chain.files, "keys": chain.keys, "seals": chain.seals, "signed": chain.signed,

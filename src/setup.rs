@@ -42,12 +42,12 @@ pub enum SetupError {
     Nominal { path: PathBuf, source: SurfaceError },
     #[error("{path}: {source}")]
     Definition { path: PathBuf, source: DefinitionError },
-    #[error("{}: {key}: {what}; correct the key", .path.display())]
+    #[error("{}: {key}: {what}; correct the value of this key", .path.display())]
     Table { path: PathBuf, key: &'static str, what: String },
     #[error("{path}: {source}")]
     Pattern { path: PathBuf, source: PatternError },
     #[error(
-        "{}: {key} is {found}, and {} allows {allowed} ({limit}); change the recipe or use another cell",
+        "{}: {key} is {found}, but the cell file {} allows {allowed} (limit: {limit}); change the recipe or use another cell",
         .recipe.display(), .cell.display()
     )]
     Limit { recipe: Box<Path>, cell: Box<Path>, key: &'static str, found: f64, allowed: Box<str>, limit: &'static str },

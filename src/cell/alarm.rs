@@ -74,20 +74,20 @@ catalogue! {
     }
     /// Another device answers.
     WrongDevice {
-        "A device other than the one in the cell file answers", "Nothing was written to it. The run does not begin.", ProcessEngineer,
-        ["Compare the address in the cell file with the machine.", "Check that no other device has this address.",
+        "The device that answers is not the device in the cell file", "Nothing was written to this device. The run does not begin.", ProcessEngineer,
+        ["Compare the address in the cell file with the address of the machine.", "Check that no other device has this address.",
          "Start the run again."]
     }
     /// Registers of the machine in another word order than in the cell file.
     WordOrder {
         "The word order of the registers differs from the cell file",
-        "Every number would be wrong. Nothing was written. The run does not begin.", ProcessEngineer,
-        ["Set word_order in the cell file to the named order.", "Start the run again."]
+        "Every number from the machine would be misread. Nothing was written to the machine. The run does not begin.", ProcessEngineer,
+        ["Set word_order in the cell file to the order that this alarm names.", "Start the run again."]
     }
     /// Lengths in inches.
     Inches {
-        "Lengths are in inches", "They are not used: Regrind works in millimetres.", ProcessEngineer,
-        ["Set the measuring program and the control to millimetres.", "Resume to measure again, or start the run again."]
+        "Lengths are in inches", "These lengths are not used: Regrind works in millimetres.", ProcessEngineer,
+        ["Set the measuring program and the control to millimetres.", "Resume to measure again. If the run has not begun, start the run again."]
     }
     /// Machine owned by another client.
     Owned {
@@ -97,79 +97,79 @@ catalogue! {
     /// Machine that is not idle at the start.
     NotIdle {
         "A machine is not idle", "The run does not begin. Nothing was changed on the machine.", Operator,
-        ["Check the machine. End or clear its job at its own panel.",
-         "If it still has the job of an interrupted run, resume that run.", "Start the run again."]
+        ["Check the machine. End or clear the job at the panel of the machine.",
+         "If the machine still has the job of an interrupted run, resume that run.", "Start the run again."]
     }
     /// Lost link.
     LinkLost {
-        "The link to a machine is lost", "Nothing new begins. A moving machine holds by itself. When the link is back, the cell asks it for the state of its job and continues.", Nobody,
-        ["Check the cable and the network switch, and that the control runs.",
-         "If the machine answers with an exception, compare its register map with the one in the cell file.",
+        "The link to a machine is lost", "No new step begins. A moving machine holds by itself. When the link is back, the cell asks the machine for the state of its job and continues.", Nobody,
+        ["Check the cable and the network switch. Check that the control of the machine runs.",
+         "If the machine answers with a Modbus exception, compare the register map in the cell file with the register map of the machine.",
          "Wait: the cell continues by itself.",
          "If the link cannot be repaired, stop or abort the run."]
     }
     /// Fault of this program.
     ProgramFailed {
-        "A part of this program has failed and can no longer reach a machine", "The machine receives no heartbeat and holds at its own silence limit. The run cannot continue with it.", ProcessEngineer,
-        ["Check the machine. End its job at its own panel.", "Abort the run. The abort reaches the other machine only.",
-         "Report the fault, with the run folder.", "Start a new run that begins with a measurement of the part as it is."]
+        "A part of the Regrind program has failed and can no longer reach a machine", "The machine receives no heartbeat from Regrind and holds after its own time limit without a heartbeat. The run cannot continue with this machine.", ProcessEngineer,
+        ["Check the machine. End the job at the panel of the machine.", "Abort the run. The abort reaches only the machine that Regrind can still reach.",
+         "Report this fault of the Regrind program. Add the run folder to the report.", "Start a new run that begins with a measurement of the part as it is."]
     }
     /// Missing supplies, or a signal out of range.
     ConditionLost {
-        "A required condition is missing", "The cell waits. It continues by itself when the condition is back.", Nobody,
-        ["Restore air or coolant, or bring the named signal into its range.", "If the machine returns no number for a signal, correct its address in the cell file, or repair the sensor.", "Wait: the cell continues by itself."]
+        "A required condition is missing", "The cell waits until the condition is met, then the cell continues by itself.", Nobody,
+        ["Restore air or coolant, or bring the named signal into its range.", "If the machine returns no number for a signal, correct the address of the signal in the cell file, or repair the sensor.", "Wait: the cell continues by itself."]
     }
     /// Suspension that lasts too long.
     StaysSuspended {
-        "The cause of the suspension remains", "The cell no longer continues by itself.", Operator,
+        "The cause of the suspension remains", "The cell is held and no longer continues by itself. A person must resume the run.", Operator,
         ["Remove the cause.", "Resume, or stop the run."]
     }
     /// Machine in fault.
     MachineFault {
-        "A machine is in fault", "Both machines get ABORT and run their own safe sequence. The run is over.", Operator,
+        "A machine is in fault", "Both machines receive the order ABORT and run their own safe sequence. The run is over.", Operator,
         ["Check the machine first.", "Remove the cause and clear the fault at the machine.",
-         "Inspect the part: ground material cannot be restored.", "Start a new run that begins with a measurement."]
+         "Inspect the part: removed material cannot be restored.", "Start a new run that begins with a measurement."]
     }
     /// Machine that held without an order.
     MachineHeldItself {
-        "A machine held its job without an order", "The cell is held, too.", Operator,
-        ["Find the cause: feed hold at the panel, a silent link, or a guard.", "Resume here, not at the machine."]
+        "A machine put its job on hold without an order", "The cell is held, too.", Operator,
+        ["Find the cause: feed hold at the panel, an interrupted link, or an open guard.", "Resume in Regrind, not at the machine."]
     }
     /// Machine that resumed without an order.
     MachineResumedItself {
         "A held machine was resumed at its own panel", "The job and the cell continue.", Operator,
-        ["Hold and resume here, so that the record names the person."]
+        ["Next time, hold and resume in Regrind, not at the panel: then the record names the person."]
     }
     /// Machine that moves without an order.
     MovesUnasked {
-        "A machine moves without an order", "It is ordered to hold, and the cell is held.", Operator,
-        ["Check the machine, and find the cause of the motion.", "If it does not stop, use the machine's own emergency circuit.",
+        "A machine moves without an order", "The cell orders the machine to hold, and the cell is held.", Operator,
+        ["Check the machine, and find the cause of the motion.", "If the machine does not stop, use the machine's own emergency circuit.",
          "Resume when the cause is known."]
     }
     /// Machine in manual mode.
     NotAutomatic {
-        "A machine is not in automatic mode", "Nothing starts, and a moving machine is held: a person at the panel can move this machine into the work space of the other one.", Operator,
-        ["Move the machine clear of the other one, and turn its key to automatic.", "Resume here."]
+        "A machine is not in automatic mode", "No job starts, and a moving machine is held. The reason: in manual mode, a person at the panel can move a machine into the work space of the other machine.", Operator,
+        ["Move the machine out of the work space of the other machine. Turn the mode key of the machine to automatic.", "Resume in Regrind."]
     }
     /// No progress.
     ProgressStands {
-        "A job makes no progress", "The machine answers, and its job continues. If this lasts, the cell holds it.", Nobody,
-        ["Check the machine: does it wait at its own panel, or cut air?", "If in doubt, hold the run."]
+        "A job makes no progress", "The machine answers and reports a running job. If the job still makes no progress, the cell holds the machine.", Nobody,
+        ["Check the machine. Does the machine wait for a person at its panel, or does the wheel run without contact to the part?", "If in doubt, hold the run."]
     }
     /// Request refused by a machine.
     MachineRefused {
-        "A machine refused a request", "The cell is held before this step.", Operator,
-        ["Meet the condition in the answer of the machine: automatic mode, guards closed, part clamped, payload within its limits.",
+        "A machine refused a request", "The cell is held. The refused step is not done.", Operator,
+        ["Read the answer of the machine and meet the condition that this answer names. Examples: automatic mode, guards closed, part clamped, map or plan within the limits of the machine.",
          "Resume to send the request again."]
     }
     /// No answer within the time limit.
     NoAnswer {
-        "A machine did not answer in time", "The cell is held before this step.", Operator,
+        "A machine did not answer in time", "The cell is held. The step that waits for the answer is not complete.", Operator,
         ["Check the machine and its panel.", "Resume to send the request again."]
     }
     /// Job that ended before it was complete.
     JobFailed {
-        "A job of a machine ended before it was complete", "Its result is not used. A pass is not repeated: the part is measured as it is.",
+        "A job of a machine ended before it was complete", "The result of the job is not used. A pass is not repeated: the next step measures the part in its present state.",
         Operator,
         ["Check the machine and the part.", "Resume to measure the part as it is."]
     }
@@ -177,45 +177,45 @@ catalogue! {
     PassRecord {
         "The pass record of the grinder is implausible", "The cell is held after the pass. The pass is not repeated: the part is measured as it is.",
         ProcessEngineer,
-        ["Check the part and the wheel: was this pass ground, with this map and this wheel?",
-         "Compare the value and its limit with the machine's program and the recipe.", "Resume to measure the part as it is, or stop the run."]
+        ["Check the part and the wheel. Was the pass ground, and with the map of this cycle and the wheel in the recipe?",
+         "Compare the value in this alarm and its limit with the program of the machine and with the recipe.", "Resume to measure the part as it is, or stop the run."]
     }
     /// START command with an unknown result: the machine may have started.
     StartUnknown {
-        "It is unknown whether a job was started", "The cell does not repeat START and orders no motion.", Operator,
+        "It is unknown whether a job was started", "The cell does not send the START order again, and orders no motion.", Operator,
         ["Check the machine: is it at rest and clear of the part? Was the part touched?",
-         "Resume to ask the machine again.", "If it cannot answer, describe what you saw: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
+         "Resume to ask the machine again.", "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
          "Or stop the run."]
     }
     /// Job that the machine no longer shows.
     JobVanished {
-        "A machine no longer has its job", "The cell does not start the job again and orders no motion.", Operator,
+        "A machine no longer reports its job", "The cell does not start the job again and orders no motion.", Operator,
         ["Check the machine: is it at rest and clear of the part? Was the part touched?", "Resume to ask the machine again.",
-         "If it cannot answer, describe what you saw: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
+         "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
          "Or stop the run."]
     }
     /// Failure that recurs.
     FailsAgain {
-        "The same step fails repeatedly", "The cell is held and no longer retries by itself.", Operator,
-        ["Read the last answer: it names the failure.", "Check the machine, its program and its connection.",
+        "The same step fails repeatedly", "The cell is held and no longer retries the step by itself.", Operator,
+        ["Read the last reason in this alarm. This reason names the failure.", "Check the machine, the program of the machine and the connection to the machine.",
          "Resume to retry, or stop the run."]
     }
     /// Restart of a machine during the run.
     MachineRestarted {
-        "A machine was restarted during the run", "It may no longer know its job. The cell orders no motion.", Operator,
+        "A machine was restarted during the run", "The machine may no longer know its job. The cell orders no motion.", Operator,
         ["Check the machine and the part.", "Resume to ask the machine for the state of the job.",
-         "If it cannot answer, declare the job over, describe what you saw, and resume to measure the part."]
+         "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part."]
     }
     /// Restart of the program during the run.
     ProgramRestarted {
-        "The program was restarted during the run", "The cell is held. It asks the machines for the state of their jobs, and holds a machine that moves.",
+        "The Regrind program was restarted during the run", "The cell is held. The cell asks both machines for the state of their jobs, and holds a machine that moves.",
         Operator,
-        ["Check both machines. The state of the cell shows what is confirmed and what is not.", "Resume: the cell continues from there."]
+        ["Check both machines. The state of the cell names a machine that has not confirmed that it is at rest.", "Resume: the cell continues from this state."]
     }
     /// Interlock: machine not clear of the part.
     NotClear {
         "A machine is not clear of the part", "The other machine is not started.", Operator,
-        ["Move it to its park position at its own panel.", "Resume."]
+        ["Use the panel of the machine to move the machine to its park position.", "Resume."]
     }
     /// Gate: too little of the part measured.
     Coverage {
@@ -230,43 +230,43 @@ catalogue! {
     /// Gate: part shifted or turned too far.
     PartMisplaced {
         "The part is further from its expected place than the recipe allows",
-        "No map is computed: it would be ground at the wrong place.", Operator,
-        ["Check how the part is loaded: turned, on swarf, or in another seat.", "Stop the run, load the part as drawn, and start a run that begins with a measurement.",
-         "If it was loaded correctly, resume to measure again."]
+        "No map is computed: a pass with this map would grind the wrong places of the part.", Operator,
+        ["Check whether the part is turned, lies on swarf, or is in the wrong seat of the fixture.", "If the part was loaded wrongly, stop the run, load the part as the drawing shows, and start a run that begins with a measurement.",
+         "If the part was loaded correctly, resume to measure again."]
     }
     /// Gate: repeated touches of control points differ from the first touches: the part has moved during the
     /// measurement.
     PartMoved {
-        "The part is not where it was at the first touches of this measurement",
-        "The repeated touches are not used: they belong to another place of the part.", Operator,
+        "The part has moved since the first touches of this measurement",
+        "The repeated touches are not used: the probe made these touches after the part had moved.", Operator,
         ["Check that the part is clamped and was not moved.", "Wait until the temperature of part and room is stable.",
          "Resume to measure the whole part again."]
     }
     /// Gate: wrong radius of the probe.
     ProbeRadius {
-        "The radius of the probe differs from the recipe", "This measurement is not used: every deviation would be wrong by the difference.", ProcessEngineer,
+        "The radius of the probe differs from the recipe", "This measurement is not used: every deviation would be wrong by the difference of the two radii.", ProcessEngineer,
         ["Clean the probe ball and the reference sphere.", "Qualify the probe on the machine, or mount the right stylus.",
-         "Resume to measure again. A recipe with another radius requires a new run."]
+         "Resume to measure again. If the radius in the recipe is wrong, correct the recipe and start a new run."]
     }
     /// Gate: contact points instead of probe centres.
     Contacts {
         "The machine returns contact points instead of probe centres",
-        "This measurement is not used: it would be wrong by the radius of the probe.", ProcessEngineer,
+        "This measurement is not used: every point would be wrong by the radius of the probe.", ProcessEngineer,
         ["Switch off the radius compensation of the measuring program.", "Resume to measure again."]
     }
     /// Gate: result of another part, plan or cycle.
     ForeignResult {
-        "The result belongs to another part, plan or cycle", "It is not used.", ProcessEngineer,
+        "The result of the machine belongs to another part, measuring plan or cycle", "This result is not used.", ProcessEngineer,
         ["Check which job the machine ran.", "Resume to measure again."]
     }
     /// Gate: broken result.
     BrokenResult {
-        "The result is invalid", "It is not used.", Operator,
-        ["Read the reason. An impossible value or point comes from the probe or the measuring program. A wrong number of points comes from the list of targets in that program.", "Correct the cause, and resume to measure again."]
+        "The result is invalid", "This result is not used.", Operator,
+        ["Read the reason in this alarm. An impossible value or point comes from the probe or the measuring program. A wrong number of points comes from the list of targets in the measuring program.", "Correct the cause, and resume to measure again."]
     }
     /// Gate: temperature out of its window.
     Temperature {
-        "The temperature was outside its window during the measurement", "This measurement is not used.", Operator,
+        "The temperature was outside its limits during the measurement", "This measurement is not used.", Operator,
         ["Wait until the temperature of part and room is stable.", "Resume to measure again."]
     }
     /// Failed registration.
@@ -277,46 +277,46 @@ catalogue! {
     }
     /// Computation that exceeds its time limit.
     ComputationLate {
-        "A computation exceeds its time limit", "The cell is held before it.", ProcessEngineer,
+        "A computation exceeds its time limit", "The cell is held before this computation.", ProcessEngineer,
         ["Check whether the computer is overloaded.", "Resume to compute again."]
     }
     /// Directions of the pose that the surface determines weakly.
     WeakDirections {
-        "The surface does not determine the position of a correction on the part",
+        "The surface determines the position of the part too weakly to place a correction",
         "No correction is computed. The error map of this cycle is in the run folder.", ProcessEngineer,
-        ["Lock the named directions in the recipe (registration.lock), if the fixture or the reference points define them well enough.",
-         "Or measure features that determine them: edges, reference marks, a wider aperture.", "Start a new run that begins with a measurement."]
+        ["Lock the directions that this alarm names (recipe key registration.lock), if the fixture or the reference points define these directions well enough.",
+         "Or measure features that determine these directions: edges, reference marks or a wider aperture.", "Start a new run that begins with a measurement."]
     }
     /// No map for the next pass.
     CompensationFailed {
-        "There is no map for the next pass", "No further pass is ground.", ProcessEngineer,
-        ["Read the reason and the figures of this cycle.", "Resume to compute again, or stop the run."]
+        "No map could be computed for the next pass", "No further pass is ground.", ProcessEngineer,
+        ["Read the reason in this alarm, and the figures of this cycle.", "Resume to compute again, or stop the run."]
     }
     /// Parameter of the machine beyond its tolerance.
     ParameterBeyond {
         "The error of a machine parameter exceeds its tolerance in the recipe",
-        "The next pass waits for the approval of a person: it would be ground with the corrected parameter.", ProcessEngineer,
-        ["Measure the parameter by other means: the radius of the wheel by its profile or a touch on a reference, the setting and the part by an indicator.",
+        "The next pass waits for the approval of a person: this pass would be ground with the corrected parameter.", ProcessEngineer,
+        ["Measure the parameter with another method. For the radius of the wheel, use the profile of the wheel or a touch on a reference. For the setting of the wheel and the tilt of the part, use a dial indicator.",
          "If the estimate is right, resume: the next pass is ground with the corrected parameter, and the map corrects the remaining error.",
-         "If it is wrong, stop the run, correct the recipe or the machine, and start a new run. Without the key in compensation.parameters, the map corrects the whole error."]
+         "If the estimate is wrong, stop the run, correct the recipe or the machine, and start a new run. If you remove the key of this parameter from compensation.parameters in the recipe, the map corrects the whole error."]
     }
     /// Response of the part with the wrong sign.
     SignFlipped {
-        "The part responded to the map with the opposite sign", "Another pass would make it worse. The cell is held.", ProcessEngineer,
-        ["Check the sign of the map at the grinder: positive leaves material.", "Do not resume before a test pass on a scrap part has shown the right sign.",
+        "The part responded to the map with the opposite sign", "Another pass would make the part worse. The cell is held.", ProcessEngineer,
+        ["Check the sign of the map at the grinder: a positive value leaves material.", "Do not resume before a test pass on a scrap part has shown the right sign.",
          "Stop the run."]
     }
     /// Response to a mirrored or turned map.
     Mirrored {
-        "The part responded as to a mirrored or rotated map", "Another pass would make it worse. The cell is held.", ProcessEngineer,
+        "The part responded as if the grinder had used a mirrored or rotated map", "Another pass would make the part worse. The cell is held.", ProcessEngineer,
         ["Check the direction of x and y at the grinder, and how the part is turned in its fixture.",
          "Do not resume before a test pass on a scrap part has shown the right direction.", "Stop the run."]
     }
     /// Response to a map applied twice.
     Doubled {
-        "The part responded as if the map was applied twice", "Another pass would overshoot to the other side. The cell is held.", ProcessEngineer,
-        ["Check whether the map is both in the program and in the controller's table, or was added to the previous map. The map is absolute.",
-         "Do not resume before it is applied in one place only.", "Stop the run."]
+        "The part responded as if the map was applied twice", "Another pass would correct too much and reverse the error. The cell is held.", ProcessEngineer,
+        ["Check whether the map is in the program and also in the controller's table. Check also whether the map was added to the previous map. A new map must replace the previous map.",
+         "Do not resume before the map is applied in one place only.", "Stop the run."]
     }
     /// No response to the map.
     NoEffect {
@@ -326,7 +326,7 @@ catalogue! {
     }
     /// Part that gets worse.
     Diverging {
-        "The part gets worse", "After two worse cycles in a row, the run holds or stops, as the recipe defines.", ProcessEngineer,
+        "The part gets worse", "If the part gets worse in two cycles in a row, the run holds or stops, as the recipe defines.", ProcessEngineer,
         ["Compare the error maps of the last cycles.", "Check for a worn wheel, a loose clamp or a change of temperature.",
          "If in doubt about the next pass, hold the run."]
     }
@@ -338,59 +338,59 @@ catalogue! {
     }
     /// Figures that prove the part neither good nor bad.
     Undecided {
-        "The measurement proves the part neither good nor bad", "The run holds or stops, as the recipe defines.", ProcessEngineer,
-        ["Measure with more points or less noise: a smaller uncertainty decides.",
+        "The measurement does not prove whether the part is good or bad", "The run holds or stops, as the recipe defines.", ProcessEngineer,
+        ["Measure with more points or less noise: a smaller uncertainty can show whether the part is good or bad.",
          "Another pass would remove material and is not expected to help."]
     }
     /// Part that is in tolerance only without the outliers.
     LeftOut {
-        "Outliers deviate from all neighbours, and with them the part exceeds a limit",
-        "The part is not accepted: an outlier counts until its place is touched again.", Operator,
-        ["Check the named places. Clean them and the probe without moving the part.",
-         "Resume to touch them again, with a few places around each. If they cannot be touched alone, the whole part is measured.",
-         "If the same places are named again, the defects are on the part: stop the run, and let quality decide."]
+        "The part exceeds a limit because of outliers, which are points that deviate from all their neighbours",
+        "The part is not accepted: each outlier is judged as a point of the part until the probe has touched its place again.", Operator,
+        ["Check the places that this alarm names. Clean these places and the probe without moving the part.",
+         "Resume to touch these places and a few places around each of them again. If these places cannot be touched alone, the whole part is measured.",
+         "If the same places are named again, the defects are on the part: stop the run, and let the quality department decide about the part."]
     }
     /// Passes used up.
     MaxCycles {
         "The recipe allows no further pass", "The run ends. The part is not in tolerance.", ProcessEngineer,
-        ["Check the figures of the cycles.", "If they still fall, allow more passes in the recipe, and start a run that begins with a measurement."]
+        ["Check the figures of the cycles.", "If the figures still fall from cycle to cycle, allow more passes in the recipe (max_cycles), and start a run that begins with a measurement."]
     }
     /// Removal budget used up.
     BudgetSpent {
         "The removal budget is spent", "No further pass is ground. The run ends. The part is not in tolerance.", ProcessEngineer,
-        ["Let quality decide on the part: removed material cannot be restored.", "Begin the next part with more allowance."]
+        ["Let the quality department decide about the part: removed material cannot be restored.", "Begin the next part with more material above the nominal surface (allowance)."]
     }
     /// Record of the run that cannot be written.
     JournalUnwritable {
-        "The record of the run cannot be written", "No new motion begins before it can be recorded.", ProcessEngineer,
+        "The record of the run cannot be written", "No new motion begins until the record can be written.", ProcessEngineer,
         ["Check the run folder: permissions, network drive, disk.", "Resume."]
     }
     /// Disk full.
     DiskFull {
-        "The disk is full", "No new motion begins before it can be recorded.", Operator,
+        "The disk is full", "No new motion begins until the record of the run can be written.", Operator,
         ["Free space on the disk of the run folder.", "Resume."]
     }
     /// Lost channel for orders.
     ControlLost {
-        "The channel for orders to the cell is lost", "The run continues, and the channel is opened again. Ctrl-C in the terminal of the run holds, twice aborts.",
+        "The channel for orders to the cell is lost", "The run continues, and Regrind opens the channel again. Until then, use the terminal of the run: press Ctrl-C once to hold the run, twice to abort the run.",
         ProcessEngineer,
         ["Find the person or program that deletes or moves files of the run folder.", "Check with `regrind status` whether orders reach the cell again.",
-         "If they do not, hold the run."]
+         "If orders do not reach the cell, hold the run."]
     }
     /// Hold that was not confirmed.
     HoldNotConfirmed {
-        "A machine did not confirm that it holds", "Both machines get ABORT and run their own safe sequence.", Operator,
-        ["Check the machine.", "If it still moves, use the machine's own emergency circuit."]
+        "A machine did not confirm that it holds", "Both machines receive the order ABORT and run their own safe sequence.", Operator,
+        ["Check the machine.", "If the machine still moves, use the machine's own emergency circuit."]
     }
     /// Stop that was not confirmed.
     StopNotConfirmed {
-        "Stop not confirmed: a machine did not report that it is at rest", "It may still be moving.", Operator,
+        "Stop not confirmed: a machine did not report that it is at rest", "This machine may still be moving.", Operator,
         ["Use the machine's own emergency circuit.", "Keep away from the machine until you see that it is at rest.",
-         "Then find the reason why it does not answer."]
+         "Then find the reason why the machine does not answer."]
     }
     /// End of the run after a timeout without an answer.
     WaitedTooLong {
-        "No person answered in time", "The run ends in order.", Operator,
+        "No person answered in time", "The run ends. A machine that has a job is stopped.", Operator,
         ["Remove the cause of the hold and start a run that begins with a measurement."]
     }
 }

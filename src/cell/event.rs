@@ -25,7 +25,7 @@ pub struct Actor {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "event", rename_all = "snake_case")]
-#[expect(clippy::large_enum_variant, reason = "events are few, and never kept in numbers")]
+#[expect(clippy::large_enum_variant, reason = "events are few, and never stored in large numbers")]
 pub enum Event {
     // Orders of people.
     /// Begin the run.
@@ -499,10 +499,10 @@ impl RecordedParameter {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
         let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
         if *taken == 0.0 && *told == 0.0 {
-            return format!("{found}, not significant: the map corrects it");
+            return format!("{found}; this error is not significant, so only the map corrects the part");
         }
         format!(
-            "{found}, {taken:.2} {unit} compensated ({told:.2} in total), which removes {removes_rms_um:.2} \u{b5}m RMS"
+            "{found}; {taken:.2} {unit} of this error is compensated (total correction {told:.2}); the RMS decreases by {removes_rms_um:.2} \u{b5}m"
         )
     }
 }

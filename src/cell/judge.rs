@@ -207,14 +207,17 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         let (removed, budget) = (format_um(removed), format_um(plan.removal_budget_mm));
         return tell(
             Verdict::BudgetSpent,
-            format!("removed {removed}, limit {budget}: no further pass is possible; {figures}"),
+            format!("removed {removed} in total, limit {budget}: another pass would exceed the limit; {figures}"),
         );
     }
     if passes >= plan.max_cycles {
         let response = now.response.and_then(wrong_response).map_or(String::new(), |message| format!("; {message}"));
         return tell(
             Verdict::MaxCycles,
-            format!("{passes} of {} passes are ground; {figures}{response}", plan.max_cycles),
+            format!(
+                "not proven in tolerance after {passes} of {} allowed passes: {figures}{response}",
+                plan.max_cycles
+            ),
         );
     }
     if let Some(message) = now.response.and_then(wrong_response) {
@@ -228,9 +231,13 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         }
         if has_stalled(plan, before, now) {
             let least = match plan.stall_mm {
-                0.0 => format!("the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share),
+                0.0 => format!("the larger of the measuring uncertainty and {:.0} %", 100.0 * plan.stall_share),
                 least => {
-                    format!("the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, format_um(least))
+                    format!(
+                        "the largest of the measuring uncertainty, {:.0} % and {}",
+                        100.0 * plan.stall_share,
+                        format_um(least)
+                    )
                 }
             };
             return tell(Verdict::Stalled, format!("improvement below {least}: {figures}; {was}"));
@@ -256,7 +263,11 @@ fn judge_next_pass(
 ) -> ReasonedVerdict {
     let (tell, figures) = (|verdict, reason| ReasonedVerdict { verdict, reason }, figures_in_words(plan, now));
     let undecided = conformity == Conformity::Undecided;
-    let so_far = if undecided { "not proven in or out of tolerance" } else { "not yet in tolerance" };
+    let so_far = if undecided {
+        "the uncertainty is too large to prove the part in or out of tolerance"
+    } else {
+        "not yet in tolerance"
+    };
     // Before the first correction nothing is known about the effect of a correction.
     let forecast = now.forecast.filter(|_| before.is_some());
     let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
@@ -306,7 +317,7 @@ pub(super) fn distance_to_acceptance(plan: &CellPlan, figures: &Figures) -> f64 
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
     let [pv, rms] = judged_medians_mm(plan, figures);
     format!(
-        "; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}",
+        "; best cycle {cycle}: PV {}, RMS {}; the correction and the map of this cycle are in the folder cycle-{cycle}",
         format_um(pv),
         format_um(rms)
     )
@@ -319,7 +330,7 @@ fn wrong_response(response: PartResponse) -> Option<&'static str> {
         PartResponse::Expected | PartResponse::Unclear => None,
         PartResponse::SignFlipped => Some("the part responded with the opposite sign: the sign of the map is wrong"),
         PartResponse::Mirrored => {
-            Some("the part responded as to a mirrored or rotated map: the direction of an axis is wrong")
+            Some("the part responded as it would to a mirrored or rotated map: the direction of an axis is wrong")
         }
         PartResponse::NoEffect => Some("the part did not respond to the map"),
         PartResponse::Doubled => Some("the part responded twice as much as expected: the map was applied twice"),

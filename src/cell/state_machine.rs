@@ -26,7 +26,7 @@ impl Cell {
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
         if let Err(why) = self.apply_event(now, &event) {
             let (event, state) = (Box::new(event), self.state);
-            let why = why.unwrap_or_else(|| format!("{} does not fit the state {state}", event.in_words()));
+            let why = why.unwrap_or_else(|| format!("{} is not accepted in the state {state}", event.in_words()));
             self.commands.push(Command::Refuse { event, state, why });
         }
         std::mem::take(&mut self.commands)
@@ -68,7 +68,7 @@ impl Cell {
             return None;
         }
         let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);
-        cycle.map(|cycle| format!("it belongs to cycle {cycle}, the current cycle is {}", self.cycle))
+        cycle.map(|cycle| format!("this event belongs to cycle {cycle}, but the current cycle is {}", self.cycle))
     }
 
     /// Applies the transition table: selects the reaction to `event` in the present state and carries it out. The first
@@ -94,7 +94,7 @@ impl Cell {
                 self.on_final_clearance(*device, false, message);
             }
             (Aborting, Event::ClearUnknown { device }) if self.machine(*device).abort_confirmed => {
-                self.on_final_clearance(*device, self.machine(*device).clear_confirmed, "no signal shows whether it is clear");
+                self.on_final_clearance(*device, self.machine(*device).clear_confirmed, "no signal shows whether the machine is clear of the part");
             }
             (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
                 let lost = matches!(event, Event::LinkLost { .. });
@@ -197,7 +197,7 @@ impl Cell {
             (Starting | Held(_) | Holding(_), Event::NotConnected { device, why }) => self.on_not_connected(*device, why),
             (Starting, Event::Refused { device, what: MachineRequest::Clear, why }) => {
                 self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
-                self.stop(&format!("the {device} could not be cleared: {why}"), false);
+                self.stop(&format!("the {device} did not clear its old job or fault: {why}"), false);
             }
 
             // Job of a machine, in its steps. `advance` continues, or stays at the border of the phase if the cell is

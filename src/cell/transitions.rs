@@ -100,7 +100,7 @@ impl Cell {
         let seconds = self.now.saturating_sub(since).as_secs();
         self.raise(
             AlarmId::FailsAgain,
-            &format!("{device}, {phase}, {failures} times in {seconds} s, last reason: {why}"),
+            &format!("{device}, {phase}, {failures} failures in {seconds} s, last reason: {why}"),
         );
     }
 
@@ -381,7 +381,10 @@ impl Cell {
     fn start_machine(&mut self, device: Device) {
         let other = device.other();
         if !self.machine(other).clear {
-            self.raise(AlarmId::NotClear, &format!("{other}, no longer clear before the START of the {device}"));
+            self.raise(
+                AlarmId::NotClear,
+                &format!("{other}, no longer clear of the part when the {device} was to start"),
+            );
             return self.enter_state(Held(Phase::from_job(device, JobStep::Send)));
         }
         let known = self.machine_mut(device);
@@ -427,7 +430,7 @@ impl Cell {
             }
             (JobResult::Aborted, _) => {
                 self.raise(AlarmId::JobFailed, &format!("{device}, aborted at the machine"));
-                self.abort(&format!("the {device} was aborted at the machine"));
+                self.abort(&format!("the job of the {device} was aborted at the machine, not by the cell"));
             }
         }
     }
@@ -485,7 +488,7 @@ impl Cell {
                 let least = 100.0 * self.plan.gates.least_found;
                 Some((
                     AlarmId::Coverage,
-                    format!("{found} of {targets} points were found, at least {least:.0} % are required"),
+                    format!("{found} of {targets} points were found, required are {least:.0} % to 100 %"),
                 ))
             }
             GateResult::Passed => None,
@@ -521,7 +524,10 @@ impl Cell {
         let gates = self.plan.gates;
         let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
         if !figures.are_valid() {
-            self.reject_measurement(AlarmId::RegistrationFailed, "a figure is negative or not a number");
+            self.reject_measurement(
+                AlarmId::RegistrationFailed,
+                "a figure of the registration is negative or not a number",
+            );
         } else if figures.touch_on.is_none() && figures.coverage < gates.min_coverage {
             let (found, least) = (100.0 * figures.coverage, 100.0 * gates.min_coverage);
             self.reject_measurement(
@@ -803,10 +809,12 @@ impl Cell {
             Some(_) if self.state == Starting => {}
             Some(device) => {
                 let what = match self.machine(*device).boot_id {
-                    Some(_) => "is not idle: end or clear its job at its panel",
+                    Some(_) => "is not idle: end or clear its job at the panel of the machine",
                     None => "is not connected",
                 };
-                return Err(format!("the {device} {what}; the cell connects it again; after that, resume once more"));
+                return Err(format!(
+                    "the {device} {what}; the cell connects to this machine again; after the connection, resume once more"
+                ));
             }
         }
         Ok(())
@@ -1030,7 +1038,7 @@ impl Cell {
             Held(_) | Suspended(_) if at_job => {}
             // It had no job, moved, and was ordered to hold.
             _ if !at_job && self.active_alarms.contains_key(&AlarmId::MovesUnasked) => {}
-            state => return Err(format!("the {device} has no job to hold in the state {state}")),
+            state => return Err(format!("the {device} reports a hold, but has no job to hold in the state {state}")),
         }
         Ok(())
     }
@@ -1047,7 +1055,9 @@ impl Cell {
             }
             Suspended(_) if at_run => self.suspend(run),
             Execute(_) | Holding(_) | Suspending(_) if at_run => {}
-            state => return Err(format!("the {device} has no job to resume in the state {state}")),
+            state => {
+                return Err(format!("the {device} reports a resume, but has no job to resume in the state {state}"));
+            }
         }
         Ok(())
     }
@@ -1091,7 +1101,10 @@ impl Cell {
             // A machine that has forgotten its job gives this answer too. A second start would grind again what the
             // first one ground.
             (Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {
-                self.hold_unknown_outcome(device, "it reports that this job never began, but the cell saw it begin");
+                self.hold_unknown_outcome(
+                    device,
+                    "the machine reports that this job never began, but the cell saw the job begin",
+                );
             }
             (Reconciliation::NotStarted, _) => {
                 self.uncount_pass(device);
@@ -1100,7 +1113,7 @@ impl Cell {
                     self.raise_recurring_failure(
                         device,
                         Phase::from_job(device, JobStep::Start),
-                        "it reports that it was not started",
+                        "the machine reports that its job was not started",
                     );
                     return self.enter_state(Held(next));
                 }
@@ -1128,7 +1141,7 @@ impl Cell {
     /// If the part was accepted already, raises an alarm and ends the run instead.
     pub(super) fn on_restarted(&mut self, actor: &str) {
         if self.state == Completing {
-            self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear");
+            self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear of the part");
             return self.finish_complete();
         }
         for known in &mut self.machines {
@@ -1276,12 +1289,12 @@ impl Cell {
             }
             Stopping => {
                 let names = self.stopping_machine.map_or("no machine".to_owned(), |device| device.to_string());
-                self.raise(AlarmId::StopNotConfirmed, &format!("{names}, within its time limit for a stop"));
-                self.abort("the orderly stop was not confirmed in time");
+                self.raise(AlarmId::StopNotConfirmed, &format!("{names}, no report within the time limit for a stop"));
+                self.abort("the machine did not confirm the ordered stop in time");
             }
             Aborting => self.on_abort_deadline(),
             Completing => {
-                self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear in time");
+                self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear of the part in time");
                 self.finish_complete();
             }
             Idle | Stopped | Aborted | Complete => {}
@@ -1294,7 +1307,7 @@ impl Cell {
                 if self.hold_deadline.is_some() =>
             {
                 self.raise(AlarmId::HoldNotConfirmed, &device.to_string());
-                self.abort(&format!("the {device} did not confirm in time that it holds"));
+                self.abort(&format!("the {device} did not confirm the hold in time"));
             }
             (Some((device, JobStep::Run)), Execute(_)) if self.needs_stall_notice(device) => self.notify_stall(device),
             (Some((device, JobStep::Run)), _) => {
@@ -1326,7 +1339,11 @@ impl Cell {
         let left = self.progress_limit(device);
         self.raise(
             AlarmId::ProgressStands,
-            &format!("{device}, for {} s; the cell holds it after {} s more", told.as_secs(), left.as_secs()),
+            &format!(
+                "{device}, no progress for {} s; without progress, the cell holds this machine in {} s",
+                told.as_secs(),
+                left.as_secs()
+            ),
         );
         self.deadline = Some(self.now.saturating_add(left));
     }
@@ -1334,7 +1351,7 @@ impl Cell {
     fn on_abort_deadline(&mut self) {
         let unconfirmed = self.unconfirmed_aborts();
         if unconfirmed.is_empty() {
-            self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear in time");
+            self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear of the part in time");
             return self.finish_aborted(true);
         }
         if self.abort_repeated {

@@ -21,14 +21,15 @@ use super::{Outcome, finite_above_zero};
 /// Estimate from a nominal surface alone the error of distances to it, and the spacing for a required accuracy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The command builds two coarser surfaces from a part of the points, and measures the distances of the other points from
-each. All points lie on the nominal surface, so these distances are errors. The error of the whole surface is
-extrapolated from the errors of the two coarser surfaces.
+The command builds two coarser surfaces, each from a part of the points. The command then measures the distances of the
+other points from each coarser surface. All points lie on the nominal surface, so these distances are errors. The error
+of the whole surface is extrapolated from the errors of the two coarser surfaces.
 
 Example:
   regrind accuracy --nominal lens.csv --want 1
 
-Exit codes: 0 the curved distance is accurate enough; 1 it is not; 2 bad arguments or data; 3 fault.")]
+Exit codes: 0 the curved distance is accurate enough; 1 the curved distance is not accurate enough;
+2 bad arguments or data; 3 fault.")]
 pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
     #[arg(long, value_name = "FILE")]

@@ -42,22 +42,24 @@ enum AuditCommand {
 /// Verify that the record is unchanged: every record, their order, the end, and every file by its hash
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; by default the newest under runs/. In a folder of runs, each run is verified, and missing,
-renamed or exchanged runs are named: each run has a number and names the record of the run before. Missing newest runs
-are found only by an anchor kept elsewhere, or at a plant. A record whose end was cut off together with its anchor
-is detected only with --anchor and a copy of journal.anchor that was kept elsewhere. A record that was rewritten from
-its beginning is detected only with this copy, or with --key and the public key that was kept elsewhere. Without --key,
-the signatures are checked against the key that the record itself names. docs/journal.md shows how to verify a record
-without this program.
+RUN is the folder of a run; by default the newest under runs/. If RUN is a folder of runs, the command verifies
+each run, and names missing, renamed and exchanged runs: each run has a number and refers to the run before.
+
+Some changes are detected only with a copy that was kept elsewhere:
+- the newest runs are missing: with an anchor of these runs, or with the copies at a plant;
+- the end of a record was cut off together with its anchor: with --anchor and a copy of journal.anchor;
+- a record was rewritten from its beginning: with the same copy, or with --key and a copy of the public key.
+
+Without --key, the signatures are checked against the key in the record itself. docs/journal.md shows how to verify a
+record without this program.
 
 Examples:
   regrind audit verify runs
   regrind audit verify runs/freeform-mirror-20260704T120000Z --key /mnt/quality/grinding-cell-2.key
   regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
 
-Exit codes: 0 intact and closed; 1 broken: the first invalid record is named, or the run was interrupted, its anchor is
-missing, or its end is not signed although the run names a key; 2 no such run, or no record in it; 4 intact so far and
-still running: a process holds the run.")]
+Exit codes: 0 the record is intact and closed; 1 the record is broken or incomplete, the message names the reason;
+2 no such run, or no record in the run; 4 the record is intact so far, and the run is still active.")]
 struct ToVerify {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -81,13 +83,13 @@ struct ToVerify {
 /// Print the record as a table
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run, also of a running one; by default the newest under runs/. This command verifies nothing; see
-`regrind audit verify`.
+RUN is the folder of a run; by default the newest under runs/. The run can still be active. This command does not verify
+the record; to verify the record: `regrind audit verify`.
 
 Example:
   regrind audit show --kind intent,event --cycle 2
 
-Exit codes: 0 shown; 1 a record cannot be read; 2 no such run, or no record in it.")]
+Exit codes: 0 shown; 1 a record cannot be read; 2 no such run, or no record in the run.")]
 struct ToShow {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -106,16 +108,17 @@ struct ToShow {
 /// Print the whole record: lines of JSON as they were hashed, or CSV
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; by default the newest under runs/. The members `prev_hash` and `hash` at the end of a line are
-the chain; `hash` is SHA-256 of \"regrind journal record 1\", a line feed, prev_hash, a line feed, and the line without these two.
-docs/verify_journal.py verifies this file. CSV follows RFC 4180: the first row names the columns, each record is a row,
-the payload is its JSON text, and no field is altered.
+RUN is the folder of a run; by default the newest under runs/. Each line ends with the members `prev_hash` and
+`hash`. These members chain the records: `hash` is the SHA-256 of \"regrind journal record 1\", a line feed, prev_hash,
+a line feed, and the line without these two members. docs/verify_journal.py verifies the exported lines. CSV follows RFC
+4180: the first row names the columns, and each record is a row. The column of the payload has the JSON text of the
+payload. No field is altered.
 
 Examples:
   regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl
   regrind audit export --format csv > record.csv
 
-Exit codes: 0 printed; 1 a record cannot be read; 2 no such run, or no record in it.")]
+Exit codes: 0 printed; 1 a record cannot be read; 2 no such run, or no record in the run.")]
 struct ToExport {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -177,7 +180,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
     if is_folder_of_runs(&folder) {
         if let Some(anchor) = &arguments.anchor {
-            let reason = "the anchor belongs to one run, but a folder of runs was given: name the run".to_owned();
+            let reason = "the anchor belongs to one run, but the argument is a folder of several runs: name the folder of the one run".to_owned();
             return Err(Failure::Anchor { path: anchor.clone(), reason });
         }
         return succession::prove(&folder, &arguments.key, arguments.json);
@@ -227,13 +230,13 @@ pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, 
     match verified {
         // With a key, an end that this key has not signed is not trusted, even if a process holds the lock.
         verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
-            "its end is not signed, although the run names a key: somebody without the key can have written the records after the last seal",
+            "the end of the record is not signed, although the run has a key: somebody without the key can have written the records after the last signature",
         ),
         Verified { anchored: 0, .. } => {
             Err("journal.anchor is missing: it is unknown whether the end of the record was cut off")
         }
         Verified { closed: false, under_way: false, .. } => Err(
-            "the run was interrupted: no program drives it, and its record has no end; what happened after the last record is unknown",
+            "the run was interrupted: its program no longer runs, and the record has no end; later events are unknown",
         ),
         verified => Ok(verified.closed && !verified.lacks_last_seal()),
     }
@@ -252,11 +255,15 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
         && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
-    let report = if edited { "report      report.html differs from the report of this record\n" } else { "" };
+    let report = if edited {
+        "report      report.html differs from the report that the record gives: the file or the program changed\n"
+    } else {
+        ""
+    };
     let others: Vec<&str> = unrecorded.iter().filter(|name| *name != RUN_REPORT).map(String::as_str).collect();
     match others.len() {
         0 => report.to_owned(),
-        _ => format!("{report}files       not on record: {}\n", others.join(", ")),
+        _ => format!("{report}files       not in the record, so not verified: {}\n", others.join(", ")),
     }
 }
 
@@ -302,10 +309,13 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> S
     let files = super::words::counted(*artefacts as usize, "file");
     let end = match (closed, anchored) {
         (true, _) => "the run is closed: no record follows, and none was cut off".to_owned(),
-        (false, 0) => "the run is not closed and has no anchor: a cut of its end would not be detected".to_owned(),
+        (false, 0) => {
+            "the run is not closed and has no anchor: if records were cut off at the end, this is not detected"
+                .to_owned()
+        }
         (false, anchored) => {
             format!(
-                "the run is not closed: nothing was cut off up to record {anchored}; a later cut would not be detected"
+                "the run is not closed: no record up to record {anchored} was cut off; if later records were cut off, this is not detected"
             )
         }
     };

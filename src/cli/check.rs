@@ -24,12 +24,13 @@ use super::nominal;
 #[derive(Args, Debug)]
 #[command(after_help = "\
 A file with a table [cell] is a cell file, a file with a table [dialect] is a dialect of programs, and any other file is
-a recipe. For a recipe, the files that it names and the truth of a simulated cell are also checked.
+a recipe. For a recipe, the command also checks the files that the recipe names and the table [simulation], which gives
+the true shape of the simulated part.
 
 Example:
   regrind check recipes/*.toml config/*.toml
 
-Exit codes: 0 all files are good; 2 a file is not; 3 fault.")]
+Exit codes: 0 all files are good; 2 a file has a problem; 3 fault.")]
 pub(super) struct Arguments {
     /// Recipes, cell files and dialects
     #[arg(value_name = "FILE", required = true)]
@@ -169,7 +170,7 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
 /// as the simulator. Returns the first problem as an error. Returns `Ok` if there is no such table.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     let Some(table) = recipe.simulation.clone() else { return Ok(()) };
-    let remedy = "correct it, or remove the key: every key has a default";
+    let remedy = "correct the value, or remove the key: every key has a default";
     let world: WorldSpec = toml::Value::Table(table)
         .try_into()
         .map_err(|error: toml::de::Error| recipe.problem("simulation", error.message().trim(), "", remedy))?;

@@ -58,30 +58,36 @@ const LONG_HELP: &str = "\
 Example:
   regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc
 
-x and y of the map are those of the program's work coordinates (G54): the model frame. Without --nominal, the map is
-applied along z; on a slope, a correction e is then too small by e (1 - nz). With --nominal, the wheel is a ball of any
-radius, and the program moves its centre, or its lowest point with --tip-of-radius.
+x and y of the map are in the work coordinates of the program (G54): the model frame. Without --nominal, the command
+applies the map along z. On a slope, where the unit normal has the z component nz, a correction e is then too small by
+e (1 - nz). With --nominal, the wheel must be a ball of any radius. The program then moves the centre of the ball or, with
+--tip-of-radius, the lowest point of the ball.
 
-Straight moves at feed are divided if the correction changes along them. An arc stays an arc if the correction is
-constant along it; otherwise it becomes chords. Rapid moves (G0), moves in machine coordinates (G53) and moves to the
-reference point (G28, G30) stay as they are. The axes that they move are unknown after them. Z is unknown after a change
-of the tool's length (G43, G49), and every axis after M6 or another zero. A move at feed from an unknown axis is refused.
-The command also refuses, with their line: a word without a meaning in its line, variables, O-words, canned cycles,
-cutter compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, and a change of the work
-coordinates within the program. Comments are kept; line numbers are not.
+Straight moves at feed are divided if the correction changes along the move. An arc stays an arc if the correction is
+constant along the arc; otherwise the arc becomes chords. Rapid moves (G0), moves in machine coordinates (G53) and moves
+to the reference point (G28, G30) stay unchanged. After G28, G30 or G53, the command does not know the positions of the
+moved axes. After a change of the tool length (G43, G49), the command does not know the position of z. After M6 or a new
+zero, the command knows no position. The command refuses a move at feed if the position of an axis is unknown.
+The command also refuses the following, and names the line: a word without a meaning in its line, variables, O-words,
+canned cycles, cutter compensation, G92 and other moved zeros, inverse-time feed, rotary axes that leave 0, and a change
+of the work coordinates within the program. The new program keeps the comments, but not the line numbers.
 
-Between its nodes, a map is a cubic spline. Next to a step, the spline swings by a tenth of the step. In a map of
-Regrind, nodes with 0 in a column `valid` keep their value; in another map, they get the nearest valid value.
+Between its nodes, a map is a cubic spline. Next to a step of the map, the spline overshoots by a tenth of the step. In a
+map of Regrind, nodes with 0 in a column `valid` keep their value. In another map, these nodes get the nearest valid
+value.
 
 The command refuses a program without a move at feed, a program with hardly any move at feed over the map, and a
-correction of more than --max-correction-um. It reports lengths outside the map: there the outermost values of the map
-level off within five nodes. Before the new program gets its name, an independent reader reads its lines again, and they
-are compared with the old program and the map.
+correction of more than --max-correction-um. The command reports the length of the path outside the map. There, the
+correction changes within five nodes to the constant value of the nearest node of the map. Before the command saves the
+new program, an independent reader reads the new lines, and the command compares these with the old program and the map.
 
-The new program names the hashes of the old program and of the map. The command refuses a program that names the map
-already, a map of another part, an error that was measured after a pass with another correction than that of the
-program, and a correction.csv, which is absolute, for a program with a correction. The program does not go deeper: if the
-map raises the tool, the tool cuts air, unless its zero is set lower.
+The new program contains the hashes of the old program and of the map. The command refuses:
+- a program that is already corrected by this map;
+- a map of another part;
+- an error map that was measured after a pass with a correction other than the one in the program;
+- a correction.csv for a program that already has a correction: a correction.csv is the total, not an addition.
+The new program does not go deeper as a whole. If the map raises the tool, the tool cuts air. To prevent this, set the
+zero of the tool lower.
 
 Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
 
@@ -132,7 +138,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// µm, length outside the map, and an assumed unit. The last two lines appear only if they apply.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
-        "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} µm\n",
+        "{} straight moves and {} arcs became {} moves, including {} arcs; each point moved by at most {} µm\n",
         amended.straight,
         amended.arcs,
         amended.written,
@@ -141,7 +147,7 @@ fn summary(amended: &Amended) -> String {
     );
     if amended.beside_map_mm > 0.0 {
         text += &format!(
-            "outside the map: {} mm of {} mm at feed, where the outermost values of the map are levelled off\n",
+            "outside the map: {} mm of {} mm at feed; there, the correction becomes the constant value at the border of the map\n",
             three_digits(amended.beside_map_mm),
             three_digits(amended.feed_mm)
         );

@@ -21,8 +21,8 @@ use super::words::time_left;
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
-RUN is the folder of a run; by default the run under runs/ that is running now. The record has the name of the person in
-the operating system.
+RUN is the folder of a run; by default the active run under runs/. The record gets your user name in the operating
+system.
 
 Example:
   {example}
@@ -54,9 +54,10 @@ Examples:
   regrind confirm done --file points.csv
   regrind confirm done --map 3fa9c210           for machines that take files, see docs/file-exchange.md
   regrind confirm clear --machine cmm
-  regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
+  regrind confirm over --machine grinder --evidence \"at rest, wheel up, one pass was ground\"
 
-Exit codes: 0 the cell accepted it; 2 no such run; 3 the cell refused it, or did not answer.")]
+Exit codes: 0 the cell accepted the confirmation; 2 no such run; 3 the cell refused the confirmation, or did not
+answer.")]
 pub(super) struct Confirmation {
     /// Fact to confirm
     #[arg(value_enum)]

@@ -25,10 +25,12 @@ use super::{Outcome, check, control, key};
 /// Check the computer, the cell file, the machines and a recipe for obstacles to a run; nothing moves
 #[derive(Args, Debug)]
 #[command(after_help = "\
-From a machine on Modbus, it reads the identity and the status, and writes only the heartbeat of a client. At a server of
-I++ DME, it opens a session, reads the same, and ends the session. From a LinuxCNC, it reads without taking control. At a
-machine that prints its hits, it listens for 5 s. From machines that exchange files, or that a person serves, it reads
-nothing.
+The command checks each machine by its kind:
+- Modbus: reads the identity and the status, and writes only the heartbeat of a client;
+- server of I++ DME: opens a session, reads the identity and the status, and ends the session;
+- LinuxCNC: reads the identity and the status without taking control;
+- machine that prints its hits: listens for 5 s;
+- machine that exchanges files, or that a person serves: reads nothing from the machine.
 
 Example:
   regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml
@@ -119,8 +121,11 @@ fn folder(runs: &Path) -> Finding {
     match written {
         Err(error) => Finding::new("folder of the runs", FindingLevel::Obstacle, error.to_string()),
         Ok(()) if free < LITTLE_BYTES => {
-            let words =
-                format!("{} has {} MB free; a run of many points requires hundreds of MB", runs.display(), free >> 20);
+            let words = format!(
+                "the disk of {} has {} MB free, but a run of many points requires hundreds of MB; free space on the disk",
+                runs.display(),
+                free >> 20
+            );
             Finding::new("folder of the runs", FindingLevel::Notice, words)
         }
         Ok(()) => Finding::new(
@@ -137,8 +142,8 @@ fn folder(runs: &Path) -> Finding {
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
-        "every user of this computer can read {open} of them, and can block them while they are active: `chmod o-rwx \
-         {}/*`",
+        "every user of this computer can read {open} of the runs, and can block an active run; to prevent this: \
+         `chmod o-rwx {}/*`",
         runs.display()
     );
     (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
@@ -158,8 +163,8 @@ fn clock(runs: &Path) -> Finding {
     let last = last.unwrap_or_default();
     if now.as_str() < MIN || now < last {
         let words = format!(
-            "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the order of the \
-             records does not depend on it"
+            "the clock shows {now:.19}, but the last record was written at {last:.19}: set the clock; the order of the \
+             records stays correct in any case"
         );
         return Finding::new("clock", FindingLevel::Notice, words);
     }
@@ -274,8 +279,8 @@ async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Fi
         None => {
             let listened = LISTENS.as_secs();
             let words = format!(
-                "{name} is open, and no line arrived in {listened} s: touch something within this time to see the \
-                 formats that it matches"
+                "{name} is open, but no line arrived in {listened} s: start this command again and touch something within this \
+                 time; then the command shows the formats that match the line"
             );
             Finding::new(what, FindingLevel::Notice, words)
         }
@@ -290,7 +295,7 @@ async fn machine<M: Machine>(
 ) -> Finding {
     let what = device.to_string();
     let Some(settings) = settings else {
-        let words = "it reports nothing over a wire; its folders and settings are valid";
+        let words = "this machine has no data connection to test; its folders and settings are valid";
         return match setup::check_machine(cell, device) {
             Ok(()) => Finding::new(what, FindingLevel::Notice, words),
             Err(error) => Finding::new(what, FindingLevel::Obstacle, error.to_string()),

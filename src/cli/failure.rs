@@ -34,7 +34,7 @@ pub(super) enum Failure {
     Program(regrind::formats::gcode::GcodeError),
     #[error(transparent)]
     Programs(regrind::drive::ProgramError),
-    #[error("{recipe} in the cell of {cell}: {source}")]
+    #[error("{recipe} with the cell file {cell}: {source}")]
     FirstPath { recipe: PathBuf, cell: PathBuf, source: regrind::compensation::path::PathError },
     #[error("{path}: {source}")]
     Path { path: PathBuf, source: regrind::compensation::path::PathError },
@@ -50,18 +50,20 @@ pub(super) enum Failure {
     NoProbeRadius,
     #[error("{path}: a map has points of the surface, not centres of a probe; give --method contact")]
     MapOfContacts { path: PathBuf },
-    #[error("{path}: --projection is for points, and this is {what}; remove it")]
+    #[error("{path}: --projection applies only to points, but this file is {what}; remove --projection")]
     Projection { path: PathBuf, what: &'static str },
     #[error(
-        "{path}: not a pose: {reason}; give 16 numbers, row by row, as text or JSON, or the registration.json of an \
-         earlier run"
+        "{path}: this file has no pose: {reason}; give the 16 numbers of a 4 x 4 matrix, row by row, as text or JSON, \
+         or the registration.json of an earlier run"
     )]
     Initial { path: PathBuf, reason: String },
-    #[error("{bad} of {files} files {} problems; they are listed above", if *bad == 1 { "has" } else { "have" })]
+    #[error("{bad} of {files} files {} problems; the problems are listed above", if *bad == 1 { "has" } else { "have" })]
     Checked { bad: usize, files: usize },
     #[error(transparent)]
     Setup(SetupError),
-    #[error("the run cannot start from the learned error of {run}: {source}; or write learn = false")]
+    #[error(
+        "the run cannot start from the learned error of {run}: {source}; or start without the learned error: write learn = false in the recipe"
+    )]
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
@@ -81,8 +83,8 @@ pub(super) enum Failure {
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
     Anchor { path: PathBuf, reason: String },
     #[error(
-        "the file of the key is unknown: REGRIND_KEY is empty, or neither it nor HOME is set; name the file with \
-         --key"
+        "the file of the key is unknown: REGRIND_KEY is empty, or neither REGRIND_KEY nor HOME is set; name the file \
+         with --key"
     )]
     NoPlaceForKey,
     #[error(transparent)]
@@ -97,17 +99,17 @@ pub(super) enum Failure {
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: there is no run; name the folder of a run")]
     NoRun { path: PathBuf },
-    #[error("{path}: no cell runs there ({source}); to see how the run ended: `regrind audit show`")]
+    #[error("{path}: this run is not active ({source}); to see how the run ended: `regrind audit show`")]
     NotRunning { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: it is unknown whether a cell runs there: this user has no permission ({source}); ask as the user of \
-         the cell"
+        "{path}: it is unknown whether this run is active: this user has no permission ({source}); give the command as \
+         the user who started the run"
     )]
     MayNotAsk { path: PathBuf, source: io::Error },
     #[error(
         "{path}: the program of the cell does not answer, and will not execute this request later. Its process is \
-         stopped (SIGSTOP, a debugger), or the computer is overloaded. A machine that receives nothing from it holds \
-         by itself: check both machines"
+         stopped (SIGSTOP, a debugger), or the computer is overloaded. A machine that receives nothing from this \
+         program holds by itself: check both machines"
     )]
     NoAnswer { path: PathBuf },
     #[error("{} runs are active: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
@@ -126,8 +128,8 @@ pub(super) enum Failure {
     Page { address: SocketAddr, source: io::Error },
     #[error(
         "{address} is open to other computers; give the page a certificate (--certificate FILE --key FILE) and users \
-         (--users FILE), or show it at 127.0.0.1 and use a tunnel from other computers: ssh -L 7373:127.0.0.1:7373 \
-         CELL"
+         (--users FILE). Or show the page at 127.0.0.1, and connect from another computer through a tunnel: \
+         ssh -L 7373:127.0.0.1:7373 CELL"
     )]
     ForOthers { address: SocketAddr },
     #[error(transparent)]
@@ -139,7 +141,7 @@ pub(super) enum Failure {
     OpenWork { why: String },
     #[cfg(feature = "plant")]
     #[error(
-        "{}: it cannot be read: {source}; check that it exists, and that you have the right to read it",
+        "{}: this file cannot be read: {source}; check that the file exists, and that you have the right to read the file",
         .path.display()
     )]
     Unreadable { path: PathBuf, source: io::Error },
@@ -154,30 +156,30 @@ pub(super) enum Failure {
     #[error("the two passwords differ; nothing was changed")]
     NotAlike,
     #[error(
-        "{}: the end of its record may be lost: {what}. A machine may have a job that is not on record, so the run \
-         is not resumed: check both machines, bring them home with `regrind recover` and begin a new run; or \
-         continue with `regrind resume --despite-loss`",
+        "{}: the last records of this run may be lost: {what}. A machine may have a job that is not in the record, so \
+         the run is not resumed. Check both machines. Then bring the machines to idle with `regrind recover` and \
+         begin a new run, or continue this run with `regrind resume --despite-loss`",
         .run.display()
     )]
     MayBeLost { run: PathBuf, what: String },
-    #[error("{}: its program ended before its first request to a machine; begin a new run", .run.display())]
+    #[error("{}: the program of this run ended before its first request to a machine, so there is nothing to resume; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error(
-        "{}: a rehearsal requires machines that people operate, and this cell has a machine on a wire; write \
-         `simulated = true` into the cell file and simulate it, or remove --rehearsal",
+        "{}: a rehearsal requires machines that people operate, but this cell has a machine with a data connection; \
+         remove --rehearsal, or write `simulated = true` into the cell file and simulate the machine",
         .cell.display()
     )]
     NoRehearsal { cell: PathBuf },
-    #[error("{}: its simulated machines ended with its program; begin a new run", .run.display())]
+    #[error("{}: the simulated machines ended with the program of this run, so the run cannot be resumed; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(
-        "{}: the run was started by Regrind {program}, and this version cannot resume it ({what}); resume it with that version, or \
-         bring the machines home with `regrind recover` and begin a new run",
+        "{}: the run was started by Regrind {program}, and this version cannot resume the run ({what}). Resume the run with the earlier version. Or \
+         bring the machines to idle with `regrind recover`, and begin a new run",
         .run.display()
     )]
     EarlierRun { run: PathBuf, program: String, what: String },
     #[error(
-        "{}: {what} changed since the begin of the run; restore the files that the recipe and the cell file name",
+        "{}: {what} changed since the run began; restore the files that the recipe and the cell file name",
         .run.display()
     )]
     OtherTask { run: PathBuf, what: &'static str },
@@ -186,26 +188,30 @@ pub(super) enum Failure {
     #[error("{device}: {source}")]
     Recover { device: regrind::cell::Device, source: regrind::drive::recovery::RecoveryError },
     #[error(
-        "it is unknown whether both machines are idle; run `regrind recover` again, or inspect a machine without a wire yourself"
+        "it is unknown whether both machines are idle; run `regrind recover` again; if a machine has no data connection, inspect the machine yourself"
     )]
     NotHome,
     #[error(transparent)]
     Learned(regrind::formats::LearnedError),
     #[error(transparent)]
     Replay(regrind::drive::ReplayError),
-    #[error("the order is not acknowledged: {message}")]
+    #[error("the cell did not accept the order: {message}")]
     OrderRefused { message: String },
     #[error("`confirm over` requires --machine and --evidence: the machine that you checked, and your finding")]
     Evidence,
-    #[error("--map is too short: give at least the first 8 digits of the map at the grinder, as in correction.json")]
+    #[error(
+        "--map is too short: give at least the first 8 digits of the hash of the map that the grinder uses; the hash is in correction.json"
+    )]
     ShortMap,
     #[error("`confirm clear` requires --machine: the machine that you checked")]
     NoMachine,
-    #[error("{path} already exists; choose another folder, or move it away")]
+    #[error("{path} already exists; choose another folder, or move the existing one away")]
     IsThere { path: PathBuf },
-    #[error("no model of the error: {0}")]
+    #[error("the model of the error cannot be computed: {0}")]
     NoModel(regrind::model::ModelError),
-    #[error("the folder to create is missing; give it as in: regrind init mirrors --machines modbus-tcp")]
+    #[error(
+        "the folder to create is missing; name the folder, for example: regrind init mirrors --machines modbus-tcp"
+    )]
     NoFolder,
     #[error("{path}: {source}; give the folder of the runs with --runs")]
     NoRuns { path: PathBuf, source: std::io::Error },
@@ -213,7 +219,9 @@ pub(super) enum Failure {
     NoFile { path: PathBuf, source: std::io::Error },
     #[error("the run did not finish: {reason}")]
     Ended { reason: String },
-    #[error("the result cannot be given: {what} is not a finite number; report it with the files that led to it")]
+    #[error(
+        "the result cannot be given: {what} is not a finite number; please report this fault with the input files of the command"
+    )]
     NotFinite { what: &'static str },
     /// The input was valid and the output folder was writable at the start, but writing the result failed.
     #[error("the result could not be saved: {0}")]

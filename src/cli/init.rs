@@ -14,8 +14,9 @@ use super::failure::Failure;
 /// Create a folder to start with: a recipe, a cell, their schemas for the editor, and a page of commands
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "\
-Existing files are not changed: a folder that has one of the files is refused. The recipe makes a free-form mirror; change
-its part, wheel and measurement. The cell file is the shipped one for these machines.
+The command refuses a folder that already has one of the files to create, so no existing file is changed. The new recipe
+is an example, such as a free-form mirror: change the part, the wheel and the measurement. The new cell file is the
+shipped example for the kind of machines that --machines names.
 
 On a terminal, the command asks for arguments that are not given.
 
@@ -89,11 +90,11 @@ impl Machines {
         };
         let always = [
             (run, "makes a part"),
-            ("regrind runs", "the list of the runs and their results"),
+            ("regrind runs", "lists the runs and their results"),
             ("regrind audit verify", "verifies the record of the newest run"),
         ];
         let checked = [
-            ("regrind check recipe.toml cell.toml", "every problem with its line, column and remedy"),
+            ("regrind check recipe.toml cell.toml", "shows every problem with its line, column and remedy"),
             ("regrind plan recipe.toml --cell cell.toml", "shows the commands of a run and their duration"),
         ];
         checked.into_iter().chain(before).chain(always).collect()
@@ -220,7 +221,7 @@ fn cell_of(shipped: &str) -> String {
 
 fn readme(name: &str, machines: Machines) -> String {
     let mut text = format!(
-        "# {name}\n\n`recipe.toml` states how the part is ground, measured and accepted, `cell.toml` on which machines. An editor for TOML completes \
+        "# {name}\n\n`recipe.toml` states how the part is ground, measured and accepted. `cell.toml` describes the machines. An editor for TOML completes \
          both files from the schemas in this folder. Commands for this folder:\n\n```sh\n"
     );
     let commands = machines.commands();
@@ -228,8 +229,8 @@ fn readme(name: &str, machines: Machines) -> String {
     for (command, what) in commands {
         let _ = writeln!(text, "{command:width$}  # {what}");
     }
-    text + "```\n\nWhile a run is on, from another terminal: `regrind status`, `regrind hold`, `regrind resume`, `regrind abort`, `regrind serve`. Every order \
-            explains itself with `--help`.\n\nNo part of this program is a safety function: guards and the emergency stop are the machines' own circuits.\n"
+    text + "```\n\nCommands from another terminal during a run: `regrind status`, `regrind hold`, `regrind resume`, `regrind abort`, `regrind serve`. Add \
+            `--help` to a command to see its description.\n\nNo part of this program is a safety function: the machines have their own circuits for guards and emergency stop.\n"
 }
 
 fn words(folder: &Path, machines: Machines) -> String {

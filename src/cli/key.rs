@@ -18,16 +18,17 @@ const KEY: &str = "REGRIND_KEY";
 /// Create the key that signs the records of this computer, if it does not exist, and print its public half
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The file of the key is that of REGRIND_KEY, otherwise $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key
-(on Windows in %LOCALAPPDATA%). Only its owner can read it. An existing key is kept, and its public half is printed. All
-later runs of this user sign with it.
+The variable REGRIND_KEY names the file of the key. Without this variable, the file is
+$XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key (on Windows in %LOCALAPPDATA%). Only the owner of the
+file can read the key. If the key exists, the command keeps the key and prints its public half. All later runs of this
+user sign their records with this key.
 
 Examples:
   regrind audit key
   regrind audit key --json > /mnt/quality/grinding-cell-2.key
   regrind audit verify --key /mnt/quality/grinding-cell-2.key
 
-Exit codes: 0 printed; 2 the file cannot be created or read, others can read it, or it has no key.")]
+Exit codes: 0 printed; 2 the file cannot be created or read, other users can read the file, or the file has no key.")]
 pub(super) struct Arguments {
     /// File of the key
     #[arg(long, value_name = "FILE")]
@@ -70,9 +71,9 @@ fn in_words(public: &PublicKey, path: &Path, made: bool) -> String {
     let fingerprint = public.fingerprint();
     format!(
         "public key   {public}\nfingerprint  {fingerprint}\nfile         {}, {made}\n\n\
-         Runs of this user sign their records with it from now on. Keep the public key where nobody at this computer can change it:\n\
+         Runs of this user sign their records with this key from now on. Keep the public key where nobody at this computer can change it:\n\
          give it to the quality department, which verifies records with `regrind audit verify --key`. Keep the key file on this\n\
-         computer, and in no copy that others can read. If it is lost, no record is lost, but later runs need another key.\n",
+         computer, and in no copy that others can read. If the key file is lost, no record is lost, but later runs need another key.\n",
         path.display()
     )
 }
@@ -123,8 +124,8 @@ pub(super) fn public(word: &str) -> Result<PublicKey, String> {
         return Ok(key);
     }
     let text = std::fs::read_to_string(word).map_err(|error| {
-        format!("neither 64 lower-case hexadecimal digits nor a file ({error}); give what `regrind audit key` printed")
+        format!("the value is neither 64 lower-case hexadecimal digits nor a readable file ({error}); give the output of `regrind audit key`")
     })?;
     PublicKey::from_text(&text)
-        .map_err(|()| "the file contains no public key; give what `regrind audit key` printed".to_owned())
+        .map_err(|()| "the file contains no public key; give the output of `regrind audit key`".to_owned())
 }

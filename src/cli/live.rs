@@ -114,7 +114,7 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
         && let Err(error) = drive.listen_also_at(door)
     {
         eprintln!(
-            "{}: orders cannot be received there: {error}",
+            "{}: orders cannot be received at this socket: {error}",
             regrind::document::visible(&door.display().to_string())
         );
     }

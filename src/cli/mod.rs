@@ -124,7 +124,9 @@ enum Outcome {
 /// Parses the arguments, runs the command, and returns the exit code.
 pub fn main() -> ExitCode {
     std::panic::set_hook(Box::new(|panic| {
-        eprintln!("error: a fault of the program itself: {panic}; please report it with the files that led to it");
+        eprintln!(
+            "error: a fault of the program itself: {panic}; please report this fault with the input files of the command"
+        );
     }));
     std::panic::catch_unwind(run).unwrap_or(ExitCode::from(failure::FAULT))
 }
@@ -216,7 +218,7 @@ fn name(text: &str) -> Result<String, String> {
     const LONGEST: usize = 300;
     match (misleading(text), text.trim()) {
         (Some(hidden), _) => Err(format!(
-            "it has the character U+{:04X}, which is invisible or changes the order of the letters; type the text again",
+            "the text has the character U+{:04X}, which is invisible or changes the order of the letters; type the text again",
             u32::from(hidden)
         )),
         (None, "") => Err("it is empty".into()),
@@ -235,7 +237,7 @@ fn remark(text: &str) -> Result<String, String> {
 fn above_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value > 0.0 => Ok(value),
-        _ => Err("give a number above 0, with a decimal point".into()),
+        _ => Err("give a number above 0; the decimal mark is a point, not a comma".into()),
     }
 }
 
@@ -248,7 +250,10 @@ fn finite_above_zero(text: &str) -> Result<f64, String> {
 fn finite_from_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value >= 0.0 && value.is_finite() => Ok(value.abs()),
-        _ => Err("give a finite number above 0, or 0 for a probe without a ball, with a decimal point".into()),
+        _ => Err(
+            "give a finite number above 0, or 0 for a probe without a ball; the decimal mark is a point, not a comma"
+                .into(),
+        ),
     }
 }
 

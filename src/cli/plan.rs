@@ -134,7 +134,7 @@ impl ArcsDocument {
     fn in_words(&self, points: u64) -> String {
         let n = three_digits;
         format!(
-            "{} and {} in place of {}, {} a second in place of {}; within {} µm of the path ({} µm allowed), corners of {} mrad at most in place of {}",
+            "{} and {} replace {}; {} moves per second instead of {}; distance from the path {} µm, limit {} µm; largest corner between moves {} mrad instead of {}",
             counted(self.arcs as usize, "arc"),
             counted(self.lines as usize, "line"),
             counted(points as usize, "line"),
@@ -177,7 +177,7 @@ impl TiltDocument {
     fn in_words(&self) -> String {
         let n = three_digits;
         format!(
-            "tilt        {} from {} to {} degrees, {} degrees a minute at most; the normals are at least {} degrees from the upright direction of the head\n",
+            "tilt        {} from {} to {}°, at most {}°/min; the angle between the normals of the part and the upright head is at least {}°\n",
             self.axis,
             n(self.least_deg),
             n(self.most_deg),
@@ -229,7 +229,7 @@ impl ScallopsDocument {
             .filter_map(|(what, um)| um.map(|um| format!("{what} {} µm", n(um))))
             .collect();
         format!(
-            "PV {} µm and RMS {} µm between tracks {} mm apart; {} allowed of all errors together",
+            "PV {} µm and RMS {} µm between tracks {} mm apart; {} allowed for all errors together",
             n(self.pv_um),
             n(self.rms_um),
             n(track_mm),
@@ -350,7 +350,7 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     }
     if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MAX_MINUTES) {
         warnings.push(format!(
-            "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; raise measure.speed_mm_s, or \
+            "a measurement takes {} h at least, more than a shift of {} h: {}, each approached over {} mm at {} mm/s; raise measure.speed_mm_s, or \
              require fewer points",
             n(minutes / 60.0),
             MAX_MINUTES / 60.0,
@@ -370,7 +370,7 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
     (!beyond.is_empty()).then(|| {
         format!(
-            "the scallops between the tracks take {}, more than {} %, and no correction can remove them; write grinding.track_mm = {} or less, or \
+            "the scallops between the tracks use {}, limit {} %; no correction can remove scallops; write grinding.track_mm = {} or less, or \
              use a wheel with a larger radius across the tracks",
             beyond.join(" and "),
             100.0 * MAX_SCALLOP_SHARE,
@@ -386,11 +386,11 @@ fn time_in_words(d: &Document) -> String {
     let n = three_digits;
     let measurements = counted(d.most_measurements as usize, "measurement");
     let measuring = d.least_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
-        format!("of {} minutes and more for the search moves alone", n(minutes))
+        format!("of at least {} minutes, counting only the search moves", n(minutes))
     });
     format!(
-        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; without the time for moves between \
-         points and for loading, which recipe and cell do not state",
+        "at most {} of {} minutes and {measurements} {measuring}: {} h or more, if all passes and measurements are needed. This does not include the time for moves between \
+         points and for loading: the recipe and the cell file do not state this time",
         if d.most_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.most_passes) },
         n(d.grinding_minutes),
         n(d.least_hours_to_last),
@@ -434,7 +434,7 @@ fn words(d: &Document) -> String {
     let arcs = d.arcs.as_ref().zip(d.program_points);
     let arcs = arcs.map_or(String::new(), |(arcs, points)| format!("arcs        {}\n", arcs.in_words(points)));
     let learns = if d.learns {
-        "learn       a run starts with the correction that the last similar run learned; this plan is without that correction\n"
+        "learn       a run starts with the correction that the last similar run learned; this plan does not contain this correction\n"
     } else {
         ""
     };
@@ -442,15 +442,17 @@ fn words(d: &Document) -> String {
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\
-         level       {} µm over the nominal surface first, at least {} µm deeper each pass, so {} µm at the last\nbudget      {} µm in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
+         level       {} µm over the nominal surface in the first pass, at least {} µm deeper in each further pass, {} µm in the last\nbudget      {} µm of material in all passes\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,
         match (d.targets, d.touches_are_chosen) {
             (0, _) => "points that the operator chooses".to_owned(),
             (targets, false) => counted(targets, "point"),
-            (targets, true) =>
-                format!("{FIRST_BATCH} of {}, then batches until enough is known", counted(targets, "point")),
+            (targets, true) => format!(
+                "{FIRST_BATCH} of {}, then more in batches until the error is known well enough",
+                counted(targets, "point")
+            ),
         },
         d.sphere_points,
         d.tracks,
@@ -458,7 +460,8 @@ fn words(d: &Document) -> String {
         n(d.grinding_minutes),
         d.scallops
             .as_ref()
-            .map_or("unknown, because no path can be planned here".to_owned(), |told| told.in_words(d.track_mm)),
+            .map_or("unknown, because this program cannot plan a path for this part".to_owned(), |told| told
+                .in_words(d.track_mm)),
         n(d.first_level_um),
         n(d.depth_of_cut_um),
         n(d.last_level_um),

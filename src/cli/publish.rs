@@ -31,9 +31,10 @@ const MINUTE: Duration = Duration::from_secs(60);
 /// Publish live values of this cell to a broker (Sparkplug B) and to clients (OPC UA)
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until it is stopped, from run to
-run, also without an active run. It accepts no orders: written values and received commands are refused, reported here,
-and recorded in the active run. `regrind run --plant` starts it by itself. docs/live.md lists every value.
+The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until you stop it,
+also without an active run. The command accepts no orders: written values and received commands are refused, reported
+here, and recorded in the active run. `regrind run --plant` starts this command by itself. docs/live.md
+lists every value.
 
 Example:
   regrind tell --plant plant.toml --runs /srv/runs
@@ -241,8 +242,7 @@ async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, j
         }
         let over = matches!(heard, Ok(0));
         if let Some(more) = quota.summed_up(Instant::now(), over) {
-            refuse(&runs, json, "these or other clients", &format!("{more} further requests that are not allowed"))
-                .await;
+            refuse(&runs, json, "these or other clients", &format!("{more} further requests")).await;
         }
         if over {
             return;

@@ -22,14 +22,15 @@ use super::{Outcome, check, control, key};
 /// Bring machines of a cell to idle that hold a job which no run knows
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Shows the state of each machine and the command that brings it nearer to idle: STOP, ACKNOWLEDGE or CLEAR. The command is
-sent only after you type that word; any other input leaves the machine as it is. Each step is recorded in a new folder
-under --runs. If a run there knows the job, prefer `regrind resume`.
+Shows the state of each machine and the command for the next step to idle: STOP, ACKNOWLEDGE or CLEAR. The command is
+sent only after you type the name of the command; after any other input no command is sent. Each step is recorded in a
+new folder under --runs. If the job belongs to an interrupted run in --runs, use `regrind resume` first.
 
 Example:
   regrind recover --cell config/modbus-tcp.toml
 
-Exit codes: 0 both machines are idle; 2 bad cell file; 3 a machine was left as it is, refused, or cannot be reached.")]
+Exit codes: 0 both machines are idle; 2 bad cell file; 3 a machine is not idle, refused a
+command, or cannot be reached.")]
 pub(super) struct Arguments {
     /// Cell whose machines to bring to idle
     #[arg(long, value_name = "FILE")]
@@ -119,10 +120,12 @@ impl Recovery {
         let Some(settings) = settings else {
             let words = match (link.wire.ippdme_address(), link.wire.linuxcncrsh_address()) {
                 (Some(_), _) => {
-                    "its server stores no job, so no job has to be ended; check at the machine that the probe is clear"
+                    "the server of this machine stores no job, so no job must be ended; check that the probe is clear of the part"
                 }
-                (_, Some(_)) => "its controller stores no job; if a program runs or is paused, end it at the machine",
-                _ => "it reports nothing over a wire; bring it to idle at the machine",
+                (_, Some(_)) => {
+                    "its controller stores no job; if a program runs or is paused, end this program at the machine"
+                }
+                _ => "this machine reports nothing over a wire; bring the machine to idle by hand",
             };
             super::print(&format!("{device}: {words}\n"))?;
             return Ok(false);
@@ -142,10 +145,14 @@ impl Recovery {
             let Some(step) = RecoveryStep::for_state(seen.state) else { return Ok(true) };
             if let Some(run) = seen.job.and_then(|job| self.run_of(job.job)) {
                 super::print(&format!(
-                    "  this is a job of the interrupted run {run}: `regrind resume {run}` continues it; recover only if resume is refused\n"
+                    "  this is a job of the interrupted run {run}: `regrind resume {run}` continues the run; send a command here only if resume is refused\n"
                 ))?;
             }
-            super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.consequence(device)))?;
+            super::print(&format!(
+                "  {} {}\n  type {0} to send this command: ",
+                step.name(),
+                step.consequence(device)
+            ))?;
             if answer()? != step.name() {
                 super::print("no command was sent; the machine stays in this state\n")?;
                 return Ok(false);

@@ -226,7 +226,14 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
         line("warning", warning.clone());
     }
     for other in &document.alternatives {
-        line("", format!("{} apart, RMS {} µm over some points", apart(document, other), um(other.rms_mm)));
+        line(
+            "",
+            format!(
+                "other pose: {} from the pose found, RMS {} µm over a sample of the points",
+                apart(document, other),
+                um(other.rms_mm)
+            ),
+        );
     }
     line("files", format!("registration.json, deviations.csv, deviation_uncertainty.csv in {}", folder.display()));
     text
@@ -242,25 +249,25 @@ fn form_in_words(form: &Form) -> String {
     let Form { hyperparameters, figures, frame_covariance, .. } = form;
     let drift = match hyperparameters.noise_autocorrelation {
         0.0 => String::new(),
-        drift => format!(", correlated by {} % with the next point along the path", (100.0 * drift).round()),
+        drift => format!("; correlation with the noise of the next point along the path {} %", (100.0 * drift).round()),
     };
     let lay = hyperparameters.field.anisotropy.angle_rad().map_or(String::new(), |angle_rad| {
         let (times, degrees) = (three_digits(hyperparameters.field.anisotropy.stretch), angle_rad.to_degrees().round());
-        format!(", {times} times as wide along {degrees} degrees from x as across")
+        format!(", {times} times as long at {degrees}° from x as across this direction")
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     let areas = area_in_words(form);
     let few = match form.is_underdetermined {
         true => format!(
-            "warning     {} degrees of freedom are too few to separate the form from the noise, 20 are enough: the upper limits assume that the whole \
-             deviation is form, and they include the form that the pose can have absorbed; measure more points\n",
+            "warning     {} degrees of freedom are too few to separate the form from the noise; at least 20 are required. The upper limits count the whole \
+             deviation as form, and they include form that the pose can have absorbed. Measure more points\n",
             form.degrees_of_freedom
         ),
         false => String::new(),
     };
     format!(
         "form        RMS {}, PV {}, PV 99.8 % {}; 95 % intervals\n{few}{areas}model       form with standard deviation {} µm and range {} mm{lay}; noise of a point {} µm{drift}\n\
-         frame       standard uncertainty {sigma} µm along x, y, z, because the form is unknown\n",
+         frame       standard uncertainty of the position {sigma} µm along x, y, z, because the form is unknown\n",
         within(&figures.rms),
         within(&figures.pv),
         within(&figures.pv_998),
@@ -281,8 +288,11 @@ fn area_in_words(form: &Form) -> String {
             format!("{median} urad ({low} to {high})")
         };
         let length = three_digits(integration_mm);
-        text +=
-            &format!("slopes      RMS {}, largest {}; over {length} mm; 95 % intervals\n", urad(rms), urad(largest));
+        text += &format!(
+            "slopes      RMS {}, largest {}; integration length {length} mm; 95 % intervals\n",
+            urad(rms),
+            urad(largest)
+        );
     }
     if let Some(IsoFigures { power, irregularity, symmetric, .. }) = form.iso {
         let [power, irregularity, symmetric] = [power, irregularity, symmetric].map(|of| {

@@ -23,9 +23,9 @@ const LINGERS: Duration = Duration::from_secs(30);
 /// Replicate the records and files of finished and running runs to the plant
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The command runs until it is stopped, also while the plant cannot be reached: it sends the rest later. The plant verifies
-the chain of every record on arrival. A journal that was cut or rewritten after it was replicated is reported here and at
-the plant. No order of the cell waits for this command.
+The command runs until you stop it. While the plant cannot be reached, the command keeps trying. The plant verifies the
+chain of every record on arrival. If a journal was cut or rewritten after its replication, this is reported here and at
+the plant. The cell never waits for this command.
 
 Examples:
   regrind ship --plant plant.toml
@@ -192,7 +192,9 @@ impl Replication<'_> {
     /// the last successful round.
     fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
-            eprintln!("ship: {error}; the cell continues, and its records wait here until the plant can be reached");
+            eprintln!(
+                "ship: {error}; the cell continues, and its records stay on this computer until the plant can be reached"
+            );
         }
         Ok(())
     }

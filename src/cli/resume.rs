@@ -32,8 +32,8 @@ its record.
 
 A run whose program has ended without an end in its record (a crash, a power failure) is resumed in this terminal. The
 record is verified and replayed without any command, the machines are asked for the state of their jobs, and the cell
-goes to Held, \"The program was restarted during the run\". Then inspect the machines, and give the same command in another
-terminal: the run continues. If the folder shows that records were lost (the log of the database or journal.anchor is
+goes to Held, \"The Regrind program was restarted during the run\". Then inspect the machines, and give the same command in
+another terminal: the run continues. If the folder shows that records were lost (the log of the database or journal.anchor is
 missing or damaged), the run resumes only with --despite-loss, which confirms that you have inspected both machines.
 Otherwise bring the machines to idle with `regrind recover`.
 
@@ -98,7 +98,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let marked = if cell.is_marked_simulation() { "SIMULATION  " } else { "" };
         let state = interrupted.describe_state();
         super::print(&format!(
-            "{marked}interrupted in {state}\nthe record is complete, and its replay gives the same results\n"
+            "{marked}interrupted in {state}\nthe record is complete, and a replay of the record gives the same results\n"
         ))?;
     }
     super::runtime()?.block_on(async {
@@ -180,7 +180,7 @@ impl RunStart {
         let last = records().map(|record| record.cycle).max().unwrap_or(0);
         let newest = newest_cycle(run);
         let of_files = (newest > last.saturating_add(1))
-            .then(|| format!("there are files of cycle {newest}, and the record ends in cycle {last}"));
+            .then(|| format!("the folder has files of cycle {newest}, but the record ends in cycle {last}"));
         let lost = lost()?.or(of_files);
         if let Some(what) = lost.clone().filter(|_| !despite_loss) {
             return Err(refused(what));
@@ -198,7 +198,7 @@ impl RunStart {
         })?;
         if begun.table_version != TABLE_VERSION {
             let what = format!(
-                "it uses version {} of the transition table, and this program uses version {TABLE_VERSION}",
+                "the run uses version {} of the transition table, but this program uses version {TABLE_VERSION}",
                 begun.table_version
             );
             return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
@@ -221,7 +221,7 @@ impl RunStart {
         let path = run.join(name);
         let Some(file) = self.files.get(name) else {
             let source =
-                std::io::Error::new(std::io::ErrorKind::NotFound, "the record of this run does not contain it");
+                std::io::Error::new(std::io::ErrorKind::NotFound, "the record of this run does not contain this file");
             return Err(Failure::File(FormatError::Unreadable { path, source }));
         };
         String::from_utf8(file.read(run).map_err(Failure::Journal)?).map_err(|error| {

@@ -29,7 +29,7 @@ pub(super) const LEARNED_FROM: &str = "learned_from.json";
 #[command(after_help = "\
 Without --cell everything is simulated, on real Modbus TCP connections within this program, and marked SIMULATION.
 Ctrl-C once holds the cell at the next safe place; twice aborts it. A closed terminal (SIGHUP) and a stopped service
-(SIGTERM) end the run in order; a second signal aborts it.
+(SIGTERM) stop the run: the machines go to their safe place, and the run ends. A second signal aborts the run.
 
 Example:
   regrind run recipes/freeform-mirror.toml
@@ -273,9 +273,12 @@ impl EarlierKnowledge {
         text.extend(self.messages.iter().map(|words| format!("{words}\n")));
         text += &match &self.learned {
             Some((Learned { taught_by: Some(others), .. }, _)) => others_in_words(others),
-            Some((learned, _)) => format!("begins with the error that {} found in every pass\n", learned.run),
+            Some((learned, _)) => format!(
+                "begins with the error that {} found in every pass: the first pass corrects this error\n",
+                learned.run
+            ),
             None => format!(
-                "begins without knowledge: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
+                "begins without knowledge from earlier runs: no finished run in {} has the same part, cell, wheel, gain and way of measuring\n",
                 runs.display()
             ),
         };
@@ -294,7 +297,7 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
     let [least, most] = [percent(f64::min), percent(f64::max)];
     match others.differ.is_empty() {
         false => format!(
-            "begins with the knowledge from {runs}: assumed difference of machines {least:.0} to {most:.0} %, from {} comparison(s)\n",
+            "begins with the knowledge from {runs}: assumed difference between the machines {least:.0} to {most:.0} %, from {} comparison(s) of machines\n",
             others.comparisons
         ),
         true => format!(

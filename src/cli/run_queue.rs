@@ -23,10 +23,11 @@ const RECIPES: &str = ".recipes";
 /// Make the parts that are queued for this cell at the plant, one after the other
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The part with the earliest due date is leased to this cell. Its recipe is fetched by its hash and verified: two of the
-approvers in the plant file must have signed it. The person at the cell confirms the part by its serial number, typed or
-scanned; any other input gives the part back. From its start the part belongs to its run, and no other cell gets it, also
-if this cell fails. The command ends when no part is left, or when a part is not accepted.
+The part with the earliest due date is leased to this cell. The recipe of the part is fetched by its hash and
+verified: two of the approvers in the plant file must have signed the recipe. The person at the cell types or scans the
+serial number of the part to confirm; any other input returns the part to the queue. After its start the part belongs to
+its run: no other cell gets the part, even if this cell fails. The command ends when no part is left, or when a part
+is not accepted.
 
 Examples:
   regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
@@ -34,8 +35,9 @@ Examples:
   regrind work --plant cell-1.toml --give-back SN-0042
   regrind work --plant cell-1.toml --give-up SN-0042 --why \"the blank broke\"
 
-Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was given back, or was started here and is not
-over; 2 bad arguments, or a recipe that is not approved; 3 a fault or abort, or the plant cannot be reached.")]
+Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was returned to the queue, or was started
+here and is not finished;
+2 bad arguments, or a recipe that is not approved; 3 a fault or abort, or the plant cannot be reached.")]
 pub(super) struct Arguments {
     /// Plant file: address and user of the database, and the approvers of recipes
     #[arg(long, value_name = "FILE")]
@@ -174,13 +176,17 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     let read = match check::or_show(Recipe::read(&path)) {
         Ok(read) => read,
         Err(error) => {
-            lease.hand_back(&link, "the program of this cell rejects its recipe").await?;
+            lease.hand_back(&link, "the program of this cell rejects the recipe of the part").await?;
             return Err(error);
         }
     };
     let PlantRecipe { name, version, .. } = &recipe;
     let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
-    let told = format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
+    let told = format!(
+        "{}  by version {version} of the recipe {name}, signed by {}{due}\n",
+        lease.serial,
+        signed.join(" and ")
+    );
     super::print(&regrind::document::visible(&told))?;
     match confirmed(&link, &lease, &read, arguments).await? {
         true => Ok(Next::Part(path, Box::new(ConfirmedPart { config: config.clone(), lease }))),
@@ -209,7 +215,9 @@ async fn confirmed(
     if !recipe.cycle.confirm_work {
         return Ok(true);
     }
-    super::print("  type or scan the serial number of the part to begin it; any other input gives it back: ")?;
+    super::print(
+        "  type or scan the serial number to start this part; any other input returns the part to the queue: ",
+    )?;
     let mut answer = tokio::task::spawn_blocking(recover::answer);
     loop {
         tokio::select! {
@@ -233,15 +241,18 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             RunProgress::Over => continue,
             RunProgress::UnderWay => {
                 let why = format!(
-                    "run {run} of {serial} is not over: regrind resume {}; if resume is refused: regrind work --give-up {serial} --why \"...\"",
+                    "run {run} of {serial} is not over: regrind resume {} continues the run; if resume is refused, give up the part: regrind work --give-up {serial} --why \"...\"",
                     folder.display()
                 );
                 return Err(Failure::OpenWork { why });
             }
             RunProgress::Nowhere => {
-                format!("which has no record in {}; check whether the part was ground; if it was not", runs.display())
+                format!(
+                    "which has no record in {}; check whether the part was ground; if the part was not ground, return the part to the queue",
+                    runs.display()
+                )
             }
-            RunProgress::Begun => "which sent no request to a machine".to_owned(),
+            RunProgress::Begun => "which sent no request to a machine; return the part to the queue".to_owned(),
         };
         let why = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
         return Err(Failure::OpenWork { why });
@@ -265,20 +276,22 @@ async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>)
     let (run, folder) = (&begun.run, runs.join(&begun.run));
     let refused = |why: String| Err(Failure::OpenWork { why });
     if is_live(&folder) {
-        return refused(format!("run {run} of {serial} is active; regrind stop ends it"));
+        return refused(format!("run {run} of {serial} is active; end the run first with regrind stop"));
     }
     if let Some(why) = up {
         begun.give_up(&link, why).await?;
-        super::print(&format!("{serial} is given up; it is made again only if a planner queues it again\n"))?;
+        super::print(&format!(
+            "the part {serial} is given up; to make the part again, a planner must queue the part again\n"
+        ))?;
         return Ok(Outcome::Accepted);
     }
     if matches!(run_progress(&folder), RunProgress::UnderWay | RunProgress::Over) {
         return refused(format!(
-            "run {run} of {serial} has a record here: regrind resume continues it, regrind work --give-up gives the part up"
+            "the part {serial} is not returned to the queue, because run {run} has a record here; continue the run with regrind resume, or give up the part with regrind work --give-up"
         ));
     }
     begun.give_back(&link, "its run did nothing").await?;
-    super::print(&format!("{serial} is given back to the queue\n"))?;
+    super::print(&format!("the part {serial} is returned to the queue\n"))?;
     Ok(Outcome::Accepted)
 }
 
@@ -327,7 +340,7 @@ fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Fail
         let inside = Path::new(name);
         if !plant::is_below(inside) {
             let what = format!(
-                "{} names the file {name:?}, which would lie outside of its folder; propose the recipe again",
+                "the recipe {} names the file {name:?}, which is outside of the folder of the recipe; propose the recipe again with all files in its folder",
                 recipe.name
             );
             return Err(PlantError::Recipe(what).into());

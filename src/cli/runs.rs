@@ -69,7 +69,9 @@ fn in_words(run: &Listed) -> String {
     let counted = format!("{cycles} cycle{}", if cycles == 1 { "" } else { "s" });
     let ended = match summary.result {
         _ if *is_live => "on now",
-        RunResult::Open if summary.machines_within => "interrupted, and its simulated machines are gone",
+        RunResult::Open if summary.machines_within => {
+            "interrupted; cannot be resumed, because its simulated machines ended with the program"
+        }
         result => word(result),
     };
     format!("{}\n    {}  {}, {counted}{measured}\n", folder.display(), ended, summary.part)

@@ -26,9 +26,10 @@ const LINGERS: Duration = Duration::from_secs(3);
 /// Show the cell and its runs as a page in the browser
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The page shows the active run, wherever it was started, and gives orders to it in the same way as `regrind hold`. Open it
-on this computer, with the printed address and its key. For other computers, the page needs a certificate with the names
-by which they reach it, and users that sign in. Alternatively, use a tunnel: ssh -L 7373:127.0.0.1:7373 CELL
+The page shows the active run and can give orders to this run, in the same way as `regrind hold`. Open the page on this
+computer with the printed address, which contains a key. For other computers, the page needs users that sign in and a
+certificate. The certificate has the names by which these computers reach the page. Alternatively, use a tunnel:
+ssh -L 7373:127.0.0.1:7373 CELL
 
 Examples:
   regrind serve --runs runs

@@ -113,11 +113,11 @@ impl Show {
             Notice::LoadPart => {
                 let by_key = if reads_keys() { "press Enter here, or: " } else { "" };
                 self.line(&format!(
-                    "load and clamp the part, check that wheel and probe are clear of it,\nthen: {by_key}regrind confirm loaded"
+                    "load and clamp the part, check that wheel and probe are clear of the part,\nthen: {by_key}regrind confirm loaded"
                 ))
             }
             Notice::AskWhetherClear { device } => self.line(&format!(
-                "{device}: no signal shows whether it is clear of the part; check that it is,\nthen: regrind confirm clear --machine {}",
+                "{device}: no signal shows whether the machine is clear of the part; check that the machine is clear,\nthen: regrind confirm clear --machine {}",
                 device.to_string().to_lowercase()
             )),
             Notice::Note { device, messages } => {
@@ -139,7 +139,7 @@ impl Show {
                     self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
                 }
                 if let Some(mm) = summary.map_rms_mm {
-                    self.line(&format!("cycle {cycle}: remaining error for the map: {} µm RMS", three_digits(1e3 * mm)))?;
+                    self.line(&format!("cycle {cycle}: error that remains for the correction map: {} µm RMS", three_digits(1e3 * mm)))?;
                 }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
@@ -168,7 +168,7 @@ impl Show {
                 self.folder
             )),
             "resume" => self.line("RESUME   the cell continues"),
-            "stop" => self.line("STOP     the cell ends in order"),
+            "stop" => self.line("STOP     the machines go to their safe place, and the run ends"),
             "abort" => self.line("ABORT    both machines run only their safe sequence"),
             _ => Ok(()),
         }
@@ -200,7 +200,7 @@ impl Show {
                 .form
                 .filter(|_| points as usize > FIRST_BATCH)
                 .map_or(String::new(), |_| format!("{pv}; {rms}; "));
-            self.line(&format!("cycle {cycle}: {known}{points} points; {targets} more: {why}"))?;
+            self.line(&format!("cycle {cycle}: {known}{points} points measured; {targets} more follow: {why}"))?;
             return self.picture(cycle);
         }
         let mut text = format!("cycle {cycle}: {pv}; {rms}; {points} points, {outliers} outliers");
@@ -353,7 +353,7 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
 /// part, and the RMS, minimum and maximum of the deviations from the planned positions in µm.
 pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_um }: &PreviewStatistics) -> String {
     format!(
-        "preliminary, relative to the planned position: {touched} touched, RMS {rms_um:.2} µm, {least_um:+.2} to {most_um:+.2} µm"
+        "preliminary, relative to the planned position: {touched} points touched, RMS {rms_um:.2} µm, deviations from {least_um:+.2} to {most_um:+.2} µm"
     )
 }
 

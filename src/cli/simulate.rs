@@ -15,7 +15,8 @@ use super::{Outcome, simulated};
 /// Serve the simulated CMM and grinder of a cell on their wires until stopped
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Both machines share one simulated part. The table [simulation] of the recipe is its truth.
+Both machines share one simulated part. The table [simulation] of the recipe defines the true shape of
+this part.
 
 Example:
   regrind simulate --cell config/modbus-tcp.toml --log machines.jsonl

@@ -76,7 +76,7 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     let none = || {
         Failure::Simulation {
         path: recipe.path().to_owned(),
-        reason: "it has no table [simulation], which defines the true shape of the simulated part; add one, or use a cell of real machines".into(),
+        reason: "the recipe has no table [simulation], which defines the true shape of the simulated part; add this table, or use a cell of real machines".into(),
     }
     };
     let table = recipe.simulation.clone().ok_or_else(none)?;
@@ -115,12 +115,11 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         return Ok(simulated);
     }
     let line = |link: &LinkConfig| {
-        let none =
-            "a machine that a person operates cannot be simulated; operate it yourself, for example with --rehearsal";
+        let none = "a machine that a person operates cannot be simulated; operate this machine yourself, for example with --rehearsal";
         link.wire.modbus_line().ok_or_else(|| failed(none.into()))
     };
     if recipe.grinding.tilt.is_some() && cell.grinder.program.folder.is_none() {
-        let why = "without programs the simulated grinder grinds upright, and grinding.tilt tilts the wheel; write grinder.program.folder";
+        let why = "grinding.tilt tilts the wheel, but without programs the simulated grinder keeps the wheel upright; write grinder.program.folder into the cell file";
         return Err(failed(why.into()));
     }
     let grinder = match by_programs(cell).map_err(&failed)? {
@@ -166,11 +165,11 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
-        return Err("the simulated wheel of LinuxCNC stays upright; remove grinding.tilt, or do not simulate".into());
+        return Err("the simulated wheel of LinuxCNC stays upright, but the recipe has grinding.tilt; remove grinding.tilt, or do not simulate".into());
     }
     let (WheelDimensions::Sphere { radius_mm }, TrackPattern::Raster) = (grinding.wheel, grinding.pattern) else {
         return Err(
-            "the simulated wheel is spherical and its tracks are along x; use another recipe, or do not simulate"
+            "the simulated wheel is spherical and its tracks are along x, but the recipe requires another wheel or pattern; use another recipe, or do not simulate"
                 .into(),
         );
     };
@@ -259,9 +258,9 @@ impl SimulatedCell {
         let machine = dme::machine::DmeMachine::new(probe, dme::machine::Options { tools, ..Default::default() });
         let server = dme::Server::new(machine, speed, dme::faults::CommandFaults::none());
         let (host, port) = (wire.host.clone(), wire.port);
-        let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder)
-            .await
-            .map_err(|e| format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it"))?;
+        let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder).await.map_err(|e| {
+            format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
+        })?;
         wire.port = serving.local_addr().port();
         self.places.push(format!("I++ DME {host}:{}", wire.port));
         self.dme = Some(serving);
@@ -292,7 +291,7 @@ impl SimulatedCell {
         let mut serving = match wire.source() {
             HitSource::Tcp { host, port } => {
                 let serving = ServingHits::tcp((host.as_str(), port)).await.map_err(|e| {
-                    format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
+                    format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
                 })?;
                 wire.port = serving.local_addr().map_or(port, |address| address.port());
                 self.places.push(format!("hit lines {host}:{}", wire.port));
@@ -327,7 +326,7 @@ impl SimulatedCell {
     fn link(&mut self, terminal: &Path, device: &str) -> Result<(), String> {
         place_link(terminal, Path::new(device)).map_err(|e| {
             format!(
-                "{device} cannot be made a link to {}: {e}; remove what is there, or name another device",
+                "a link at {device} to {} cannot be created: {e}; remove the file at this path, or name another device",
                 terminal.display()
             )
         })?;
@@ -340,7 +339,7 @@ impl SimulatedCell {
         match line {
             LineAddress::Tcp { host, port } => {
                 let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
-                    format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
+                    format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
                 })?;
                 let bound = serving.local_addr().map_or(*port, |address| address.port());
                 self.places.push(format!("Modbus TCP {host}:{bound}, {}", names.join(" and ")));

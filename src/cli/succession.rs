@@ -230,7 +230,7 @@ impl Proof {
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));
         if number > due {
             let named = before.map_or(String::new(), |before| {
-                format!("; the last of them was {} with {} records or more", before.run, before.records)
+                format!("; the last missing run was {} with at least {} records", before.run, before.records)
             });
             let missing = if number == due + 1 {
                 format!("number {due} is missing")
@@ -239,17 +239,19 @@ impl Proof {
             };
             self.flaws.push(format!("{missing} before {name}{named}"));
         } else if number < due {
-            self.flaws.push(format!("{name}: another run has its number {number} too"));
+            self.flaws.push(format!("{name}: another run has the same number {number}"));
         }
         let Some(Before { run, records, head }) = before else { return };
         let Some((_, last)) = last.filter(|_| number == due) else { return };
         let last_name = name_of(last);
         if last_name != *run {
-            self.flaws
-                .push(format!("{last_name}: it is the run before {name}, but {name} names {run} as the run before it"));
+            self.flaws.push(format!(
+                "{last_name}: by its number this run comes before {name}, but {name} names {run} as the run before it"
+            ));
         } else if hash_of(last, *records).as_deref() != Some(head) {
-            let what = format!("the hash of its record {records} has changed since {name} began");
-            self.flaws.push(format!("{run}: it differs from the run that {name} names as the run before it: {what}"));
+            let what = format!("the hash of record {records} has changed since {name} began");
+            self.flaws
+                .push(format!("{run}: this run differs from the run that {name} names as its predecessor: {what}"));
         }
     }
 }

@@ -14,9 +14,9 @@ use super::failure::Failure;
 /// Manage the users who may sign in to the page of the cell
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Roles: viewer can only look; quality can look and hold; operator can give every order, but cannot resume from an alarm that
-a process engineer clears; engineer can give every order. The list has only a hash of each password. A change takes
-effect at once, also for an open page.
+Roles: a viewer reads the page and gives no order; quality can only hold the cell; an operator can give every order, but
+cannot resume after an alarm that only a process engineer clears; an engineer can give every order. The list has only a
+hash of each password. A change takes effect at once, also for an open page.
 
 Example:
   regrind users add \"A. Smith\" --role operator

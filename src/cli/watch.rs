@@ -36,7 +36,7 @@ uncertainty of the map, q quits and leaves the cell as it is. If the output is n
 Example:
   regrind watch
 
-Exit codes: 0 the run ended, or q was pressed; 2 no such run; 3 its program is no longer running.")]
+Exit codes: 0 the run ended, or q was pressed; 2 no such run; 3 the program of the run is no longer running.")]
 pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -202,7 +202,7 @@ impl View {
         let (figures, map) = if wide { (right, left) } else { (left, right) };
         frame.render_widget(self.figures(), figures);
         self.map(frame, map);
-        let keys = if self.said.is_empty() { "h hold   u uncertainty   q leave" } else { &self.said };
+        let keys = if self.said.is_empty() { "h hold   u uncertainty   q quit" } else { &self.said };
         frame.render_widget(Paragraph::new(keys).dim(), foot);
     }
 

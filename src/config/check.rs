@@ -86,7 +86,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     // A simulated machine beside one that a person serves is a rehearsal. With both served by people nothing is
     // simulated.
     if simulated == Some(true) && machines.iter().all(|m| m.wire.is_some_and(Wire::is_by_person)) {
-        let found = "is true, and both machines are connected by files or operated by hand";
+        let found = "is true, but people operate both machines (by files or by hand)";
         document.report("cell.simulated", found, "a person cannot be simulated", "write `simulated = false`");
     }
     let [cmm_link, grinder_link] = machines.map(|machine| machine.link(simulated, document));
@@ -150,13 +150,13 @@ impl MachineTables<'_> {
             document.report(
                 &self.key("timing.lost_after_ms"),
                 format!(
-                    "is {} ms; {} tries of {} ms take {all_tries_ms} ms",
+                    "is {} ms, but {} tries of {} ms take {all_tries_ms} ms",
                     written.lost_after_ms,
                     u64::from(written.retries) + 1,
                     written.request_timeout_ms
                 ),
                 "it must cover every try",
-                "raise it, or lower `request_timeout_ms` or `retries`",
+                "raise `lost_after_ms`, or lower `request_timeout_ms` or `retries`",
             );
         }
         for (name, ms) in [("poll_ms", written.poll_ms), ("heartbeat_ms", written.heartbeat_ms)] {
@@ -213,8 +213,11 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             let file = dialect::dialect_path(&written.dialect, path).unwrap_or_default();
             let found =
                 format!("is {:?}: {}", written.dialect, problems.to_string().lines().next().unwrap_or_default());
-            let remedy = format!("name one of these, or correct the file: regrind check {}", file.display());
-            let allowed = format!("it must be {known} or a valid file");
+            let remedy = format!(
+                "write one of these names, or correct the dialect file; to check the file: regrind check {}",
+                file.display()
+            );
+            let allowed = format!("it must be one of {known}, or a valid dialect file");
             document.report("grinder.program.dialect", found, &allowed, &remedy);
             return None;
         }
@@ -225,13 +228,16 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             "grinder.program.arcs_within_um",
             format!("is set for the dialect `{dialect}`, which has no words for arcs"),
             "arcs require [arcs] in the dialect",
-            "remove it, or write [arcs] into a dialect of your own",
+            "remove this key, or add the table [arcs] to a dialect file of your own",
         ),
         Some(Err(DialectError::ArcsFine { dialect, found_um, decimals, least_um })) => document.report(
             "grinder.program.arcs_within_um",
             format!("is {found_um} µm"),
-            &format!("the {decimals} decimals of the dialect `{dialect}` move points by up to {least_um:.4} µm"),
-            "raise it, or write more decimals into a dialect of your own if the control reads them",
+            &format!(
+                "rounding to the {decimals} decimals of the dialect `{dialect}` moves points by up to {least_um:.4} µm"
+            ),
+            "raise arcs_within_um; or, if the control reads more decimals, write a dialect of your own with more \
+             decimals",
         ),
         _ => {}
     }
@@ -297,8 +303,8 @@ fn rotary(written: &RotaryTable, document: &mut Document) -> Option<RotaryConfig
         document.report(
             "grinder.rotary.turns",
             "is \"table\"",
-            "programs tilt the wheel with its head, not the part with its table",
-            "remove the table [grinder.rotary]: the wheel then stays upright",
+            "the programs of Regrind can tilt only the wheel head, not the machine table with the part",
+            "remove the section [grinder.rotary] from the cell file; the wheel then stays upright",
         );
     }
     let (letter, range_deg) = (written.axis?, [written.min_deg?, written.max_deg?]);

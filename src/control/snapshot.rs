@@ -128,7 +128,8 @@ impl fmt::Display for NextStep {
         f.write_str(match self {
             Self::Nothing => "no action needed",
             Self::Load => {
-                "load and clamp the part, check that wheel and probe are clear of it; then: regrind confirm loaded"
+                "load and clamp the part; check that wheel and probe are clear of the part; then: regrind confirm \
+                 loaded"
             }
             Self::SeeClear { device } => {
                 let name = device.to_string().to_lowercase();
@@ -145,12 +146,15 @@ impl fmt::Display for NextStep {
                 let name = device.to_string().to_lowercase();
                 return write!(
                     f,
-                    "check whether the {device} is at rest; then: regrind resume, which asks it for the state of its job; if it \
-                     cannot answer: regrind confirm over --machine {name} --evidence \"what you saw\""
+                    "check whether the {device} is at rest; then: regrind resume (the cell asks the machine for the \
+                     state of its job). If the machine cannot answer, confirm that the job is over: regrind confirm \
+                     over --machine {name} --evidence \"what you saw\""
                 );
             }
             Self::KeepAway => "keep away from both machines: they run their safe sequence",
-            Self::EmergencyCircuit => "use the emergency circuit of each machine that has not confirmed that it is at rest",
+            Self::EmergencyCircuit => {
+                "use the emergency circuit of each machine that has not confirmed that it is at rest"
+            }
             Self::ReadReport => "the run is over: read its report.html",
         })
     }

@@ -160,24 +160,27 @@ pub trait DriverFactory {
 pub enum DriverError {
     /// A required folder does not exist.
     #[error(
-        "{key}: the folder {path} does not exist; create it where the {machine} finds it (mkdir -p {path}), or \
-         correct the cell file"
+        "{key}: the folder {path} does not exist; create this folder where the {machine} can use it (mkdir -p {path}), \
+         or correct the cell file"
     )]
     Folder { key: String, path: PathBuf, machine: MachineKind },
     /// The file of reference points is not valid.
     #[error("cmm.wire.reference_points: {source}")]
     References { source: Box<FormatError> },
     /// A serial port does not exist.
-    #[error("{missing}; connect it, or name one of these in the cell file")]
+    #[error("{missing}; connect the missing port, or name an existing port in the cell file")]
     NoPort { missing: String },
     /// The positions of the machine must be checked against its volume, but the cell file gives no volume.
     #[error(
-        "cmm.travel is missing: every position is checked against it before {machine} moves; add the box that its \
-         probe must not leave"
+        "cmm.travel is missing: Regrind checks every position against this box before {machine} moves; add \
+         [cmm.travel], the box that the centre of the probe must not leave"
     )]
     NoVolume { machine: String },
     /// This wire has no driver for this machine.
-    #[error("{table}.wire: kind = {kind:?} is for the other machine of a cell; name another wire")]
+    #[error(
+        "{table}.wire: kind = {kind:?} cannot be used for this machine, only for the other machine of the cell; name \
+         another kind"
+    )]
     NoDriver { table: &'static str, kind: &'static str },
     /// The line cannot be opened.
     #[error("{line} cannot be opened: {source}; check the cell file and the machine")]

@@ -27,26 +27,27 @@ pub enum DeviceError {
     Unreachable { machine: Arc<str>, kind: std::io::ErrorKind, limit: Duration },
     /// The connection exists, but no answer arrived in time.
     #[error(
-        "{machine} did not answer ({operation}) within {} ms: check the line and its load, unit number and, on a serial line, baud rate and \
-         parity",
+        "{machine} did not answer ({operation}) within {} ms. Check the line, the load of the line and the unit \
+         number. On a serial line, also check baud rate and parity",
         .limit.as_millis()
     )]
     TimedOut { machine: Arc<str>, operation: &'static str, limit: Duration },
     /// The machine, or a device between, closed the connection.
     #[error(
-        "{machine} closed the connection ({operation}): another client may use its only connection, or it was \
-         restarted"
+        "{machine} closed the connection ({operation}). Check whether another client uses the only connection of the \
+         machine, or whether the machine was restarted"
     )]
     Disconnected { machine: Arc<str>, operation: &'static str },
     /// The received data are inconsistent: wrong length, echo, checksum or page.
     #[error(
         "{machine} sent an inconsistent {data}: expected {expected:#x}, found {found:#x}; the data were not used. If \
-         this repeats, check cable, shielding and terminating resistors, and that no second client is on the line"
+         this repeats, check cable, shielding and terminating resistors. Also check that no second client uses the line"
     )]
     Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
     #[error(
-        "{machine} answers, but its application has stopped: its heartbeat counter has been {beat} for {} ms (limit \
+        "{machine} answers, but its application has stopped: its heartbeat counter has stayed at {beat} for {} ms \
+         (limit \
          {} ms). Check the machine; do not rely on its values",
         .unchanged_for.as_millis(), .limit.as_millis()
     )]
@@ -54,8 +55,9 @@ pub enum DeviceError {
     /// A command was written several times and never acknowledged. The driver knows that the machine did not act upon
     /// it later.
     #[error(
-        "{machine} did not acknowledge {command} number {sequence} (the last that it acknowledged is {acknowledged}) \
-         after {tries} tries: its application may have stopped, or its program does not follow docs/modbus.md"
+        "{machine} did not acknowledge {command} number {sequence} after {tries} tries; the last acknowledged number \
+         is {acknowledged}. Check whether the application of the machine has stopped, and whether its program follows \
+         docs/modbus.md"
     )]
     NotAcknowledged { machine: Arc<str>, command: MachineCommand, sequence: u32, acknowledged: u32, tries: u32 },
     /// It is unknown whether the job was begun. The start is never repeated; see
@@ -68,7 +70,7 @@ pub enum DeviceError {
     /// The transfer was interrupted by its [`Interrupt`](super::Interrupt).
     #[error(
         "{machine}: the transfer of the {payload} was interrupted on request after {done} of {total} pages; the \
-         machine uses none of it"
+         machine uses no part of the transferred data"
     )]
     Interrupted { machine: Arc<str>, payload: &'static str, done: u32, total: u32 },
     /// The driver was used before [`Machine::connect`](super::Machine::connect).
@@ -77,13 +79,13 @@ pub enum DeviceError {
 
     /// The machine is of the right kind, but it is not the one that the cell file names.
     #[error(
-        "{machine} has the name {found:?}, and the cell file expects {expected:?}: check address and port, or \
+        "{machine} has the name {found:?}, but the cell file expects {expected:?}: check address and port, or \
          correct expected_name"
     )]
     WrongName { machine: Arc<str>, expected: String, found: String },
     /// The machine is a simulation and the cell file has a real machine, or the reverse.
     #[error(
-        "{machine} reports that it is {}, and the cell file has simulated = {}: nothing was sent to it. Check \
+        "{machine} reports that it is {}, but the cell file has simulated = {}. Nothing was sent to the machine. Check \
          address and port, or correct cell.simulated",
         if *.simulation { "a simulation" } else { "a real machine" }, !.simulation
     )]
@@ -93,7 +95,7 @@ pub enum DeviceError {
     ConfirmationNotNeeded { machine: Arc<str> },
     /// An operator confirmation did not name the map with which the machine works.
     #[error(
-        "{machine} accepts a confirmation only with its map: give --map with at least the first 8 digits of the map"
+        "a confirmation for {machine} must name the map: add --map with at least the first 8 digits of the map identity"
     )]
     MapNotNamed { machine: Arc<str> },
     /// A file that the operator named is not the requested measurement, or it could not be stored.
@@ -109,14 +111,14 @@ pub enum DeviceError {
 
     /// A line to send would not be one plain line of the protocol of the machine.
     #[error(
-        "{machine}: {operation} would contain a character that is not plain text, and was not sent: correct the cell \
-         file"
+        "{machine}: {operation} was not sent, because the line would contain a character that is not plain text. \
+         Correct the cell file"
     )]
     Unsendable { machine: Arc<str>, operation: &'static str },
     /// Another client has taken control; the machine does not say which client.
     #[error(
-        "{machine} is now controlled by another client: find that client, and let it release the machine. Only an \
-         abort, or a run that is resumed, takes control back"
+        "{machine} is now controlled by another client. Find that client, and let that client release the machine. \
+         Regrind takes control back only with an abort, or when an interrupted run is resumed"
     )]
     ControlTaken { machine: Arc<str> },
 
@@ -144,30 +146,30 @@ pub enum DeviceError {
     /// The device that answers is not a machine of this kind. The register at this address, counted from 0, shows it.
     #[error(
         "{machine} is not a {expected} of a Regrind cell: register {address} has {found:#06x}, expected \
-         {required:#06x}. Check address, port and unit number in the cell file, and the base of the identity block; \
-         nothing was written to it"
+         {required:#06x}. Nothing was written to the device. Check address, port, unit number and the base of the \
+         identity block in the cell file"
     )]
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
     /// The identity block of the map has a wrong layout: exchanged bytes, or addresses off by one.
-    #[error("{machine} answers with the identity block of this map, {description}; nothing was written to it")]
+    #[error("{machine} sends the correct identity block, but {description}; nothing was written to the machine")]
     WrongLayout { machine: Arc<str>, description: std::borrow::Cow<'static, str> },
     /// The cell file names one kind of machine, and this is the other kind.
     #[error(
-        "{machine} is a {found}, and the cell file has it as the {expected}: check whether the two addresses are \
-         swapped; nothing was written to it"
+        "{machine} is a {found}, but the cell file expects a {expected} at this address. Check whether the two \
+         addresses are swapped. Nothing was written to the machine"
     )]
     WrongKind { machine: Arc<str>, expected: MachineKind, found: MachineKind },
     /// The sentinels are correct in the other word order, or in none.
     #[error(
-        "{machine} sends its words in another order than the cell file has (word_order = \"{configured}\"): {}; \
-         nothing was written to it",
-        match .matching { Some(order) => format!("write word_order = \"{order}\""), None => "neither \"big\" nor \"little\" fits its sentinels".into() }
+        "{machine} sends its values in another word order than the cell file expects (word_order = \"{configured}\"): \
+         {}; nothing was written to the machine",
+        match .matching { Some(order) => format!("write word_order = \"{order}\""), None => "the test values (sentinels) of the machine fit neither \"big\" nor \"little\"".into() }
     )]
     WrongWordOrder { machine: Arc<str>, configured: &'static str, matching: Option<&'static str> },
     /// The machine uses another version of the map.
     #[error(
-        "{machine} has version {found} of the register map, this program has version {required}: {}; nothing was \
-         written to it",
+        "{machine} has version {found} of the register map, but this program requires version {required}: {}; nothing \
+         was written to the machine",
         version_in_words(*.found, *.required)
     )]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
@@ -175,10 +177,10 @@ pub enum DeviceError {
     #[error(
         "{machine} belongs to {}",
         match .owner {
-            0 => "no client now: it has lost its client, as after a restart of its application; check the machine \
-                  before it continues".to_owned(),
-            owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find that client; \
-                              one of the two must release the machine"),
+            0 => "no client now: the machine has lost its client, for example by a restart of its application; check \
+                  the machine before the run continues".to_owned(),
+            owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find that client; one \
+                              of the two clients must release the machine"),
         }
     )]
     OwnedByOther { machine: Arc<str>, ours: u32, owner: u32 },
@@ -196,41 +198,51 @@ pub enum DeviceError {
     Restarted { machine: Arc<str>, old_boot_id: u32, new_boot_id: u32 },
     /// A received value is not a finite number.
     #[error(
-        "{machine}: {field} is {value}, which is not a finite number; it was rejected. The machine's program has not \
-         set it, or its word order differs from that of its sentinels (docs/modbus.md)"
+        "{machine}: {field} is {value}, which is not a finite number; the value was rejected. Check the machine's \
+         program: does it set this value, and in the same word order as its sentinels (docs/modbus.md)?"
     )]
     NotFinite { machine: Arc<str>, field: String, value: f64 },
     /// A received value is outside its possible range.
     #[error(
-        "{machine}: {field} is {value} {unit}, allowed is {min} to {max} {unit}: check scale, type and word order in the cell file, and the sensor"
+        "{machine}: {field} is {value} {unit}; the allowed range is {min} to {max} {unit}. Check scale, type and word \
+         order in the cell file. Also check the sensor"
     )]
     OutOfRange { machine: Arc<str>, field: String, value: f64, min: f64, max: f64, unit: String },
     /// A received code is not in the contract.
     #[error("{machine}: {field} is {found}, which docs/modbus.md does not list: correct the machine's program")]
     Unlisted { machine: Arc<str>, field: &'static str, found: u32 },
     /// The number of elements is not the expected one.
-    #[error("{machine}: {found} {elements}, expected {expected}; they were not used")]
+    #[error(
+        "{machine}: {found} {elements}, but {expected} are expected; the data were not used. Check the machine's \
+         program"
+    )]
     WrongCount { machine: Arc<str>, elements: &'static str, expected: u64, found: u64 },
     /// The machine holds something else than was sent, or something of another job.
     #[error(
-        "{machine}: {field} is {found:#x} at the machine and {sent:#x} here: the machine would use other data. Load \
-         it again"
+        "{machine}: {field} is {found:#x} at the machine, but {sent:#x} in Regrind: the machine would use wrong data. \
+         Load the data again"
     )]
     Mismatch { machine: Arc<str>, field: &'static str, sent: u64, found: u64 },
     /// A result was requested, but there is none.
     #[error(
-        "{machine} is in {state} and has no finished result of {job}: a result is available from COMPLETE until it \
-         is acknowledged"
+        "{machine} is in {state} and has no finished result of {job}: a result exists only from the state COMPLETE \
+         until the result is acknowledged"
     )]
     NoResult { machine: Arc<str>, job: Job, state: MachineState },
     /// An I++ DME server refused a method with an error number.
-    #[error("{machine} refused {method} with {error}; check the machine's own panel, then clear")]
+    #[error(
+        "{machine} refused {method} with {error}; read the message at the panel of the machine and remove the cause, \
+         then clear the error"
+    )]
     MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },
     /// An I++ DME server did not return the requested value.
-    #[error("{machine} answered {method} without {missing}: no other value is used instead")]
+    #[error(
+        "{machine} answered {method} without {missing}; the answer was not used. Check the I++ DME server of the \
+         machine"
+    )]
     ValueMissing { machine: Arc<str>, method: &'static str, missing: &'static str },
     /// An I++ DME server does not know the tool that the cell file names.
-    #[error("{machine} has no tool {tool:?}; it has {known}: correct cmm.wire.tool")]
+    #[error("{machine} has no tool {tool:?}; the known tools are {known}. Correct cmm.wire.tool")]
     NoTool { machine: Arc<str>, tool: String, known: String },
     /// The probe of the machine is not the probe of the plan.
     #[error(
@@ -241,7 +253,7 @@ pub enum DeviceError {
     ProbeRadius { machine: Arc<str>, tool: String, reported_mm: f64, plan_mm: f64, limit_mm: f64 },
     /// A property was set, but another value is in force.
     #[error(
-        "{machine} was set to {property} = {requested} and reports {in_force}: correct the recipe or the cell file"
+        "{machine} was set to {property} = {requested}, but reports {in_force}: correct the recipe or the cell file"
     )]
     NotSet { machine: Arc<str>, property: String, requested: f64, in_force: f64 },
     /// A plan moves the probe out of the volume of the machine. This is checked before anything moves.
@@ -261,7 +273,8 @@ pub enum DeviceError {
     },
     /// A controller does not answer as linuxcncrsh does.
     #[error(
-        "{machine} does not answer like linuxcncrsh: {reply:?} to {request}; only queries were sent. Check host and \
+        "{machine} does not answer like linuxcncrsh: the answer to {request} was {reply:?}. Only queries were sent. \
+         Check host and \
          port in the cell file"
     )]
     NotLinuxcnc { machine: Arc<str>, request: &'static str, reply: String },
@@ -272,7 +285,7 @@ pub enum DeviceError {
     #[error("{machine} is not ready: {reason}")]
     NotReady { machine: Arc<str>, reason: &'static str },
     /// A controller reported errors.
-    #[error("{machine} reports, when {occasion}: {errors}")]
+    #[error("{machine} reported errors when {occasion}: {errors}")]
     ControllerErrors { machine: Arc<str>, occasion: &'static str, errors: String },
     /// The driver was given a payload that no machine could accept.
     #[error("{machine}: the {payload} cannot be sent: {field} is {value}; it must be {limit}")]
@@ -319,11 +332,11 @@ fn version_in_words(found: u16, required: u16) -> String {
         return "this program is older and does not know the newer map: update this program".to_owned();
     }
     let lacks = [
-        "a beat that names its owner, so the beat of another client keeps it moving",
-        "a CLAIM with a higher number that makes it refuse a late START",
-        "an ABORT that it accepts from any client with any number",
-        "a `done` that remains after CLEAR and names the START that ended",
-        "a plan that begins slowly where the part may be displaced",
+        "a heartbeat that names its owner (without the owner, the heartbeat of any client keeps the machine moving)",
+        "a CLAIM after which the machine must refuse a late START with a lower number",
+        "an ABORT that the machine accepts from any client, with any number",
+        "a register `done` that remains after CLEAR and contains the number of the START whose job has ended",
+        "a measuring plan that begins slowly at targets where the part may be displaced",
     ];
     format!(
         "the machine's program lacks {}; update it to version {required} (docs/modbus.md, \"What version 2 changed\")",
@@ -339,8 +352,8 @@ fn kind_in_words(kind: std::io::ErrorKind) -> String {
 fn exception_remedy(code: u8) -> &'static str {
     match code {
         1..=3 => {
-            "compare the register map of the cell file with the machine's: its base addresses, which count from 0 (40001 is register 0), and \
-             the version that the machine's program follows (docs/modbus.md)"
+            "compare the register map in the cell file with the register map of the machine (docs/modbus.md): the \
+             version of the map, and the base addresses, which count from 0 (40001 is register 0)"
         }
         10 | 11 => "check the gateway, and the unit number in the cell file",
         _ => "check the machine",

@@ -299,21 +299,39 @@ impl fmt::Display for Answer {
             Self::None => "no answer yet",
             Self::Accepted => "accepted",
             Self::NotOwner => {
-                "another client owns the machine, or has owned it since this client started: end that client, then \
-                 claim again"
+                "another client owns the machine, or has owned the machine since this client started: end that \
+                 client, then claim the machine again"
             }
-            Self::WrongState => "the machine does not allow it in its present state",
-            Self::UnknownCommand => "the machine does not know the command: compare its program with docs/modbus.md",
-            Self::DeadToken => "the token of the prepared job has expired (30 s passed, or an interlock opened): prepare again",
-            Self::OtherJob => "job, cycle or payloads differ from those that were prepared: load and prepare again",
-            Self::AlreadyBegun => "this job and cycle were already begun and are never begun twice",
-            Self::PayloadMissing => "a payload is missing, damaged, or for another part: load it again, and check the part",
+            Self::WrongState => "the machine does not allow this command in its present state",
+            Self::UnknownCommand => {
+                "the machine does not know the command: compare the machine's program with docs/modbus.md"
+            }
+            Self::DeadToken => {
+                "the token of the prepared job has expired (30 s passed, or an interlock opened): prepare the job \
+                 again"
+            }
+            Self::OtherJob => {
+                "job, cycle or payloads differ from the prepared ones: load the payloads and prepare the job again"
+            }
+            Self::AlreadyBegun => {
+                "this cycle of the job has already begun; the machine does not begin the same cycle twice"
+            }
+            Self::PayloadMissing => {
+                "a payload is missing, damaged, or for another part: check the part, and load the payload again"
+            }
             Self::InterlockOpen => {
-                "an interlock is open or the machine is not in automatic mode: close the guards, check clamping and supplies"
+                "an interlock is open or the machine is not in automatic mode: close the guards, select \
+                 automatic mode, check the clamping and the supplies"
             }
-            Self::OutsideLimits => "a value of the payload is outside the machine's limits",
-            Self::OtherResult => "the acknowledged result is not the present one: collect it again",
-            Self::Unlisted(number) => return write!(f, "answer {number}, which docs/modbus.md does not list"),
+            Self::OutsideLimits => {
+                "a value of the payload is outside the machine's limits: compare the recipe with these limits"
+            }
+            Self::OtherResult => {
+                "the acknowledged result is not the present result of the machine: collect the result again"
+            }
+            Self::Unlisted(number) => {
+                return write!(f, "answer {number}, which docs/modbus.md does not list: correct the machine's program");
+            }
         })
     }
 }
@@ -373,13 +391,15 @@ impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::None => "no fault",
-            Self::StopCircuit => "the stop circuit is open: close it at the machine, then clear",
-            Self::Collision => "collision or unexpected touch: check the part and the probe or wheel before clearing",
+            Self::StopCircuit => "the stop circuit is open: close the circuit at the machine, then clear the fault",
+            Self::Collision => "collision or unexpected touch: check part and probe or wheel, then clear the fault",
             Self::Supplies => "air, coolant or power is missing",
-            Self::TravelLimit => "a limit of travel was reached: check the position of the part",
+            Self::TravelLimit => "an axis reached its limit of travel: check the position of the part",
             Self::Drive => "a drive has failed: see the machine's own panel",
             Self::Tool => "the probe or the spindle has failed: see the machine's own panel",
-            Self::ClientSilent => "the machine received nothing from its client for too long and holds",
+            Self::ClientSilent => {
+                "the machine received nothing from Regrind for too long, so the machine holds: check the cable"
+            }
             Self::Other(number) => return write!(f, "fault {number}: see the machine's own panel"),
         })
     }

@@ -9,13 +9,13 @@ use regrind_core::geometry::{Point, Vector, fit_rigid};
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum PlanMismatch {
     /// The points equal the points of the plan.
-    #[error("it is identical to the plan and not a measurement; export the measured points")]
+    #[error("the points are identical to the plan, so they are not a measurement; export the measured points")]
     EqualsPlan,
     /// Points that are too far from their targets, for every pose of the part in its fixture.
     #[error(
-        "touched point {number} lies {distance_mm:.3} mm from its target after the fit of all points to the plan, \
-         which turns them by {rotation_deg:.1}°; the limits are {limit_mm:.1} mm and {MAX_ROTATION_DEG:.0}°: check \
-         that the rows are in the order of the plan, and that it is the plan of this part"
+        "all points were fitted to the plan: touched point {number} is still {distance_mm:.3} mm from its target (limit \
+         {limit_mm:.1} mm), and the fit turns the points by {rotation_deg:.1}° (limit {MAX_ROTATION_DEG:.0}°). Check \
+         that the rows are in the order of the plan, and that the plan is of this part"
     )]
     OffTarget {
         /// Position of the worst point among the touched points of the part, from 1.

@@ -47,7 +47,7 @@ impl ValueRange {
         let value = value.filter(|value| !self.contains(*value))?;
         let Self { name: figure, min: least, max: most, unit } = self;
         let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
-        Some(format!("{figure} is {value}{unit}, and {least} to {most}{unit} are possible"))
+        Some(format!("{figure} is {value}{unit}, limits {least} to {most}{unit}"))
     }
 
     fn refuse(&self, machine: &Arc<str>, value: f64) -> Result<(), DeviceError> {
@@ -158,9 +158,9 @@ mod tests {
             (Measurement { duration_s: Some(-5.0), ..measurement() }, "the duration is -5 s"),
             (
                 Measurement { probe_radius_mm: Some(0.0), ..measurement() },
-                "the probe's radius is 0 mm, and 0.01 to 50 mm",
+                "the probe's radius is 0 mm, limits 0.01 to 50 mm",
             ),
-            (point(101, [1.0; 3]), "target 7: the quality of a point is 101, and 0 to 100 are"),
+            (point(101, [1.0; 3]), "target 7: the quality of a point is 101, limits 0 to 100"),
             (point(0, [1.0, 1e30, 1.0]), "target 7: a coordinate is 1000000000000000"),
             (point(0, [1.0, 1.0, f64::NEG_INFINITY]), "target 7: a coordinate is -inf mm"),
         ];

@@ -46,7 +46,7 @@ pub(super) fn evaluate_touches(
     let open = |chosen: Vec<usize>| chosen.into_iter().filter(|&k| tried[k].is_none()).collect();
     let first: Vec<usize> = open(farthest_points(&places, MIN_TOUCHES));
     if points.tried_targets.len() == 1 && !first.is_empty() {
-        let why = "the part is at its expected place";
+        let why = "the first touches found the part at its expected place";
         return TouchEvaluation { form: Err(why.to_owned()), next: Some((short_tour(&places, first), why)) };
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.point_targets };
@@ -154,16 +154,18 @@ fn reason_message(why: Reason) -> &'static str {
     match why {
         Reason::WithinLimits => "the part is in tolerance",
         Reason::FormKnown => "the form is known well enough for a correction",
-        Reason::CorrectionPreferred => "another pass improves more than further touches",
+        Reason::CorrectionPreferred => "another pass improves the part more than further touches do",
         Reason::AllTargetsTried => "every target was touched",
         Reason::TooFewTouches => "too few touches for a decision",
         Reason::LargeInnovations => "the last touches deviate from the prediction",
-        Reason::UnconfirmedOutlier => "a touch is an outlier, and its surroundings are unknown",
+        Reason::UnconfirmedOutlier => "a touch is an outlier, and too few touches near this touch confirm or reject it",
         Reason::NarrowFeature => "the part has a narrow feature, so every target is touched",
-        Reason::Undecided => "it is undecided whether the part is in tolerance",
+        Reason::Undecided => "the touches do not yet show whether the part is in tolerance",
         Reason::FormUnknown => "the form is not known well enough for a correction",
-        Reason::BeyondLimit => "the part is out of tolerance, and no pass is left",
-        Reason::MaxBatchesReached => "the limit of batches is reached, so all other targets are touched",
+        Reason::BeyondLimit => "the part is out of tolerance, and the recipe allows no further pass",
+        Reason::MaxBatchesReached => {
+            "the maximum number of touch batches is reached, so all remaining targets are touched"
+        }
     }
 }
 

@@ -430,7 +430,10 @@ impl Drive {
     /// not a known computation.
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
-        let why = format!("the computation failed by a fault of the program; report it: {}", panic_message(error));
+        let why = format!(
+            "the computation failed because of a fault of the program; report this fault: {}",
+            panic_message(error)
+        );
         let event = match kind {
             Computation::Gate => {
                 let gate = GateResult::Failed(GateFailure::Broken(why));
@@ -484,7 +487,7 @@ impl Drive {
     /// or the cell changed its state before the record was written. Does nothing for other commands.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "START was not sent: it could not be recorded, or the cell was held before".to_owned();
+            let why = "START was not sent: START could not be recorded, or the cell was held first".to_owned();
             self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
         }
     }
@@ -546,8 +549,9 @@ impl Drive {
         for waiting in &mut self.backlog {
             match std::mem::replace(&mut waiting.action, RecordAction::Nothing) {
                 RecordAction::Answer { answer, message, .. } => {
-                    let message =
-                        format!("{message}; only steps that make the cell safe were carried out; not recorded: {why}");
+                    let message = format!(
+                        "{message}; only steps that make the cell safe were carried out; the order was not recorded: {why}"
+                    );
                     // The person who asked may be gone.
                     drop(answer.send(Reply { taken: false, message, status: status.clone() }));
                 }
@@ -598,8 +602,10 @@ impl Drive {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.state_changes
         {
-            let message =
-                format!("the state of the cell has changed since you saw it; it is now {}", self.cell.in_words());
+            let message = format!(
+                "the state of the cell changed before your order arrived; the state is now {}; check this state, then resume",
+                self.cell.in_words()
+            );
             // The person who asked may be gone.
             if let Some(answer) = answer {
                 drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
@@ -688,7 +694,7 @@ impl Drive {
     /// it is not a confirmation.
     fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving_device);
-        let job = || at_work.ok_or("no job of a machine is in progress");
+        let job = || at_work.ok_or("no machine has a job in progress, so there is no job to confirm");
         let identity = |map: &Option<String>| map.as_ref().map(|digits| self.map_identity(digits)).transpose();
         Ok(match request {
             Request::Started { map } => {
@@ -702,7 +708,7 @@ impl Drive {
                     device.or(at_work).ok_or("name the machine that is at rest: --machine cmm or --machine grinder")?;
                 (device, "still", OperatorConfirmation::Still)
             }
-            _ => return Err("this is not a confirmation about a machine".into()),
+            _ => return Err("this order is not a confirmation for a machine".into()),
         })
     }
 
@@ -717,12 +723,15 @@ impl Drive {
         let identity = self.task.payloads(&cycle.correction).0.identity();
         let whole = hex(&identity);
         if digits.len() < 8 {
-            return Err("give at least the first 8 digits of the identity of the map in correction.json".into());
+            return Err(
+                "give at least the first 8 digits of the map identity; the file correction.json has this identity"
+                    .into(),
+            );
         }
         if !whole.starts_with(&digits) {
             let (given, handed) = (digits.get(..8).unwrap_or(&digits), &whole[..8]);
             return Err(format!(
-                "map {handed} was sent, but the confirmation names {given}; check the setup of the grinder"
+                "map {handed} was sent, but the confirmation names map {given}; check which map is set up at the grinder"
             ));
         }
         Ok(identity)
@@ -1233,7 +1242,7 @@ fn require_free_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     }
     let [free, needed] = [free, needed].map(|bytes| bytes.div_ceil(1 << 20));
     let disk = folder.display();
-    Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB free, a cycle needs up to {needed} MB")))
+    Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB free, but a cycle needs up to {needed} MB")))
 }
 
 /// Returns the message of a task that panicked.
@@ -1249,7 +1258,7 @@ async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<
     match backlog.front_mut() {
         Some(next) => (&mut next.receipt).await.unwrap_or_else(|_| {
             Err(RecordFailure::Unwritable(
-                "the part of this program that writes the record has ended; report it".into(),
+                "the part of this program that writes the record has stopped; report this fault".into(),
             ))
         }),
         None => std::future::pending().await,

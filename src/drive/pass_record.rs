@@ -42,14 +42,14 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
         return Some(format!(
-            "it is of job {is_job}, cycle {is_cycle}; the pass is of job {}, cycle {}",
+            "the record belongs to job {is_job}, cycle {is_cycle}, but the pass to job {}, cycle {}",
             job.job, job.cycle
         ));
     }
     if record.map_identity != *map_identity {
         let short = |identity: &[u8; 32]| identity[..4].iter().map(|b| format!("{b:02x}")).collect::<String>();
         let (is, told) = (short(&record.map_identity), short(map_identity));
-        return Some(format!("map {is} was ground, but map {told} was sent"));
+        return Some(format!("the grinder used map {is}, but map {told} was sent"));
     }
     if record.outcome != Outcome::Complete {
         return None; // A pass that did not come to its end is judged by that alone.
@@ -187,9 +187,18 @@ mod tests {
     fn pass_record_names_violated_limit() {
         assert_eq!(checked(&record()), None);
         let cases = [
-            (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, but map 03030303 was sent"),
-            (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; the pass is of job 41, cycle 2"),
-            (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; the pass is of job 41, cycle 2"),
+            (
+                PassRecord { map_identity: [4; 32], ..record() },
+                "the grinder used map 04040404, but map 03030303 was sent",
+            ),
+            (
+                PassRecord { job: 40, ..record() },
+                "the record belongs to job 40, cycle 2, but the pass to job 41, cycle 2",
+            ),
+            (
+                PassRecord { cycle: 1, ..record() },
+                "the record belongs to job 41, cycle 1, but the pass to job 41, cycle 2",
+            ),
             (PassRecord { max_depth_mm: Some(3.0), ..record() }, "3.000 mm, maximum 0.535 mm"),
             (PassRecord { path_mm: Some(-1.0), ..record() }, "the path travelled is -1.000 mm, minimum 6324.000 mm"),
             (
@@ -199,11 +208,11 @@ mod tests {
             (PassRecord { path_mm: Some(1e300), ..record() }, "the path travelled is 1e300 mm"),
             (PassRecord { removed_mm3: Some(1e30), ..record() }, "the removed volume is 1e30 mm³"),
             (PassRecord { removed_mm3: Some(0.0), ..record() }, "is 0 mm³, but the largest removed depth is 0.2000 mm"),
-            (PassRecord { spindle_load: Some(-1.0), ..record() }, "the spindle load is -1, and 0 to 10"),
+            (PassRecord { spindle_load: Some(-1.0), ..record() }, "the spindle load is -1, limits 0 to 10"),
             (PassRecord { temperature_c: Some(-327.0), ..record() }, "the temperature is -327 degrees Celsius"),
             (PassRecord { wheel_radius_mm: Some(11.0), ..record() }, "is 11.000 mm, limits 12.375 to 12.625 mm"),
             (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, minimum 379.440 s"),
-            (PassRecord { idle_share: Some(1.5), ..record() }, "cut nothing is 1.5, and 0 to 1 are"),
+            (PassRecord { idle_share: Some(1.5), ..record() }, "cut nothing is 1.5, limits 0 to 1"),
             (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the removed volume is -2.000 mm³"),
         ];
         for (record, words) in cases {

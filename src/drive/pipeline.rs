@@ -118,7 +118,7 @@ fn merge_repeated_touches(
     if measurement.points.len() < planned {
         let found = measurement.points.len();
         return Err(GateFailure::Broken(format!(
-            "the machine returned {found} points, at least {planned} are required"
+            "the machine returned {found} points, but at least {planned} points are required"
         )));
     }
     let found = measurement.points.iter().filter(|point| point.status == TouchStatus::Touched).count();
@@ -156,13 +156,13 @@ fn check_control_points(
     match changes_mm.get(1) {
         Some(&second_mm) if second_mm <= limit_mm => Ok(()),
         Some(&second_mm) => Err(GateFailure::Moved(format!(
-            "{} control points are at least {:.2} µm from their first touches, limit {:.2} µm",
+            "{} control points are too far from their first touches; the second largest distance is {:.2} µm, limit {:.2} µm",
             changes_mm.iter().filter(|&&change| change > limit_mm).count(),
             1e3 * second_mm,
             1e3 * limit_mm,
         ))),
         None => Err(GateFailure::Moved(format!(
-            "{} of {} control points were found, at least 2 are required",
+            "{} of {} control points were touched again, but at least 2 are required",
             changes_mm.len(),
             again.control_points.len()
         ))),
@@ -288,12 +288,14 @@ const MAX_PROBE_RADIUS_DIFFERENCE: f64 = 0.01;
 /// of points, and a value out of range. Returns `None` if no contradiction is found.
 fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
-        return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
+        return Some(GateFailure::Foreign(
+            "the result of the machine names another plan than the plan that was sent".into(),
+        ));
     }
     match (measurement.coordinates, task.expected_coordinates) {
         (Coordinates::Contacts, Some(Coordinates::Centres)) => return Some(GateFailure::Contacts),
         (Coordinates::Centres, Some(Coordinates::Contacts)) => {
-            let message = "the machine returns probe centres, the cell file expects contact points";
+            let message = "the machine returns probe centres, but the cell file expects contact points";
             return Some(GateFailure::Broken(message.into()));
         }
         _ => {}
@@ -302,12 +304,14 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
     let told = measurement.probe_radius_mm.filter(|told| *told > 0.0);
     if let Some(told_mm) = told.filter(|told| (told - stated_mm).abs() > MAX_PROBE_RADIUS_DIFFERENCE * stated_mm) {
         let message =
-            format!("the probe radius of the measurement is {told_mm:.4} mm, that of the recipe is {stated_mm:.4} mm");
+            format!("the probe radius of the measurement is {told_mm:.4} mm, but the recipe has {stated_mm:.4} mm");
         return Some(GateFailure::Broken(message));
     }
     if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
         let (found, planned) = (measurement.points.len(), plan.targets.len());
-        return Some(GateFailure::Broken(format!("the machine returned {found} points for {planned} targets")));
+        return Some(GateFailure::Broken(format!(
+            "the machine returned {found} points, but the plan has {planned} targets"
+        )));
     }
     if let Some(flaw) = measurement.range_violation() {
         return Some(GateFailure::Broken(flaw));
@@ -315,7 +319,10 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
     let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
     if let Some(k) = order {
         let (found, planned) = (measurement.points[k].index, plan.targets[k].index);
-        return Some(GateFailure::Broken(format!("point {} is of target {found}, expected target {planned}", k + 1)));
+        return Some(GateFailure::Broken(format!(
+            "point {} of the result belongs to target {found}, but the plan has target {planned} at this place",
+            k + 1
+        )));
     }
     match plan.check(measurement).err()? {
         PlanMismatch::EqualsPlan if task.rehearsal => None,
@@ -345,7 +352,7 @@ fn repeated_result_failure(
     let is_same = touched().filter(|point| old.contains(&bits(point.position_mm))).count() >= old.len();
     (is_same && old.len() >= MIN_COMPARED_TOUCHES).then(|| {
         let message =
-            format!("the points equal those of cycle {number} to the last bit: the machine returned its old result");
+            format!("all points are identical to the points of cycle {number}: the machine returned its old result");
         GateFailure::Foreign(message)
     })
 }
@@ -354,7 +361,7 @@ fn repeated_result_failure(
 /// although the limits or the thermal expansion require it. Returns `None` otherwise.
 fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
     if task.expansion.is_some() && measurement.temperature_c.is_none() {
-        let message = "the measurement has no temperature, which the compensation of the expansion requires (part.expansion_um_m_k)";
+        let message = "the measurement has no temperature, but the compensation of the thermal expansion requires a temperature (part.expansion_um_m_k)";
         return Some(GateFailure::Temperature(message.to_owned()));
     }
     let [least, most] = task.temperature_range_c?;
@@ -496,8 +503,7 @@ fn register_and_evaluate(
     let mut figures = cell_figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
     if task.expansion.is_some() && grown.is_none() {
-        let message =
-            "the measurement has no temperature: the expansion of the part is not compensated (part.expansion_um_m_k)";
+        let message = "the measurement has no temperature, so the thermal expansion of the part is not compensated (part.expansion_um_m_k)";
         figures.warnings.push(message.to_owned());
     }
     let untold =
@@ -528,7 +534,7 @@ fn register_and_evaluate(
     let again = again.filter(|_| task.tolerance.outliers_decide(&figures));
     if let Some(again) = again.as_ref().filter(|_| points.repeat_rounds == 0) {
         let targets = again.targets.len() as u32;
-        let why = "a touch is an outlier: it is repeated, with a few touches around it".to_owned();
+        let why = "a touch is an outlier, so this touch is repeated, with a few touches near the same place".to_owned();
         figures.touch_on = Some(Box::new(FurtherTouches { targets, why }));
     }
     let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
@@ -763,8 +769,9 @@ fn compute_correction(
     cycle: &CycleState,
 ) -> Result<(CompensationSummary, Correction), ComputationError<CompensationRefusal>> {
     let failed = |why: &dyn std::fmt::Display| ComputationError::Failed(CompensationRefusal::Failed(why.to_string()));
-    let found =
-        cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
+    let found = cycle.registration.as_ref().ok_or_else(|| {
+        failed(&"the measurement of this cycle has no registration, so no correction can be computed")
+    })?;
     // If the part may slide within its own surface, the place of the map on the part is unknown.
     let covariance = cycle.form.as_ref().map_or(&found.quality.covariance, |form| &form.frame_covariance);
     if let Some(why) = map_obstacle(found, covariance, &task.map_limits) {
@@ -852,7 +859,7 @@ fn parameter_questions(cycle: &CycleState) -> Vec<String> {
         let (units, unit) = (p.kind.display_units_per_unit(), p.kind.unit());
         let key = p.kind.recipe_key().unwrap_or_default();
         format!(
-            "{}: error {:.2} \u{b1} {:.2} {unit}; its compensation of {:.2} {unit} exceeds compensation.parameters.{key}",
+            "{}: error {:.2} \u{b1} {:.2} {unit}; the compensation of {:.2} {unit} for this error exceeds the limit compensation.parameters.{key}",
             p.kind.name(),
             units * p.value,
             2.0 * units * p.sigma,

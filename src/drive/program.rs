@@ -72,7 +72,9 @@ pub enum ProgramError {
          the program with `regrind plan --program`"
     )]
     TooLong { points: u64 },
-    #[error("{path} differs from the program that was written; check the program folder (grinder.program.folder)")]
+    #[error(
+        "the file {path} differs from the program that Regrind wrote; check the program folder (grinder.program.folder)"
+    )]
     CopyDiffers { path: PathBuf },
 }
 
@@ -310,10 +312,10 @@ pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radi
             ParameterKind::WheelRadius => {
                 let true_mm = wheel_radius_mm + value;
                 format!(
-                    "{said}, {true_mm:.6} mm instead of {wheel_radius_mm} mm, since pass {since}; compensated by the wheel radius, not by the map"
+                    "{said}, {true_mm:.6} mm instead of {wheel_radius_mm} mm, compensated since pass {since} by the wheel radius, not by the map"
                 )
             }
-            _ => format!("{said}, since pass {since}; compensated by the map"),
+            _ => format!("{said}; compensated since pass {since} by the map"),
         }
     };
     taken.map(line).collect()
@@ -341,7 +343,7 @@ fn describe_tracks(path: &ToolPath) -> String {
         TrackSpacing::Distance(_) => String::new(),
     };
     format!(
-        "{} pieces, {:.6} mm apart, {pattern}{scallop}, chords within {:.4} um, overrun {} mm",
+        "{} track pieces, {:.6} mm apart, {pattern}{scallop}, chords within {:.4} um, overrun {} mm",
         path.track_count(),
         path.track_mm(),
         1e3 * options.chord_error_mm,

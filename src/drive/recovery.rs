@@ -70,13 +70,17 @@ impl RecoveryStep {
     /// Returns a text for people about the effect of this step on `device`, including what is lost.
     pub fn consequence(self, device: Device) -> &'static str {
         match (self, device) {
-            (Self::Stop, _) => "ends its job in order, clear of the part, or withdraws its preparation",
-            (Self::Acknowledge, Device::Cmm) => "discards its result: a measurement that no run has collected is lost",
+            (Self::Stop, _) => {
+                "ends the running job normally, clear of the part; if no job runs, cancels the prepared job"
+            }
+            (Self::Acknowledge, Device::Cmm) => {
+                "discards the result of the CMM: a measurement that no run has collected is lost"
+            }
             (Self::Acknowledge, Device::Grinder) => {
-                "discards its result: the part has had this pass, but no record will contain it"
+                "discards the result of the grinder: the part was ground with this pass, but no record will contain this pass"
             }
             (Self::Clear, _) => {
-                "returns it to idle: first check that it is at rest, clear of the part, and why it was stopped"
+                "returns the machine to idle: first check that the machine is at rest and clear of the part, and why the machine was stopped"
             }
         }
     }

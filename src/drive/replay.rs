@@ -67,15 +67,15 @@ pub enum ReplayError {
     Journal(#[from] JournalError),
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{}: {source}; no command was sent; check the disk and retry", .path.display())]
+    #[error("{}: the temporary file cannot be read: {source}; no command was sent; check the disk and retry", .path.display())]
     Scratch { path: PathBuf, source: io::Error },
-    #[error("{}: the repeated computation cannot be written ({what}); no command was sent; check the disk and retry", .run.display())]
+    #[error("{}: the result of the repeated computation cannot be written ({what}); no command was sent; check the disk and retry", .run.display())]
     NotSaved { run: PathBuf, what: String },
-    #[error("{}: record {seq} cannot be read ({what}); this run cannot continue; return its machines to idle with `regrind recover`", .run.display())]
+    #[error("{}: record {seq} cannot be read ({what}); this run cannot continue; return the machines of the run to idle with `regrind recover`", .run.display())]
     Unreadable { run: PathBuf, seq: u64, what: String },
     #[error(
         "{}: at record {seq} the result of this program differs from the record: {what}; no command was sent. Continue with \
-         the program that began the run, or return its machines to idle with `regrind recover` and start a new run",
+         the program that began the run, or return the machines of the run to idle with `regrind recover` and start a new run",
         .run.display()
     )]
     Differs { run: PathBuf, seq: u64, what: String },
@@ -213,7 +213,10 @@ impl<'t> Replay<'t> {
 
     fn apply_event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
         if let Some(missing) = self.due_commands.front() {
-            return Err(self.differs(format!("the program sends {}, but the record has another event", missing.name())));
+            return Err(self.differs(format!(
+                "the program would send {}, but the record has an event in place of this command",
+                missing.name()
+            )));
         }
         let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
         if let Event::Prepared { device, .. } = &event {
@@ -249,14 +252,16 @@ impl<'t> Replay<'t> {
     fn compare_command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
         let Some(command) = self.due_commands.pop_front() else {
-            return Err(self.differs(format!("the program sends no command, but the record has {name}")));
+            return Err(
+                self.differs(format!("the program would send no command, but the record has the command {name}"))
+            );
         };
         if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
             recorded.remove("intent");
         }
         let due = serde_json::to_value(&command).unwrap_or_default();
         if !is_same_decision(&due, &recorded) {
-            return Err(self.differs(format!("the program sends {due}, but the record has {recorded}")));
+            return Err(self.differs(format!("the program would send {due}, but the record has {recorded}")));
         }
         if let Some(id) = id.filter(|_| outcome::expects_answer(&command)) {
             self.replayed.open_commands.insert(id, command);
@@ -329,8 +334,11 @@ impl<'t> Replay<'t> {
             .read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?
             .map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
-        pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches)
-            .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))
+        pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(|why| {
+            self.differs(format!(
+                "the recorded points of cycle {number} do not pass the checks of a measurement: {why:?}"
+            ))
+        })
     }
 
     /// Reads the newest recorded JSON file `name` of cycle `number`. Returns `None` if no such file is recorded.
@@ -352,15 +360,16 @@ impl<'t> Replay<'t> {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };
             if !path.is_file() {
-                return Err(self.differs(format!("the repeated computation does not give {}", recorded.name)));
+                return Err(self.differs(format!("the repeated computation does not write the file {}", recorded.name)));
             }
             let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
             if sha256_hex(&bytes) != recorded.sha256
                 && !is_same_file(&recorded.name, &recorded.read(self.run_folder)?, &bytes)
             {
-                return Err(
-                    self.differs(format!("the repeated computation of {} differs from the record", recorded.name))
-                );
+                return Err(self.differs(format!(
+                    "the file {} of the repeated computation differs from the recorded file",
+                    recorded.name
+                )));
             }
         }
         Ok(())
@@ -442,7 +451,7 @@ impl<'t> Replay<'t> {
         }
         let told = intent.digest;
         Err(self.differs(format!(
-            "the {device} was prepared in cycle {number} for data {told:08x}, but this cycle has data {due:08x}"
+            "the {device} was prepared in cycle {number} for data with digest {told:08x}, but the data of this cycle have digest {due:08x}"
         )))
     }
 

@@ -332,7 +332,7 @@ impl<B: StationDriver> MachineTask<B> {
     ) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.serve_requests(asks, poll, aborts, pulse)).await else { return };
-        let why = format!("a fault of the program; report it: {}", panic_message(error));
+        let why = format!("a fault of the program; report this fault: {}", panic_message(error));
         let event = Some(Event::StationFailed { device: name, why });
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
@@ -576,7 +576,7 @@ impl<B: StationDriver> MachineTask<B> {
     /// Reports a command as refused that the station did not send, because the link was lost after the cell had issued
     /// it. It is not sent later either, so it cannot move the machine.
     async fn refuse_unsent(&mut self, what: MachineRequest) {
-        let why = "the link is lost, and the command was not sent".to_owned();
+        let why = "the link is lost, so the command was not sent".to_owned();
         self.report(Event::Refused { device: B::DEVICE, what, why }).await;
     }
 
@@ -650,7 +650,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match met.await {
             Ok(status) if self.has_foreign_job(&status) => {
-                Err(format!("it has a job of another run: {}", describe_job(&status)))
+                Err(format!("the machine has a job of another run: {}", describe_job(&status)))
             }
             Ok(_) => {
                 self.observed.connected = true;
@@ -707,7 +707,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn collect(&mut self, cycle: u32) {
         let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
-            let why = "this program has not prepared it for a job of this cycle".to_owned();
+            let why = "this program has not prepared the machine for a job of this cycle".to_owned();
             return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Collect, why }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
@@ -777,7 +777,7 @@ impl<B: StationDriver> MachineTask<B> {
             let answers = if error.is_link() {
                 ""
             } else {
-                "the machine answers, but not as the cell file and docs/modbus.md define it: "
+                "the machine answers, but its answer contradicts the cell file or docs/modbus.md: "
             };
             self.report(Event::LinkLost { device: B::DEVICE, why: format!("{answers}{error}") }).await;
         }
@@ -930,7 +930,8 @@ impl<B: StationDriver> MachineTask<B> {
                     && self.observed.running
                     && self.observed.progress_rises_at_held.is_multiple_of(MOVING_AFTER_RISES)
                 {
-                    let why = format!("it reports HELD, but its progress has risen to {done} of {total}");
+                    let why =
+                        format!("the machine reports HELD, but the progress of the job has risen to {done} of {total}");
                     self.report(Event::Refused { device, what: MachineRequest::Hold, why }).await;
                 }
             }
@@ -939,7 +940,7 @@ impl<B: StationDriver> MachineTask<B> {
         let is_late = self.observed.stop_accepted_at.is_some_and(|taken| taken.elapsed() > STOP_TIMEOUT);
         if self.observed.stopping && is_late && status.state == MachineState::Execute {
             self.observed.stop_accepted_at = None;
-            let why = format!("it accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
+            let why = format!("the machine accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
             self.report(Event::Refused { device, what: MachineRequest::Stop, why }).await;
         }
     }
@@ -953,7 +954,7 @@ impl<B: StationDriver> MachineTask<B> {
             return;
         };
         if f64::from(done) < MIN_COMPLETE_SHARE * f64::from(total) {
-            let why = format!("the grinder reports the pass as complete at a progress of {done} of {total}");
+            let why = format!("the grinder reports the pass as complete, but the progress is only {done} of {total}");
             self.report(Event::RecordDoubted { cycle: self.cycle, why }).await;
         }
     }
@@ -980,8 +981,11 @@ impl<B: StationDriver> MachineTask<B> {
         let Some(clear) = status.clear_of_part else { return };
         let before = self.observed.clear.replace(clear);
         if before == Some(true) && !clear && !self.observed.running {
-            let message =
-                format!("{} is {} and no longer clear of the part", self.driver.machine().name(), status.state);
+            let message = format!(
+                "{} is in {} without a running job, but is no longer clear of the part",
+                self.driver.machine().name(),
+                status.state
+            );
             self.report(Event::Obstructed { device: B::DEVICE, message }).await;
         }
     }
@@ -1112,8 +1116,8 @@ fn fault_message(device: Device, fault: Fault) -> String {
     match (device, fault) {
         // A probe that meets material where only air should be is not at fault: the part is in another place.
         (Device::Cmm, Fault::Collision) => {
-            "the probe touched material where only air is expected: before clearing, check the position of the part (turned, \
-             in another seat, another part) and the probe"
+            "the probe touched material where the plan expects only air: check the position of the part (turned, in another \
+             seat, another part) and the probe, then clear the machine"
                 .to_owned()
         }
         (_, fault) => fault.to_string(),

@@ -18,13 +18,13 @@ pub enum FormatError {
     #[error("{path}: cannot be read: {source}; check the name and the permissions")]
     Unreadable { path: PathBuf, source: io::Error },
     /// The file has more bytes, points or triangles (`unit` says which) than are read.
-    #[error("{path}: {found} {unit}, more than the limit of {limit}; reduce the file, or split it")]
+    #[error("{path}: the file has {found} {unit}, more than the limit of {limit}; reduce or split the file")]
     TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },
     /// The file has no content at all.
     #[error("{path}: the file is empty, expected {expected}; export it again")]
     Empty { path: PathBuf, expected: &'static str },
     /// The file is well formed, but contains no data.
-    #[error("{path}: the file has no {expected}; export it again with its data")]
+    #[error("{path}: the file has no {expected}; export the file again with its data")]
     NoData { path: PathBuf, expected: &'static str },
     /// A byte that does not occur in a text file.
     #[error(
@@ -36,7 +36,7 @@ pub enum FormatError {
     #[error("{path}: expected plain text, found UTF-16; save the file as UTF-8")]
     Utf16 { path: PathBuf },
     /// A line that is too long for a point.
-    #[error("{path}, line {line}: longer than {limit_bytes} bytes; expected one point per line")]
+    #[error("{path}, line {line}: the line is longer than {limit_bytes} bytes; write one point per line")]
     LineTooLong { path: PathBuf, line: u64, limit_bytes: usize },
     /// Text where a number should be.
     #[error(
@@ -118,7 +118,7 @@ pub enum FormatError {
     Unexpected { path: PathBuf, place: String, expected: String, found: String },
     /// A face that refers to a vertex that does not exist.
     #[error(
-        "{path}, {place}: a face has the vertex {index}, but there are {vertices} vertices, counted from 0; export the mesh again"
+        "{path}, {place}: a face refers to vertex {index}, but the mesh has {vertices} vertices, counted from 0; export the mesh again"
     )]
     IndexOutOfRange { path: PathBuf, place: String, index: f64, vertices: u64 },
     /// A vertex that is not a valid position.

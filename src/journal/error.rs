@@ -29,7 +29,9 @@ pub enum JournalError {
     )]
     Newer { path: PathBuf, found: u32, limit: u32 },
     /// Another process drives the run.
-    #[error("{path}: another process drives this run; wait for it, or order it to hold or stop")]
+    #[error(
+        "{path}: another process controls this run; wait until that process ends, or order a hold or a stop of the run"
+    )]
     Busy { path: PathBuf },
     /// Another run has the machine.
     #[error(
@@ -38,7 +40,7 @@ pub enum JournalError {
     )]
     MachineTaken { address: String, holder: String },
     /// The folder for the locks of machines is not safe to use: another user could have created it.
-    #[error("{path}: this folder is not safe for the locks of machines: {what}; {remedy}")]
+    #[error("{path}: this folder must hold the locks of the machines, but is not safe: {what}; {remedy}")]
     LockFolder { path: PathBuf, what: String, remedy: String },
     /// The run is over.
     #[error("{path}: the journal is closed, because its run is over; begin another run")]
@@ -100,11 +102,13 @@ pub enum JournalError {
     )]
     KeyIsOpen { path: PathBuf, how: String, remedy: String },
     /// The name could lead out of the run folder.
-    #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
+    #[error(
+        "`{name}` cannot be the name of a file in a run folder; give a relative path of plain file names, without `..`"
+    )]
     Name { name: String },
     /// The file is already on record with a different content.
     #[error(
-        "{path}: this file is on record with another content; recorded files are never overwritten; write it under another name"
+        "{path}: this file is already recorded with another content, and a recorded file is never overwritten; write the new content under another name"
     )]
     Recorded { path: PathBuf },
     /// The entry is not allowed at this place of the journal.

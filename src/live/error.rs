@@ -15,9 +15,9 @@ use thiserror::Error;
 pub enum LiveError {
     #[error(transparent)]
     Trust(#[from] TrustError),
-    #[error("{of} {name:?} cannot be a part of a topic: it is empty, or has one of + / #; give it another name")]
+    #[error("{of} {name:?} cannot be a part of a topic: the name is empty or contains +, / or #; choose another name")]
     Topic { of: &'static str, name: String },
-    #[error("{}: the state of the publisher cannot be stored there: {source}; check that the folder exists, and that you have the right to write in it", .path.display())]
+    #[error("{}: the state of the publisher cannot be stored in this folder: {source}; check that the folder exists, and that you have the right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
     #[error(
         "{listen} is open to other computers, and this OPC UA server has no encryption; listen at 127.0.0.1, and connect from other computers \

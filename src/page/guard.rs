@@ -261,13 +261,15 @@ impl Guard {
         };
         if untold > 0 {
             (self.log)(&format!(
-                "{untold} further requests were refused within the minute after the first refusal, and not logged one by one"
+                "{untold} further requests were refused in the minute after the first refusal; the log does not list these requests"
             ));
         }
         if told <= MAX_LOGGED_REFUSALS {
             (self.log)(&format!("refused {what}"));
         } else if told == MAX_LOGGED_REFUSALS + 1 {
-            (self.log)("further refusals within this minute are counted, but not logged one by one");
+            (self.log)(
+                "too many requests were refused in this minute; the log shows only the number of further refusals",
+            );
         }
         told <= MAX_LOGGED_REFUSALS
     }
@@ -427,7 +429,7 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     foreign_origin(guard, headers).or_else(|| {
         let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
         (!guard.takes_token(session, token))
-            .then(|| "an order without a token of the page, or with one that was used".into())
+            .then(|| "an order without a token of this page, or with a token that was already used".into())
     })
 }
 
@@ -464,7 +466,7 @@ fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
 fn not_signed_in(guard: &Guard, request: &Request) -> Response {
     if request.method() != "GET" {
         let path = printable(request.uri().path());
-        guard.record_refusal(&format!("an order of somebody who has not signed in, for {path}"));
+        guard.record_refusal(&format!("an order to {path} from a person who has not signed in"));
     }
     view::sign_in(StatusCode::UNAUTHORIZED, guard.subject, request.headers(), None)
 }

@@ -52,13 +52,19 @@ pub(crate) async fn order(
     let request = serde_json::from_slice::<Request>(&body).ok();
     // Other requests that the cell understands are for programs and the terminal only.
     let Some((request, name)) = request.and_then(|request| name_of(&request).map(|name| (request, name))) else {
-        return refuse(&page, &run, "a request that is not an order of the page".into(), StatusCode::BAD_REQUEST).await;
+        return refuse(
+            &page,
+            &run,
+            "a request that is not one of the orders that this page can give".into(),
+            StatusCode::BAD_REQUEST,
+        )
+        .await;
     };
     if let Some(what) = not_for(&session, name) {
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     if !MAKES_SAFE.contains(&name) && !page.guard.has_control(&session, true) {
-        let message = "another screen has control of the cell; take control first".to_owned();
+        let message = "another screen has control of the cell; press TAKE CONTROL on this screen first".to_owned();
         return (StatusCode::CONFLICT, Json(Answer { accepted: false, message })).into_response();
     }
     if name == "resume"
@@ -91,7 +97,7 @@ fn name_of(request: &Request) -> Option<&'static str> {
 /// it.
 fn not_for(session: &Session, order: &str) -> Option<String> {
     let person = session.person.as_ref().filter(|_| !session.may(order))?;
-    Some(format!("the order {order} of {person}: the role of this person does not allow this order"))
+    Some(format!("the order {order} from {person}: the role of this person does not allow this order"))
 }
 
 /// Checks whether the person at the browser of `session` may give a resume order for the run in `folder`. Returns the
@@ -101,7 +107,10 @@ async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) ->
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
     let theirs = status.alarms.iter().find(|alarm| alarm.clears == Role::ProcessEngineer)?;
-    Some(format!("the order resume of {person}: only an engineer can clear the alarm \"{}\"", theirs.what))
+    Some(format!(
+        "the order resume from {person}: an alarm is active that only an engineer can clear: \"{}\"",
+        theirs.what
+    ))
 }
 
 /// Gives control of the cell of the run named `run` to the browser of `session`. Refuses this if the order does not
@@ -119,7 +128,7 @@ pub(crate) async fn take_control(
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
-    let what = "control was taken over by another screen of the page".to_owned();
+    let what = "another screen of the page took control of the cell".to_owned();
     let recorded = give(folder, Request::Remark { what }, &session).await;
     if recorded.is_ok() {
         page.guard.take_control(&session);
@@ -131,7 +140,8 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
     match reply {
         Ok(Reply { taken, message, .. }) => Json(Answer { accepted: taken, message }).into_response(),
         Err(error) => {
-            let message = format!("the program of the cell does not answer: {error}");
+            let message =
+                format!("the program that runs the cell does not answer: {error}; check that this program still runs");
             (StatusCode::BAD_GATEWAY, Json(Answer { accepted: false, message })).into_response()
         }
     }

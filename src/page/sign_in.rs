@@ -202,11 +202,13 @@ pub(crate) async fn sign_in(
         None => None,
     };
     let Some(turn) = turn else {
-        let what = format!("a sign-in as {who} from {from}, which waited too long for the sign-ins of others");
+        let what = format!(
+            "a sign-in as {who} from {from}, which could not start in time because other sign-ins were in progress"
+        );
         return refuse(StatusCode::SERVICE_UNAVAILABLE, what, Text::TooManyTries);
     };
     let Some(proven) = prove(&guard, turn, given).await else {
-        let what = format!("a wrong name or password, {who}, from {from}");
+        let what = format!("a sign-in with a wrong name or password, as {who} from {from}");
         return refuse(StatusCode::UNAUTHORIZED, what, Text::SignInRefused);
     };
     guard.signed_in.forget_tries(from, &name);

@@ -77,17 +77,17 @@ texts! {
     Simulation { "SIMULATION", "SIMULATION", "仿真" }
     NotConnected { "No data since", "Keine Daten seit", "无数据，自" }
     ProgramGone {
-        "The program that ran the cell does not answer. The state of the machines is unknown: look at them. Then run: regrind resume",
+        "The program that ran the cell does not answer. The state of the machines is unknown: go to the machines and check their state. Then run: regrind resume",
         "Das Programm der Zelle antwortet nicht. Was die Maschinen tun, ist nicht bekannt: bitte nachsehen. Dann: regrind resume",
         "单元程序没有应答。机器的状态未知：请到现场查看。然后执行：regrind resume"
     }
     SimulationGone {
-        "The program that simulated this cell has ended, and its machines with it. Begin a new run.",
+        "The program that simulated this cell has ended. The simulated machines have ended too. Begin a new run.",
         "Das Programm, das diese Zelle simuliert hat, ist beendet, und mit ihm ihre Maschinen. Bitte einen neuen Lauf beginnen.",
         "仿真该单元的程序已结束，其中的机器也随之结束。请开始新的运行。"
     }
     PageGone {
-        "This page has lost the connection to its server. The state of the cell is unknown here: look at the machines.",
+        "This page has lost the connection to its server and cannot show the state of the cell. Go to the machines and check their state.",
         "Diese Seite hat ihren Server verloren. Was die Zelle tut, ist hier nicht bekannt: bitte nachsehen.",
         "页面与服务器断开。此处无法得知单元状态：请到现场查看。"
     }
@@ -109,7 +109,7 @@ texts! {
     TimeLeft { "left", "verbleiben", "剩余" }
     PreliminaryPoints { "preliminary", "vorläufig", "初步" }
     PreliminaryMeans {
-        "relative to the planned position of the part; not registered, not judged",
+        "deviations relative to the planned position of the part, before the registration and before the judgement",
         "gegen die Lage des Teils im Plan; nicht eingepasst, nicht beurteilt",
         "相对于计划中的工件位置；未配准，未判定"
     }
@@ -142,12 +142,12 @@ texts! {
     Points { "Points", "Punkte", "测点" }
     Histogram { "Distribution", "Verteilung", "分布" }
     NoRelief {
-        "This browser cannot draw the relief: the map is shown instead.",
+        "This browser cannot draw the relief (3D view). The page shows the error map instead.",
         "Dieser Browser zeichnet kein Relief: die Karte wird gezeigt.",
         "此浏览器无法绘制立体图：显示误差图。"
     }
     MapHelp {
-        "Error of the part along the normal, in micrometres. Arrow keys move the mark, or turn the relief.",
+        "Error of the part along the normal, in micrometres. In the map, the arrow keys move the mark. In the relief, the arrow keys turn the view.",
         "Fehler des Teils längs der Normalen, in Mikrometern. Pfeiltasten bewegen die Marke oder drehen das Relief.",
         "零件沿法向的误差，单位微米。方向键移动标记或旋转立体图。"
     }
@@ -167,7 +167,7 @@ texts! {
     FirstThing { "RESUME does this first:", "FORTSETZEN tut zuerst dies:", "“继续”首先执行：" }
     TakeControl { "TAKE CONTROL", "BEDIENUNG ÜBERNEHMEN", "接管操作" }
     ControlElsewhere {
-        "Another screen has control. HOLD, END THE RUN and ABORT work here too.",
+        "Another screen has control of the cell. The buttons HOLD, END THE RUN and ABORT work on this screen too.",
         "Ein anderer Bildschirm bedient. Halten, Beenden und Abbrechen gehen hier trotzdem.",
         "另一屏幕正在操作。此处仍可保持、结束和中止。"
     }
@@ -179,12 +179,12 @@ texts! {
     // Next actions.
     Nothing { "No action needed.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
     Load {
-        "Load the part and clamp it. Check that wheel and probe are clear of it. Then press THE PART IS LOADED.",
+        "Load the part and clamp it. Check that the wheel and the probe are clear of the part. Then press THE PART IS LOADED.",
         "Teil laden und spannen. Prüfen, dass Scheibe und Taster frei sind. Dann TEIL IST GELADEN drücken.",
         "装上零件并夹紧。确认砂轮和测头已离开零件。然后按“零件已装好”。"
     }
     SeeClear {
-        "Check that this machine is clear of the part, and confirm it:",
+        "Check that this machine is clear of the part. Then press the button below. The machine:",
         "Prüfen, dass diese Maschine frei vom Teil ist, und bestätigen:",
         "确认此机器已离开零件："
     }
@@ -204,7 +204,7 @@ texts! {
         "按“继续”，或“结束运行”。"
     }
     SeeStands {
-        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine does not know this state, write below what you saw, and confirm:",
+        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine cannot report this state, write below what you saw at the machine, and press ITS JOB IS OVER. The machine:",
         "Prüfen, ob diese Maschine steht. Dann FORTSETZEN drücken: sie wird nach ihrem Auftrag gefragt; kann sie es nicht sagen, unten angeben:",
         "查看此机器是否静止。然后按“继续”，系统会询问其作业结果；若机器无法应答，请在下方说明："
     }
@@ -218,7 +218,7 @@ texts! {
         "Not-Halt jeder Maschine betätigen, die ihren Stillstand nicht bestätigt hat.",
         "对未确认静止的机器使用急停。"
     }
-    ReadReport { "The run is over: read its report.", "Der Lauf ist zu Ende: Bericht lesen.", "运行已结束：请看报告。" }
+    ReadReport { "The run is over. Read the report of this run.", "Der Lauf ist zu Ende: Bericht lesen.", "运行已结束：请看报告。" }
     // States, by PackML's names.
     Idle { "IDLE", "BEREIT", "待机" }
     Starting { "STARTING", "STARTET", "启动中" }
@@ -265,7 +265,7 @@ texts! {
         "重新读取机器结果"
     }
     GivesBack {
-        "the cell tells the machine that it can delete its result",
+        "the cell permits the machine to delete the result of the job",
         "der Maschine wird gesagt, dass sie ihr Ergebnis vergessen darf",
         "告知机器可以清除结果"
     }
@@ -292,7 +292,7 @@ texts! {
         "选择两次运行并排比较。"
     }
     KeyNeeded {
-        "This page needs its key. The key is in the address that `regrind serve` printed.",
+        "This page needs its key. Open the full address that `regrind serve` printed: this address contains the key.",
         "Diese Seite braucht ihren Schlüssel. Er steht in der Adresse, die `regrind serve` ausgegeben hat.",
         "此页面需要密钥，见 `regrind serve` 输出的地址。"
     }
@@ -307,12 +307,12 @@ texts! {
         "用户名与密码不符。请重新输入。"
     }
     TooManyTries {
-        "Too many attempts from this address. Wait a minute, then sign in.",
+        "Too many attempts from this address. Wait one minute, then sign in again.",
         "Zu viele Versuche von hier. Eine Minute warten, dann anmelden.",
         "此处尝试次数过多。请等待一分钟再登录。"
     }
     WhoMakesUsers {
-        "The administrator of the computer of the cell adds users: regrind users add",
+        "To add a user, the administrator of the cell computer runs: regrind users add",
         "Wer den Rechner der Zelle betreut, legt Benutzer an: regrind users add",
         "由单元计算机的管理者添加用户：regrind users add"
     }

@@ -18,8 +18,8 @@ use thiserror::Error;
 
 /// First lines of the file, which explain it to a reader.
 const FIRST_LINES: &str = "\
-# People who can sign in to the page of this cell. `regrind users` writes this file. It contains no passwords, only a hash of each.
-# Keep the file secret: with a hash, a computer can try many passwords.
+# People who can sign in to the page of this cell. `regrind users` writes this file. The file contains a hash of each password, not the password.
+# Keep the file secret: a person who has a hash can find a weak password by trying many passwords.
 ";
 /// Maximum length of the name of a person, in characters.
 const LONGEST_NAME: usize = 64;
@@ -73,7 +73,7 @@ impl FromStr for PageRole {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|role| role.name() == text);
-        found.ok_or_else(|| "the roles are viewer, quality, operator and engineer".to_owned())
+        found.ok_or_else(|| "this role does not exist; the roles are viewer, quality, operator and engineer".to_owned())
     }
 }
 
@@ -96,19 +96,19 @@ impl Display for Person {
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum UsersError {
-    #[error("{}: the list of users cannot be read: {source}; make one: regrind users add NAME --role operator", .path.display())]
+    #[error("{}: the list of users cannot be read: {source}; to create a list: regrind users add NAME --role operator", .path.display())]
     Unreadable { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer can read this list of users ({}); only its owner must be able to read it: {}", .path.display(), .open.how, .open.remedy)]
+    #[error("{}: other users of this computer can read this list of users ({}); give access only to the owner of the file: {}", .path.display(), .open.how, .open.remedy)]
     Open { path: PathBuf, open: OpenToOthers },
-    #[error("{}: not a list of users: {what}", .path.display())]
+    #[error("{}: this file is not a list of users: {what}", .path.display())]
     Broken { path: PathBuf, what: String },
     #[error(
-        "the name of a user must have 1 to {LONGEST_NAME} characters, without control characters and without characters that change the direction of the text"
+        "the name of a user must have 1 to {LONGEST_NAME} characters; control characters and characters that change the direction of the text are not allowed"
     )]
     Name,
-    #[error("the password has {found} bytes; choose one of {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} bytes")]
+    #[error("the password has {found} bytes; choose a password of {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} bytes")]
     Password { found: usize },
-    #[error("the password cannot be hashed: {0}")]
+    #[error("the hash of the password cannot be computed: {0}")]
     Hash(String),
 }
 
@@ -145,7 +145,7 @@ impl Users {
         let found = std::fs::metadata(path).map_err(failed)?;
         let broken = |what: String| UsersError::Broken { path: path.to_owned(), what };
         if !found.is_file() || found.len() > MAX_BYTES {
-            return Err(broken("it is not a file, or it is larger than 1 MiB".into()));
+            return Err(broken("the path is not a file, or the file is larger than 1 MiB".into()));
         }
         if let Some(open) = readable_by_others(path).map_err(failed)? {
             return Err(UsersError::Open { path: path.to_owned(), open });
@@ -161,10 +161,12 @@ impl Users {
                 return wrong("the name is not allowed");
             }
             if users[..at].iter().any(|other| other.name == user.name) {
-                return wrong("the name is there twice");
+                return wrong("another user in the list has the same name");
             }
             if PasswordHash::new(&user.proof).is_err() {
-                return wrong("its `proof` is not a password hash; set the password again: regrind users add");
+                return wrong(
+                    "the `proof` of this user is not a password hash; set the password again: regrind users add",
+                );
             }
         }
         Ok(Self { users })

@@ -266,7 +266,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
         @if let Some(PreviewStatistics { touched, rms_um, least_um, most_um }) = live.so_far {
             p .quiet title=(Text::PreliminaryMeans.to(language)) {
                 (Text::PreliminaryPoints.to(language)) ": " (touched) " " (Text::Touched.to(language))
-                (format!(", RMS {rms_um:.2} µm, {least_um:+.2} … {most_um:+.2} µm"))
+                (format!(", RMS {rms_um:.2} µm, min {least_um:+.2} µm, max {most_um:+.2} µm"))
             }
         }
     }

@@ -17,11 +17,13 @@ pub enum PlantError {
     #[error(transparent)]
     Trust(#[from] TrustError),
     /// The database cannot be reached now; a retry can succeed.
-    #[error("the database at {place} cannot be reached: {what}; check that it runs and that the network is up")]
+    #[error(
+        "the database at {place} cannot be reached: {what}; check that the database runs and that the network connection works"
+    )]
     Unreachable { place: String, what: String },
     #[error("the database refused {what}: {why}{hint}")]
     Refused { what: &'static str, why: String, hint: String },
-    #[error("the database has layout {found}, and this program requires layout {known}; {remedy}")]
+    #[error("the tables of the database have layout {found}, but this program requires layout {known}; {remedy}")]
     Layout { found: i32, known: i32, remedy: &'static str },
     #[error(
         "the layout of the database was changed: migration {version} has another text; restore the database from its \
@@ -30,10 +32,10 @@ pub enum PlantError {
     ForeignLayout { version: i32 },
     /// The records in the plant and those at the cell disagree.
     #[error(
-        "{run}: {what}; change neither the journal nor the copy at the plant, and compare them: regrind audit verify --plant"
+        "{run}: {what}; do not change the journal of the run or its copy in the database of the plant; to compare both: regrind audit verify --plant"
     )]
     Differs { run: String, what: String },
-    #[error("the plant has no run {name:?} of {cell:?}; `regrind plant runs` lists them")]
+    #[error("the database of the plant has no run {name:?} of the cell {cell:?}; to list the runs: regrind plant runs")]
     NoRun { cell: String, name: String },
     #[error("{0}")]
     Recipe(String),

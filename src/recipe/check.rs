@@ -50,7 +50,7 @@ fn resolve_path(folder: &Path, path: &str) -> PathBuf {
 }
 
 fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Option<NominalSource> {
-    let from_formula = "keep `file`, or the tables [nominal.surface] and [nominal.aperture]";
+    let from_formula = "remove this table, or use only a formula: remove `nominal.file` and keep [nominal.surface] and [nominal.aperture]";
     if !document.contains_key("nominal") {
         return None;
     }
@@ -62,7 +62,7 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             ("height_unit", written.height_unit.is_some()),
         ];
         for (key, _) in of_points.into_iter().filter(|(_, there)| *there) {
-            document.report(&format!("nominal.{key}"), "is only for a file of points", "", "remove it");
+            document.report(&format!("nominal.{key}"), "is only for a file of points", "", "remove this key");
         }
         return formula(written, document);
     };
@@ -72,7 +72,7 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             document.report(
                 &key,
                 "is given together with `nominal.file`",
-                "the nominal surface is either a file or a formula",
+                "the nominal surface comes from a file or from a formula, not from both",
                 from_formula,
             );
         }
@@ -158,7 +158,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
     let risk = written.measure.accepted_risk;
     if written.measure.mode == SelectionMode::Fixed {
         if risk.is_some() {
-            let remedy = "remove it, or write `mode = \"adaptive\"`";
+            let remedy = "remove `accepted_risk`, or write `mode = \"adaptive\"`";
             document.report(
                 "measure.accepted_risk",
                 "is only for mode adaptive",
@@ -172,8 +172,8 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             "is missing",
-            "mode adaptive touches only some targets, so it can accept a part that is out of tolerance",
-            "state the probability that you accept: `accepted_risk = 0.025`",
+            "mode adaptive touches only some targets, so the run can accept a part that is out of tolerance",
+            "state the probability of a wrong acceptance that you allow, for example `accepted_risk = 0.025`",
         );
     }
     if let (Some(risk), Some(probability)) = (risk, written.acceptance.probability)
@@ -182,11 +182,15 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             format!(
-                "is {risk}, and `acceptance.probability`, {probability}, leaves a risk of {:.3}",
+                "is {risk}, but `acceptance.probability` is {probability} and leaves a risk of {:.3}",
                 1.0 - probability
             ),
-            "the accepted risk must be at least the risk that the required probability leaves",
-            &format!("raise it to {:.3}, or the probability to {:.3}", 1.0 - probability, 1.0 - risk),
+            "the accepted risk must be at least 1 minus the required probability",
+            &format!(
+                "raise `accepted_risk` to {:.3}, or raise `acceptance.probability` to {:.3}",
+                1.0 - probability,
+                1.0 - risk
+            ),
         );
     }
     if written.measure.pattern == PatternKind::Free {
@@ -194,7 +198,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.mode",
             "is adaptive",
-            "it chooses targets from a pattern, and the pattern \"free\" has none",
+            "mode adaptive chooses the targets from a pattern, but the pattern \"free\" has no targets",
             remedy,
         );
     }
@@ -202,7 +206,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "acceptance.expanded_uncertainty",
             "is false",
-            "mode adaptive touches only some targets, so the uncertainty of the figures must count",
+            "mode adaptive touches only some targets, so the judgement must include the uncertainty of the figures (RMS, PV)",
             "write `expanded_uncertainty = true`, or `mode = \"fixed\"`",
         );
     }
@@ -210,7 +214,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.qualify",
             "is false",
-            "mode adaptive requires the noise of the probe, which is measured on the reference sphere",
+            "mode adaptive requires the noise of the probe, and `qualify` measures this noise on the reference sphere",
             "write `qualify = true`, or `mode = \"fixed\"`",
         );
     }
@@ -220,16 +224,21 @@ fn measure(written: &MeasurementSettings, document: &mut Document) {
     if written.safe_height_mm < written.approach_mm {
         document.report(
             "measure.safe_height_mm",
-            format!("is {} mm, less than `approach_mm`, {} mm", written.safe_height_mm, written.approach_mm),
-            "the probe must travel above the points it approaches from",
-            "raise it, or lower `approach_mm`",
+            format!("is {} mm, less than `approach_mm` ({} mm)", written.safe_height_mm, written.approach_mm),
+            "the safe height must be at least the approach distance",
+            "raise `safe_height_mm`, or lower `approach_mm`",
         );
     }
     if let Some([least, most]) = written.temperature_c
         && least >= most
     {
         let found = format!("is [{least}, {most}]");
-        document.report("measure.temperature_c", found, "the first must be less than the second", "swap them");
+        document.report(
+            "measure.temperature_c",
+            found,
+            "the first limit must be less than the second limit",
+            "swap them",
+        );
     }
 }
 
@@ -256,7 +265,7 @@ fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document
             &format!("measure.{key}"),
             "is not for this pattern",
             &allowed,
-            "remove it, or change `pattern`",
+            "remove this key, or change `pattern`",
         );
     }
     let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
@@ -289,7 +298,7 @@ fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document
         let given: Vec<&str> =
             keys.iter().filter(|(key, there)| *there && takes.contains(key)).map(|(key, _)| *key).collect();
         let found = if given.is_empty() {
-            "has no spacing, number or file of points".into()
+            "has no spacing of points, no number of points and no file of points".into()
         } else {
             format!("has {}", given.join(", "))
         };
@@ -303,7 +312,7 @@ fn registration(written: &RegistrationSettings, document: &mut Document) {
         document.report(
             "registration.lock",
             "locks directions while `start` is \"search\"",
-            "a locked direction keeps its value of the fixture pose, and a search does not start from this pose",
+            "a locked direction keeps the value of the fixture pose, but a search does not start from the fixture pose",
             "write `start = \"fixture\"`, or lock no direction",
         );
     }
@@ -321,18 +330,18 @@ fn acceptance(written: &Acceptance, document: &mut Document) {
         }
         (Some(pv), Some(rms)) if pv < rms => document.report(
             "acceptance.pv_um",
-            format!("is {} µm, less than `rms_um`, {} µm", pv.0, rms.0),
+            format!("is {} µm, less than `rms_um` ({} µm)", pv.0, rms.0),
             "PV is never less than RMS",
-            "raise it, or check whether the two are swapped",
+            "raise `pv_um`, or check whether `pv_um` and `rms_um` are swapped",
         ),
         _ => {}
     }
     if let Some(probability) = written.probability.filter(|_| !written.expanded_uncertainty) {
         document.report(
             "acceptance.probability",
-            format!("is {probability}, and `expanded_uncertainty` is false"),
-            "the probability requires the uncertainty of the figure",
-            "remove one of the two",
+            format!("is {probability}, but `expanded_uncertainty` is false"),
+            "the program computes the probability from the uncertainty of the figure",
+            "write `expanded_uncertainty = true`, or remove `probability`",
         );
     }
 }
@@ -343,9 +352,9 @@ fn compensation(written: &Compensation, document: &mut Document) {
         if um > budget {
             document.report(
                 &format!("compensation.{key}"),
-                format!("is {} µm, more than `removal_budget_um`, {} µm", um.0, budget.0),
-                "no pass may remove more than the budget",
-                "lower it, or raise the budget",
+                format!("is {} µm, more than `removal_budget_um` ({} µm)", um.0, budget.0),
+                "no pass can remove more than the removal budget",
+                "lower this value, or raise the budget (`removal_budget_um`)",
             );
         }
     }
@@ -353,17 +362,17 @@ fn compensation(written: &Compensation, document: &mut Document) {
     if cutoff < least {
         document.report(
             "compensation.cutoff_mm",
-            format!("is {cutoff} mm, less than two spacings of the map, {least} mm"),
-            "the cut-off wavelength must be at least two spacings of the map",
-            "raise it, or lower `compensation.spacing_mm`",
+            format!("is {cutoff} mm, less than twice the spacing of the map ({least} mm)"),
+            "the cut-off wavelength must be at least twice the spacing of the map",
+            "raise `cutoff_mm`, or lower `compensation.spacing_mm`",
         );
     }
     if let (Some(gain), Some(by)) = (written.gain, written.gain_by) {
         document.report(
             "compensation.gain",
-            format!("is {gain}, and `gain_by` is {by:?}"),
-            "`gain` fixes the share of the error that a correction removes, and `gain_by` is a rule that chooses it",
-            "remove one of the two",
+            format!("is {gain}, but `gain_by` is {by:?}"),
+            "`gain` fixes the share of the error that a correction removes, but `gain_by` is a rule that chooses this share",
+            "remove `gain` or `gain_by`",
         );
     }
 }
@@ -376,39 +385,39 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
     let Some(parameters) = written.compensation.parameters else { return };
     let tolerances = parameters.tolerances();
     if tolerances.iter().all(Option::is_none) && !document.has_problem(KEY) {
-        let remedy = "add `wheel_radius_um = 100.0`, the uncertainty of the wheel's radius, or remove the table";
+        let remedy = "add, for example, `wheel_radius_um = 100.0` (the uncertainty of the radius of the wheel), or remove the table";
         document.report(KEY, "has no parameter", "at least one parameter to compensate is required", remedy);
     }
     if written.cycle.begin_with == FirstStep::Measure {
         document.report(
             KEY,
             "is set in a recipe that begins with a measurement",
-            "parameters are estimated from the error after the first pass, and this run measures before its first pass",
+            "the estimate requires the error after the first pass, but this run measures before the first pass",
             "write `begin_with = \"grind\"`, or remove the table",
         );
     }
     if written.measure.side == ProbeSide::Below {
         document.report(
             KEY,
-            "is set in a recipe whose part is ground from below",
-            "the estimate requires a wheel that comes from +z",
-            "remove the table: the map then corrects these errors",
+            "is set in a recipe in which the wheel grinds the part from below",
+            "the estimate of the parameters requires a wheel that comes from above (from +z)",
+            "remove the table; the map then corrects the errors of these parameters",
         );
     }
     if written.grinding.tilt.is_some() {
         document.report(
             KEY,
             "is set together with grinding.tilt",
-            "the estimate requires a wheel that stays upright",
-            "remove one of the two: without the table the map corrects these errors",
+            "the estimate of the parameters requires a wheel without tilt",
+            "remove grinding.tilt, or remove this table; without this table, the map corrects the errors of these parameters",
         );
     }
     if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, WheelDimensions::Sphere { .. }) {
         document.report(
             "compensation.parameters.wheel_radius_um",
             "requires a spherical wheel",
-            "the effect of a radius error is known only for a sphere",
-            "remove it: the map then corrects this error",
+            "the program knows the effect of a radius error only for a spherical wheel",
+            "remove `wheel_radius_um`; the map then corrects the radius error",
         );
     }
     let registration = &written.registration;
@@ -424,15 +433,15 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         if !held[k] {
             document.report(
                 &format!("{KEY}.{key}"),
-                format!("is set while `registration.lock` does not lock {coordinate}"),
-                "in a free direction this error cannot be separated from a displacement of the part",
-                &format!("remove it, or lock \"{coordinate}\" if the fixture holds it"),
+                format!("is set, but `registration.lock` does not lock {coordinate}"),
+                "in a direction that is not locked, the program cannot separate this error from a displacement of the part",
+                &format!("remove this key, or lock \"{coordinate}\" if the fixture fixes the part in this direction"),
             );
         } else if registration.lock_uncertainty_um.is_none() {
             document.report(
                 &format!("{KEY}.{key}"),
                 "requires `registration.lock_uncertainty_um`",
-                "the uncertainty of the fixture limits the uncertainty of the estimate",
+                "the uncertainty of the estimate cannot be less than the uncertainty of the fixture",
                 "add `lock_uncertainty_um = 0.5` to [registration]",
             );
         }
@@ -451,17 +460,17 @@ fn grinding(written: &Grinding, document: &mut Document) {
     {
         document.report(
             "grinding.wheel.minor_radius_mm",
-            format!("is {minor_radius_mm} mm, more than `radius_mm`, {radius_mm} mm"),
-            "the curve of the rim must be inside the wheel",
-            "check whether the two are swapped",
+            format!("is {minor_radius_mm} mm, more than `radius_mm` ({radius_mm} mm)"),
+            "the curve radius of the rim must be at most the radius of the wheel",
+            "check whether `minor_radius_mm` and `radius_mm` are swapped",
         );
     }
     if written.one_way && written.pattern == TrackPattern::Spiral {
         document.report(
             "grinding.one_way",
             "is set for a spiral",
-            "only the tracks of a raster can alternate",
-            "remove it",
+            "only the tracks of a raster can alternate in direction or all have one direction",
+            "remove `one_way`",
         );
     }
     if let Some(tilt) = written.tilt
@@ -472,16 +481,16 @@ fn grinding(written: &Grinding, document: &mut Document) {
         document.report(
             "grinding.tilt.angle_deg",
             format!("is {}° for a spherical wheel that follows the surface", tilt.angle_deg),
-            "the wheel would touch at its pole, which has no cutting speed",
-            "tilt it by at least 2° to either side, usually 15° to 45°",
+            "the wheel would touch the part with the pole of the wheel, and the pole has no cutting speed",
+            "tilt the wheel by more than 2° to either side; 15° to 45° is usual",
         );
     }
     if let Some(track_mm) = written.track_mm.filter(|track_mm| *track_mm > wheel.radius_mm()) {
         document.report(
             "grinding.track_mm",
-            format!("is {track_mm} mm, more than the wheel's radius, {} mm", wheel.radius_mm()),
+            format!("is {track_mm} mm, more than the radius of the wheel ({} mm)", wheel.radius_mm()),
             "tracks must overlap",
-            "lower it",
+            "lower `track_mm`",
         );
     }
 }
@@ -494,17 +503,17 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
     {
         document.report(
             "registration.max_rms_um",
-            format!("is {} µm, less than `acceptance.rms_um`, {} µm", most.0, rms.0),
-            "the registration would reject a good part",
-            "raise it well above the RMS of the first cycle, or remove it",
+            format!("is {} µm, less than `acceptance.rms_um` ({} µm)", most.0, rms.0),
+            "the registration would reject a part that is in tolerance",
+            "raise `max_rms_um` well above the RMS of the first cycle, or remove `max_rms_um`",
         );
     }
     if written.compensation.learn && written.cycle.begin_with == FirstStep::Measure {
         document.report(
             "compensation.learn",
-            "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
-            "`learn` acts on a pass before the first measurement, and this recipe has no such pass",
-            "remove one of the two",
+            "is true, but `cycle.begin_with` is \"measure\"".to_owned(),
+            "`learn` changes only a pass before the first measurement, but this recipe has no such pass",
+            "remove `learn`, or write `begin_with = \"grind\"`",
         );
     }
     let (Micrometres(allowance), Micrometres(depth)) =
@@ -513,9 +522,9 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
     if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(
             "grinding.allowance_um",
-            format!("is {allowance} µm, which {cycles} cycles of {depth} µm cannot remove"),
-            "the last pass must reach the nominal surface",
-            "lower it, or raise `cycle.max_cycles` or `compensation.depth_of_cut_um`",
+            format!("is {allowance} µm, too much for {cycles} cycles with a depth of cut of {depth} µm"),
+            "the first pass grinds to the allowance, and the last pass must reach the nominal surface",
+            "lower `allowance_um`, or raise `cycle.max_cycles` or `compensation.depth_of_cut_um`",
         );
     }
 }
@@ -548,7 +557,7 @@ fn check_against_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Do
             "measure.edge_margin_mm",
             format!("is {} mm on a part of {:.4} x {:.4} mm", measure.edge_margin_mm, size_mm[0], size_mm[1]),
             "no area would remain to measure",
-            "lower it",
+            "lower `edge_margin_mm`",
         );
     } else if let Some(spacing) = measure.spacing_mm {
         check_spacing(spacing, left_mm, document);
@@ -563,7 +572,12 @@ fn check_against_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Do
         let limit_mm = share * smaller_mm;
         if length_mm > limit_mm {
             let found = format!("is {length_mm} mm on a part of {:.4} x {:.4} mm", size_mm[0], size_mm[1]);
-            document.report(key, found, &format!("it must be at most {limit_mm:.4} mm here"), "lower it");
+            document.report(
+                key,
+                found,
+                &format!("on this part, the limit of this key is {limit_mm:.4} mm"),
+                "lower the value",
+            );
         }
     }
     let cutoff_mm = written.compensation.cutoff_mm;
@@ -577,12 +591,12 @@ fn check_against_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Do
 
 fn check_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) {
     let points = (left_mm[0] / spacing_mm + 1.0) * (left_mm[1] / spacing_mm + 1.0);
-    let found = format!("is {spacing_mm} mm on {:.4} x {:.4} mm", left_mm[0], left_mm[1]);
+    let found = format!("is {spacing_mm} mm on a measured area of {:.4} x {:.4} mm", left_mm[0], left_mm[1]);
     if points > MAX_POINTS {
         let allowed = format!("this gives {points:.1e} points, limit {MAX_POINTS:.0e}");
         document.report("measure.spacing_mm", found, &allowed, "choose a coarser spacing");
     } else if spacing_mm > left_mm[0].min(left_mm[1]) {
-        let allowed = "it must be at most the smaller side";
+        let allowed = "the spacing must be at most the smaller side of this area";
         document.report("measure.spacing_mm", found, allowed, "choose a finer spacing");
     }
 }
@@ -591,9 +605,9 @@ fn check_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
     if cutoff_mm < 2.0 * apart_mm {
         document.report(
             "compensation.cutoff_mm",
-            format!("is {cutoff_mm} mm, with measured points {apart_mm:.4} mm apart"),
-            &format!("the cut-off wavelength must be at least two point spacings, {:.4} mm", 2.0 * apart_mm),
-            "raise it, or measure more points",
+            format!("is {cutoff_mm} mm, but the distance between measured points is {apart_mm:.4} mm"),
+            &format!("the cut-off wavelength must be at least twice this distance, {:.4} mm", 2.0 * apart_mm),
+            "raise `cutoff_mm`, or measure more points",
         );
     }
 }
@@ -623,11 +637,11 @@ fn check_against_curvature(written: &RecipeFile, surface: &DefinedSurface, docum
             document.report(
                 key,
                 format!(
-                    "is {ball_mm} mm; the surface is concave with a radius of {radius_mm:.4} mm at ({:.3}, {:.3}) mm",
+                    "is {ball_mm} mm, but the surface has a concave radius of {radius_mm:.4} mm at x, y = ({:.3}, {:.3}) mm",
                     place[0], place[1]
                 ),
-                "the radius must be less than the concave radius",
-                "choose a smaller one, or check the formula",
+                "the radius of the probe or wheel must be less than the concave radius of the surface",
+                "choose a smaller radius, or check the formula of the surface",
             );
         }
     }

@@ -24,7 +24,10 @@ pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> Str
     let wheel = story.wheel_radius_mm.map(|mm| format!("radius {mm:.4} mm, as the grinder reported for its last pass"));
     let radius = registration.and_then(|found| found["probe_radius_mm"].as_f64()).filter(|mm| *mm > 0.0);
     let off = story.radius_error_mm.map(|(cycle, mm)| {
-        format!("; on the reference sphere in cycle {cycle} off by {:.2} \u{b5}m from what the recipe states", 1e3 * mm)
+        format!(
+            "; the radius measured on the reference sphere in cycle {cycle} differs by {:.2} \u{b5}m from the recipe",
+            1e3 * mm
+        )
     });
     let probe = radius.map(|mm| format!("radius {mm:.5} mm{}", off.unwrap_or_default()));
     let rows = [
@@ -78,13 +81,13 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
         let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("locked".to_owned(), um)).join(", ");
         let turn = ["rx_rad", "ry_rad", "rz_rad"]
             .map(|key| sigma(key).map_or("locked".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
-        format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))
+        format!("shift {shift} along x, y, z; rotation {} about x, y, z", turn.join(", "))
     };
     let frame = model.map_or("not on record".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
     let converged = if found["converged"] == true { "converged" } else { "not converged" };
     let points = |key: &str| number(key).map_or("-".to_owned(), |n| format!("{n:.0}"));
     let verdict = format!(
-        "{converged} in {} steps; {} of {} points used, {} outliers, {} off the part; {:.1} % of the surface covered; rms {}",
+        "{converged} in {} steps; {} of {} points used, {} outliers, {} points off the part; {:.1} % of the surface covered; RMS {}",
         points("iterations"),
         points("used"),
         points("points"),
@@ -99,14 +102,14 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     let mut remarks = words("weak_directions", |weak| weak["words"].as_str());
     remarks.extend(words("warnings", Value::as_str));
     if count("alternatives") > 0 {
-        remarks.push(format!("{} other poses fit about as well", count("alternatives")));
+        remarks.push(format!("{} other poses of the part fit the points about equally well", count("alternatives")));
     }
     let remarks = if remarks.is_empty() { "none".to_owned() } else { remarks.join("; ") };
     let mut html = format!("<h2>Registration, cycle {cycle}</h2>\n<table id=\"registration\">\n");
     for (key, value) in [
         ("Fit", verdict),
         ("Repeatability of the pose (standard uncertainty)", place(&found["standard_uncertainty"])),
-        ("Standard uncertainty of the nominal frame, with the uncertainty of the form", frame),
+        ("Standard uncertainty of the nominal coordinate frame, including the uncertainty of the form", frame),
         ("Remarks", remarks),
     ] {
         let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));

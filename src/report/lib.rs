@@ -63,7 +63,7 @@ pub use words::{ending_words, in_air, words};
 #[non_exhaustive]
 pub enum ReportError {
     /// Fewer points than the figure needs.
-    #[error("{figure}: there is nothing to draw; at least {least} points are needed, {found} were given")]
+    #[error("{figure}: the figure cannot be drawn; at least {least} points are required, but the data has {found}")]
     TooFewPoints { figure: String, found: usize, least: usize },
     /// Number that is not finite, so that no figure can show it.
     #[error("{figure}: point {} has the {what} {value}; a figure shows finite numbers only", index + 1)]
@@ -78,14 +78,16 @@ pub enum ReportError {
     #[error("{figure}: the limit of the colour bar is {limit}; give a finite number above 0")]
     ColourLimit { figure: String, limit: f64 },
     /// Triangle with a corner index that refers to no point.
-    #[error("{figure}: a triangle has the corner {corner}, and there are {points} points, counted from 0")]
+    #[error(
+        "{figure}: a triangle uses point number {corner}, but the figure has only {points} points (the first point has number 0)"
+    )]
     Corner { figure: String, corner: u32, points: usize },
     /// Failure to encode the pixels as PNG.
-    #[error("{figure}: the picture could not be encoded: {source}")]
+    #[error("{figure}: the figure could not be written as a PNG picture: {source}")]
     Encoding { figure: String, source: png::EncodingError },
     /// Run without results.
     #[error(
-        "run {run}: nothing was measured that could be registered, so there are no results to write; `regrind report` shows the reason"
+        "run {run}: no measurement of this run could be registered, so the run has no results to write; `regrind report` shows the reason"
     )]
     NothingMeasured { run: String },
     /// Record of the run that cannot be read or does not pass verification.

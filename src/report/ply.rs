@@ -82,9 +82,16 @@ fn header(title: &str, points: usize, triangles: usize, tones: &Tones, remarks: 
     comment(title);
     comment("units: mm");
     remarks.iter().for_each(|remark| comment(remark));
-    comment(&format!("colours: blue {} um to red {} um", 1e3 * tones.range[0], 1e3 * tones.range[1]));
+    comment(&format!(
+        "colours of the deviation: from {} um (blue) to {} um (red)",
+        1e3 * tones.range[0],
+        1e3 * tones.range[1]
+    ));
     if let Some(band) = tones.tolerance {
-        comment(&format!("in tolerance: {} um on either side of zero, a tint", 1e3 * band));
+        comment(&format!(
+            "pale colours: deviations of at most {} um to either side of zero, which are in tolerance",
+            1e3 * band
+        ));
     }
     text.push_str(&format!(
         "element vertex {points}\nproperty double x\nproperty double y\nproperty double z\nproperty uchar red\nproperty uchar \

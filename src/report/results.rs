@@ -212,12 +212,12 @@ impl Measured {
 fn decision_rule(tolerance: &Tolerance) -> String {
     if tolerance.with_uncertainty {
         format!(
-            "ISO 14253-1, JCGM 106: a figure is within its limit if it does not exceed the limit with a \
-             probability of at least {:.1} %",
+            "ISO 14253-1, JCGM 106: a figure is within its limit if the probability that the figure does not \
+             exceed the limit is at least {:.1} %",
             1e2 * tolerance.probability
         )
     } else {
-        "the figure is compared with its limit without its uncertainty".to_owned()
+        "the figure is compared with its limit; the uncertainty of the figure is ignored".to_owned()
     }
 }
 
@@ -272,15 +272,15 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
 const PV: &str = "largest minus smallest deviation from the nominal surface along its normal, all points";
 const RMS: &str = "root mean square of the deviations from the nominal surface along its normal";
 
-const FORM_PV: &str = "largest minus smallest deviation of the form from the nominal surface along its normal, after its best fit, without the \
-                       noise of the probe";
-const FORM_PV_998: &str = "largest minus smallest deviation of the form from the nominal surface along its normal, after its best fit, without \
-                         the noise of the probe, over the aperture: the measured points and the positions between them, without the outermost \
-                         0.1 % of the positions at either end";
-const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, without \
-                        the noise of the probe";
-const PV_998: &str =
-    "largest minus smallest deviation along the normal of the surface, without the outermost 0.1 % at either end";
+const FORM_PV: &str = "largest deviation minus smallest deviation of the form from the nominal surface, along the normal of the nominal \
+                       surface, after the best fit of the form, without the noise of the probe";
+const FORM_PV_998: &str = "largest deviation minus smallest deviation of the form from the nominal surface, along the normal of the nominal \
+                         surface, after the best fit of the form, without the noise of the probe; over the aperture (the measured points and the \
+                         positions between the points), without the positions with the lowest 0.1 % and the highest 0.1 % of the deviations";
+const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface, along the normal of the nominal surface, \
+                        after the best fit of the form, without the noise of the probe";
+const PV_998: &str = "largest deviation minus smallest deviation along the normal of the surface, without the lowest 0.1 % \
+                      and the highest 0.1 % of the deviations";
 
 fn what_of(name: &str, of_form: bool) -> &'static str {
     match (name, of_form) {
@@ -295,19 +295,19 @@ fn what_of(name: &str, of_form: bool) -> &'static str {
 
 /// Lengths of ISO 10110-5, with their names in `figures.json`.
 const AREAS: [(&str, &str, &str); 6] = [
-    ("power", "ISO 10110-5 A", "peak to valley of the best sphere of the form"),
+    ("power", "ISO 10110-5 A", "peak to valley of the sphere that fits the form best"),
     ("irregularity", "ISO 10110-5 B", "peak to valley of the form without piston, tilt and power"),
     (
         "symmetric irregularity",
         "ISO 10110-5 C",
-        "peak to valley of the part of the irregularity that is symmetric about the middle",
+        "peak to valley of the part of the irregularity that is rotationally symmetric about the centre",
     ),
     ("RMSt", "ISO 10110-5 RMSt", "root mean square of the form without piston and tilt"),
     ("RMSi", "ISO 10110-5 RMSi", "root mean square of the form without piston, tilt and power"),
     (
         "RMSa",
         "ISO 10110-5 RMSa",
-        "root mean square of the part of the irregularity that is not symmetric about the middle",
+        "root mean square of the part of the irregularity that is not rotationally symmetric about the centre",
     ),
 ];
 

@@ -123,11 +123,11 @@ fn broken_off_pass(story: &RunHistory) -> String {
     let far = match ground {
         Some([done, total]) if total > 0 => {
             format!(
-                "{:.0} % of its path was ground, as the grinder last reported",
+                "{:.0} % of the path was ground, according to the last report of the grinder",
                 100.0 * f64::from(done) / f64::from(total)
             )
         }
-        _ => "the ground share of its path is not known".to_owned(),
+        _ => "the share of the path that was ground is not known".to_owned(),
     };
     format!("<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part is unchanged.</p>\n")
 }
@@ -200,21 +200,24 @@ fn decision_rule(tolerance: &Tolerance) -> String {
     let rule = if tolerance.with_uncertainty {
         format!(
             "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only if each figure is within its limit with a \
-             probability of at least {:.1} %. It is out of tolerance only if a figure is beyond its limit with this probability. Otherwise \
-             the result is undecided.",
+             probability of at least {:.1} %. The part is out of tolerance only if at least one figure is \
+             beyond its limit with at least this probability. In all other cases, the result is undecided.",
             1e2 * tolerance.probability
         )
     } else {
-        "Decision rule: each figure is compared with its limit; its uncertainty is shown, but not used.".to_owned()
+        "Decision rule: each figure is compared with its limit. The uncertainty of the figure is shown, but the comparison \
+         does not use this uncertainty."
+            .to_owned()
     };
     format!(
-        "{rule} The figures are those of the form of the part after its best fit, without the noise of the probe. Their uncertainty includes \
-         the noise and the pose. If no form error is detectable, only an upper bound of a figure is known. U is half of the 95 % credible \
-         interval of the figure. PV is the largest minus the smallest deviation along the normal{}.",
+        "{rule} The figures describe the form of the part after the best fit of the form, without the noise of the probe. The \
+         uncertainty of each figure includes the noise of the probe and the uncertainty of the pose. If no form error is detectable, only an \
+         upper bound of a figure is known. U is half of the 95 % credible interval of the figure. PV is the largest deviation minus the \
+         smallest deviation along the normal of the surface{}.",
         match tolerance.pv_of {
             regrind_cell::PvPoints::All => ", of the measured points",
             regrind_cell::PvPoints::MostPoints =>
-                "; PV 99.8 % is that of the aperture: the measured points and the positions between them, without the outermost 0.1 % of the positions at either end",
+                "; PV 99.8 % is the PV over the aperture (the measured points and the positions between the points), without the positions with the lowest 0.1 % and the highest 0.1 % of the deviations",
         }
     )
 }
@@ -299,7 +302,9 @@ fn parameters(story: &RunHistory) -> String {
     let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
     let left: String = left
-        .map(|(number, mm)| format!("<p>Error left for the map after cycle {number}: {} µm RMS.</p>\n", um(mm)))
+        .map(|(number, mm)| {
+            format!("<p>Error that remains for the correction map after cycle {number}: {} µm RMS.</p>\n", um(mm))
+        })
         .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\

@@ -147,7 +147,7 @@ pub fn state_picture(rows: &[TransitionRow]) -> String {
         [20.0, CYCLE_TOP_PX],
         Anchor::Start,
         LARGE,
-        "Within Execute: the phases of a cycle and the steps of a job",
+        "Inside the state Execute: the phases of a cycle and the steps of a job",
     );
     let phases = ways(rows, |state| match state {
         State::Execute(phase) => Some(phase.to_string()),

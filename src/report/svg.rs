@@ -72,7 +72,7 @@ impl Svg {
     }
 
     fn put(&mut self, arguments: std::fmt::Arguments) {
-        self.text.write_fmt(arguments).expect("a string takes what it is given");
+        self.text.write_fmt(arguments).expect("writing to a string cannot fail");
     }
 
     pub(super) fn line(&mut self, [x1, y1]: [f64; 2], [x2, y2]: [f64; 2], colour: &str) {
@@ -91,7 +91,7 @@ impl Svg {
     pub(super) fn polyline(&mut self, points: &[[f64; 2]], colour: &str, dashes: &str) {
         let mut list = String::with_capacity(points.len() * 14);
         for [x, y] in points {
-            write!(list, "{x:.2},{y:.2} ").expect("a string takes what it is given");
+            write!(list, "{x:.2},{y:.2} ").expect("writing to a string cannot fail");
         }
         self.put(format_args!(
             "<polyline points=\"{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\" stroke-dasharray=\"{dashes}\"/>\n",

@@ -65,7 +65,11 @@ fn artefact_words(value: &Value) -> Option<String> {
 
 fn seal_words(value: &Value) -> Option<String> {
     let key = value["key"].as_str()?;
-    Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
+    Some(format!(
+        "the records up to record {} are sealed with key {}...",
+        value["records"],
+        key.get(..12).unwrap_or(key)
+    ))
 }
 
 /// Returns in one line a person's confirmation of the state of a machine: the machine, the confirmed state, and the
@@ -83,7 +87,7 @@ fn person_words(device: Device, value: &Value) -> Option<String> {
 
 fn step_words(device: Device, value: &Value) -> Option<String> {
     let (step, seen) = (value["recover"].as_str()?, value["seen"].as_str().unwrap_or("unknown"));
-    Some(format!("{device}: to be brought home by {step}, its state is {seen}"))
+    Some(format!("{device}: order {step} to recover the machine; state before the order: {seen}"))
 }
 
 /// Returns in words which machines are home. `home` holds true for a machine that is home: first the CMM, then the
@@ -144,7 +148,9 @@ pub fn ending_words(ending: &Ending) -> String {
         Ending::Stopped { reason, .. } => format!("STOPPED: {reason}"),
         Ending::Aborted { reason, confirmed: true, .. } => format!("ABORTED: {reason}"),
         Ending::Aborted { reason, confirmed: false, .. } => {
-            format!("ABORTED, and not every machine has confirmed that it is at rest: {reason}")
+            format!(
+                "ABORTED, but at least one machine has not confirmed its standstill: check the machines. Reason of the abort: {reason}"
+            )
         }
     }
 }
@@ -236,7 +242,7 @@ fn event_words(event: &Event) -> String {
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "correction up to {:.2} µm, depth {:.2} µm, {}, expected PV {:.2} µm{}",
+            "largest correction {:.2} µm, largest removal {:.2} µm, part without wheel contact: {}, expected PV after the pass {:.2} µm{}",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
             in_air(summary.air_share),
@@ -261,7 +267,7 @@ fn found_words(simulated: bool, found: &Occupation) -> String {
     let kind = if simulated { "a simulation" } else { "a real machine" };
     match found {
         Occupation::Idle => format!("{kind}, idle"),
-        Occupation::ToClear => format!("{kind}, aborted or in fault, must be cleared"),
+        Occupation::ToClear => format!("{kind}, aborted or in fault: this state must be cleared before a run"),
         Occupation::Busy(words) => format!("{kind}, busy: {words}"),
     }
 }
@@ -270,7 +276,9 @@ fn mismatch_words(why: &ConnectionRefusal) -> String {
     match why {
         ConnectionRefusal::Unreachable(words) => format!("unreachable: {words}"),
         ConnectionRefusal::WrongDevice(words) => format!("another device: {words}"),
-        ConnectionRefusal::WordOrder(words) => format!("word order differs from the cell file: {words}"),
+        ConnectionRefusal::WordOrder(words) => {
+            format!("the word order of the machine differs from the word order in the cell file: {words}")
+        }
         ConnectionRefusal::Inches => "the machine works in inches".to_owned(),
         ConnectionRefusal::Owned(words) => format!("owned by another client: {words}"),
         ConnectionRefusal::AtAnotherJob(words) => format!("busy with the job of another run: {words}"),
@@ -320,7 +328,7 @@ fn figures_words(figures: &Figures) -> String {
             format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm)
         };
         let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
-        let _ = write!(line, "; form without the noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
+        let _ = write!(line, "; form without the probe noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }
     for words in figures.weak_directions.iter().chain(&figures.warnings) {
         let _ = write!(line, "; {words}");
@@ -335,7 +343,7 @@ fn figures_words(figures: &Figures) -> String {
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::RecordedParameter::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
-    told.chain(left.map(|mm| format!("left for the map: {:.2} µm RMS", 1e3 * mm))).collect()
+    told.chain(left.map(|mm| format!("error that remains for the correction map: {:.2} µm RMS", 1e3 * mm))).collect()
 }
 
 #[cfg(test)]

@@ -24,15 +24,15 @@ const MAX_BYTES: u64 = 4096;
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TrustError {
     #[error(
-        "{}: the password cannot be read: {source}; name its file with `password_file`; for a database, `regrind plant enrol` creates the file", .path.display()
+        "{}: the password cannot be read: {source}; enter the path of the password file in the key `password_file`; for a database, the command `regrind plant enrol` creates this file", .path.display()
     )]
     Password { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer can read the password ({}); only its owner must be able to read it: {}", .path.display(), .open.how, .open.remedy)]
+    #[error("{}: other users of this computer can read the password ({}); allow only the owner to read the password file: {}", .path.display(), .open.how, .open.remedy)]
     PasswordIsOpen { path: PathBuf, open: OpenToOthers },
-    #[error("{}: no certificates in PEM can be read from it: {what}; give the certificates of the issuer of the server in PEM", .path.display())]
+    #[error("{}: no certificates in PEM format can be read from this file: {what}; the file must contain the certificates of the issuer of the server certificate in PEM format", .path.display())]
     Certificates { path: PathBuf, what: String },
     #[error(
-        "{host} is another computer, and no certificates to authenticate it are given; name their file with `certificates` of {table}"
+        "{host} is another computer, but no certificates to authenticate the other computer are given; enter the path of the certificate file in the key `certificates` of {table}"
     )]
     Unproven { host: String, table: &'static str },
 }
@@ -86,7 +86,7 @@ fn certified(path: &Path) -> Result<ClientConfig, String> {
         signers.add(certificate.map_err(|error| error.to_string())?).map_err(|error| error.to_string())?;
     }
     if signers.is_empty() {
-        return Err("there is none in it".into());
+        return Err("the file contains no certificate".into());
     }
     let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()

@@ -289,7 +289,7 @@ fn result_of_other_part_or_cycle_ignored() {
     let shop = Shop::new();
     shop.put("SN_7_c2.csv", &three());
     let mut bench = Bench::new(shop.cmm());
-    bench.refused("SN_7_c2.csv was there before the plan was handed over; ignored");
+    bench.refused("SN_7_c2.csv was in the folder before the plan was handed over; the file was ignored");
     for (text, expected) in [
         (format!("# part: SN 8\n{}", three()), "is of part SN 8, not SN 7; ignored"),
         (format!("# cycle: 1\n{}", three()), "is of cycle 1, not 2; ignored"),
@@ -301,7 +301,7 @@ fn result_of_other_part_or_cycle_ignored() {
     }
     fs::remove_file(shop.inbox.join("SN_7_c2.csv")).unwrap();
     shop.put("notes.txt", &three());
-    bench.refused("notes.txt does not state that it is of this job, and its name does not match SN_7_c2.*");
+    bench.refused("notes.txt does not name this job or its plan, and the file name does not match SN_7_c2.*");
     // A file that identifies its part and cycle can have any name.
     shop.put("export 0815.txt", &format!("# part: SN 7\n# cycle: 2\n{}", three()));
     assert!(bench.settled().answer.is_some());
@@ -345,7 +345,7 @@ fn two_matching_files_refused() {
     let mut bench = Bench::new(shop.cmm());
     shop.put("SN_7_c2.csv", &three());
     shop.put("SN_7_c2.txt", &three());
-    bench.refused("2 files match `SN_7_c2.*`: SN_7_c2.csv, SN_7_c2.txt; leave only the right one there");
+    bench.refused("2 files match `SN_7_c2.*`: SN_7_c2.csv, SN_7_c2.txt; leave only the requested file in this folder");
     fs::remove_file(shop.inbox.join("SN_7_c2.txt")).unwrap();
     assert!(bench.settled().answer.is_some());
 }
@@ -393,7 +393,7 @@ fn hand_over_once_per_job_and_cycle() {
     other.publish(next, 2, &order, &Permit::new()).unwrap();
     let mut bench = Bench { folders: other, job: next, now_s: 0 };
     shop.put("SN_7_c3.csv", &three());
-    bench.refused("the same bytes were already the result of job 3 cycle 2");
+    bench.refused("a file with exactly this content was already the result of job 3 cycle 2");
 }
 
 #[test]
@@ -453,15 +453,16 @@ fn stations_merge_by_reference_points() {
     bench.refused("waiting for the first station");
     shop.put("ref_1.yaml", &references([0, 1, 2, 3], 1));
     shop.put("ref_9.yaml", &references([0, 1, 2, 3], 9));
-    bench.refused("2 points of 1 stations; at least 4 are required; waiting for further stations");
+    bench.refused("2 points from 1 stations; at least 4 points are required; waiting for further stations");
     shop.put("P_2.txt", &points(2));
     shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
-    bench.refused("station 2 (ref_2.yaml): reference point right is off by");
+    bench.refused("station 2 (ref_2.yaml): reference point right is");
     assert_says(&bench.poll(), &["right and upper are probably swapped"]);
     shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
     let look = bench.settled();
-    assert_says(&look, &["ignored, because they belong to no station: ref_9.yaml"]);
-    assert_says(&look, &["station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"]);
+    assert_says(&look, &["these files were ignored, because they belong to no station: ref_9.yaml"]);
+    let residuals = "the residuals of the reference points are 0.000 mm rms (each point: left 0.000, right 0.000";
+    assert_says(&look, &[&format!("station 1 (ref_1.yaml): {residuals}")]);
     let found = look.answer.unwrap();
     for (k, expected) in [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].iter().cycle().take(4).enumerate() {
         let at = found.points[k].position_mm;
@@ -489,14 +490,14 @@ fn pass_confirmed_by_map_identity() {
     grinder.publish(job, 4, &GrindOrder { map: map(), pass: pass(), map_identity }, &Permit::new()).unwrap();
     let folder = shop.outbox.join("SN_7_j3_c2");
     let csv = fs::read_to_string(folder.join("correction.csv")).unwrap();
-    assert!(csv.contains("positive leaves material") && csv.ends_with("-1,7,0\n-0.5,7,0.003\n0,7,0.25\n"), "{csv}");
+    assert!(csv.contains("positive value leaves") && csv.ends_with("-1,7,0\n-0.5,7,0.003\n0,7,0.25\n"), "{csv}");
     let mut now = 0;
     let mut settled = |grinder: &mut GrinderFolders| {
         now += 10;
         grinder.poll(Duration::from_secs(now), job).unwrap();
         grinder.poll(Duration::from_secs(now + 2), job).unwrap()
     };
-    assert_says(&settled(&mut grinder), &["done.json was there before", "waiting for the confirmation of the start"]);
+    assert_says(&settled(&mut grinder), &["done.json was in the inbox", "waiting for the confirmation of the start"]);
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
     assert!(!look.start_confirmed);

@@ -171,11 +171,11 @@ fn with_fault(fault: &Fault) -> Vec<u8> {
 async fn damaged_hit_line_is_touched_again() {
     // Fault, number of the four targets that are touched anyway, and the words of the message.
     for (fault, touched, why) in [
-        (Fault::Lost(4), 3, "not a number with 3 digits"),
+        (Fault::Lost(4), 3, "must be a number with 3 digits"),
         (Fault::Lost(0), 3, "50.000 mm from the nearest target, 7"),
-        (Fault::Garbled(1), 3, "REFUSED line 2 of the measurement, \"1u0.000,200.000,300.000\": its value 1"),
+        (Fault::Garbled(1), 3, "REFUSED line 2 of the measurement, \"1u0.000,200.000,300.000\": value 1 of the line"),
         (Fault::Merged, 2, "two lines are joined"),
-        (Fault::Stranger("SN 00412".into()), 4, "it has 1 values instead of 3"),
+        (Fault::Stranger("SN 00412".into()), 4, "the line has 1 values instead of 3"),
     ] {
         let mut bench = Bench::on_serial(4, |_| {}).await;
         let lines = with_fault(&fault);
@@ -289,7 +289,7 @@ async fn hold_stop_abort_need_operator() {
     assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;
     bench.until(1, MachineState::Holding).await;
-    assert!(bench.notes().contains("HOLD it at its own panel; 1 targets remain: 8"), "{}", bench.notes());
+    assert!(bench.notes().contains("HOLD the machine at its own panel; 1 targets remain: 8"), "{}", bench.notes());
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
     let mut bench = Bench::on_serial(2, |_| {}).await;

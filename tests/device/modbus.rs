@@ -505,7 +505,7 @@ async fn connect_refuses_wrong_device() {
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
     let said = e.to_string();
     for lacked in [
-        "a beat that names its owner",
+        "a heartbeat that names its owner",
         "refuse a late START",
         "an ABORT",
         "remains after CLEAR",

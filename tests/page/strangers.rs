@@ -68,8 +68,8 @@ fn foreign_orders_refused_and_recorded() {
     let told = remarks(&shown);
     for words in [
         "an order from the origin http://evil.example",
-        "an order without a token of the page, or with one that was used",
-        "a request that is not an order of the page",
+        "an order without a token of this page, or with a token that was already used",
+        "a request that is not one of the orders that this page can give",
     ] {
         assert!(told.iter().any(|remark| remark.contains(words)), "{words}: {told:?}");
     }
@@ -232,7 +232,7 @@ fn one_screen_has_control_any_can_hold() {
     assert!(one.order(&shown.id, &json!({ "order": "abort", "reason": "" })).1);
     assert_eq!(shown.run.end().0, 3);
     let told = remarks(&shown);
-    assert!(told.iter().any(|remark| remark.contains("control was taken over")), "{told:?}");
+    assert!(told.iter().any(|remark| remark.contains("another screen of the page took control")), "{told:?}");
     let reader = regrind::journal::Reader::open(&shown.folder).unwrap();
     let stations: Vec<String> = reader.records(1).map(|record| record.unwrap().station).collect();
     assert!(stations.iter().any(|station| station.starts_with("page, screen ")), "{stations:?}");

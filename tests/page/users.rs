@@ -175,8 +175,8 @@ fn wrong_passwords_are_throttled() {
     let (_, told) = shown.page.end();
     let came_in = told.lines().filter(|line| line.starts_with("page: engineer (engineer) signed in at the page, from"));
     assert_eq!(came_in.count(), 1, "{told}");
-    assert!(told.contains("page: refused a wrong name or password, operator, from"), "{told}");
-    assert!(told.contains("page: further refusals within this minute are counted"), "{told}");
+    assert!(told.contains("page: refused a sign-in with a wrong name or password, as operator from"), "{told}");
+    assert!(told.contains("page: too many requests were refused in this minute"), "{told}");
 }
 
 #[test]

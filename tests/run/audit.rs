@@ -193,7 +193,7 @@ fn audit_lists_unrecorded_files() {
     fs::write(folder.join("report.html"), html.replace("0.812", "0.212")).unwrap();
     let words = printed(home.path(), &["audit", "verify"], 0);
     assert!(words.contains("not on record: cycle-2/more.csv"), "{words}");
-    assert!(words.contains("report.html differs from the report of this record"), "{words}");
+    assert!(words.contains("report.html differs from the report that the record gives"), "{words}");
 }
 
 #[test]
@@ -383,7 +383,7 @@ fn signed_run_verifies_with_public_key() {
     assert_eq!((&told["sound"], &told["record"]), (&json!(false), &Value::Null));
     printed(home.path(), &["audit", "verify", "--key", &other, "--key", "kept"], 0);
     let shown = printed(home.path(), &["audit", "show", "--kind", "seal"], 0);
-    assert!(shown.contains("sealed up to record 1, key "), "{shown}");
+    assert!(shown.contains("the records up to record 1 are sealed with key "), "{shown}");
     for wrong in ["", "abc", "absent", "small.toml"] {
         let error = refused(home.path(), &["audit", "verify", "--key", wrong], 2);
         assert!(error.contains("regrind audit key"), "{wrong}: {error}");
@@ -438,7 +438,7 @@ fn audit_detects_unsigned_end() {
     database.execute_batch("DROP TRIGGER record_is_not_deleted; DELETE FROM record WHERE seq = 4").unwrap();
     drop(database);
     assert!(verify(&folder).unwrap().lacks_last_seal());
-    assert!(refused(home.path(), &["audit", "verify"], 1).contains("its end is not signed"));
+    assert!(refused(home.path(), &["audit", "verify"], 1).contains("the end of the record is not signed"));
     let (home, _) = recorded(false);
     assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no: the run had no key"));
 }
@@ -618,7 +618,7 @@ fn audit_detects_removed_or_renamed_run() {
         fs::rename(from, &to).unwrap();
         let found = flaws();
         assert!(
-            found.iter().any(|flaw| flaw.contains("it is the run before") || flaw.contains("it differs from")),
+            found.iter().any(|flaw| flaw.contains("this run comes before") || flaw.contains("this run differs from")),
             "{found:?}"
         );
         fs::rename(&to, from).unwrap();

@@ -248,7 +248,7 @@ fn simulate_refuses_file_at_device_link() {
     fs::write(home.path().join("grinder.tty"), "mine").unwrap();
     let (code, _, errors) = in_time(&["simulate", &recipe(home.path(), 1e4), "--cell", "cell.toml"], home.path());
     assert!(code == 2 || code == 3, "{code} {errors}");
-    assert!(errors.contains("grinder.tty") && errors.contains("remove what is there"), "{errors}");
+    assert!(errors.contains("grinder.tty") && errors.contains("remove the file at this path"), "{errors}");
     assert_eq!(fs::read_to_string(home.path().join("grinder.tty")).unwrap(), "mine");
     assert!(fs::symlink_metadata(home.path().join("cmm.tty")).is_err(), "what was linked before is taken back");
 }

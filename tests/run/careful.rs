@@ -106,7 +106,7 @@ async fn result_of_other_probe_radius_refused() {
     };
     let alarm = tokio::time::timeout(PATIENCE, told).await.expect("an alarm");
     assert_eq!(alarm.id, AlarmId::BrokenResult, "{alarm:?}");
-    assert!(alarm.what.contains("mm, that of the recipe is"), "{}", alarm.what);
+    assert!(alarm.what.contains("mm, but the recipe has"), "{}", alarm.what);
     until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();

@@ -56,13 +56,18 @@ fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
 fn wrong_devices_detected_before_write() {
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
     let order_words = &["word order", "othing was written", "word_order in the cell file"];
-    let older = &["version 1 of the register map", "lacks a beat that names its owner", "update it to version 2"];
+    let older = &["version 1 of the register map", "lacks a heartbeat that names its owner", "update it to version 2"];
     let newer = &["version 3 of the register map", "this program is older"];
     let cases: [(&str, Setup, AlarmId, &[&str]); 4] = [
         ("an older map", Setup { version: 1, ..usual() }, AlarmId::WrongDevice, older),
         ("a newer map", Setup { version: 3, ..usual() }, AlarmId::WrongDevice, newer),
         ("word order", other_order, AlarmId::WordOrder, order_words),
-        ("exchanged", exchanged, AlarmId::WrongDevice, &["A device other than", "address in the cell file"]),
+        (
+            "exchanged",
+            exchanged,
+            AlarmId::WrongDevice,
+            &["not the device in the cell file", "address in the cell file"],
+        ),
     ];
     for (what, setup, alarm, words) in cases {
         let ran = caught(what, setup, alarm, words, 0);

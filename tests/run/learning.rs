@@ -100,7 +100,7 @@ fn unusable_learned_error_refused() {
     let small = replaced(&shop.recipe, "max_correction_um = 60.0", "max_correction_um = 0.5");
     refused(&small, &["the recipe allows 0.50 µm", "raise max_correction_um", "learn = false"]);
     let measured_first = replaced(&shop.recipe, "max_cycles = 2", "max_cycles = 2\nbegin_with = \"measure\"");
-    refused(&measured_first, &["compensation.learn", "remove one of the two"]);
+    refused(&measured_first, &["compensation.learn", "remove `learn`"]);
     // A damaged file is reported, and blocks nothing.
     fs::write(first.join("learned.json"), "{").unwrap();
     let (_, said) = shop.ran(&shop.recipe);

@@ -204,7 +204,7 @@ fn manual_part_with_recorded_steps() {
                 assert!(code == 3 && told.contains("confirm first that the pass has begun"), "{told}");
                 let (code, told) = person.types("confirm started --map 0123456789abcdef");
                 assert!(code == 3 && told.contains("the confirmation names"), "{told}");
-                let ngc = file(": by ", " (map");
+                let ngc = file(": with ", " (map");
                 let correction = ngc.with_file_name("correction.csv");
                 let map = stated(&correction, "# map: sha256");
                 assert!(asked.contains(&format!("(map {})", &map[..8])), "{asked}");

@@ -312,7 +312,7 @@ fn doctor_finds_missing_exchange_folders() {
     assert_eq!(code, 1, "{said}");
     assert!(
         said.matches("OBSTACLE").count() == 2
-            && said.contains("does not exist; create it where the measuring machine finds it"),
+            && said.contains("does not exist; create this folder where the measuring machine can use it"),
         "{said}"
     );
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {

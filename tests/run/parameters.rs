@@ -66,7 +66,7 @@ fn wheel_radius_compensated_in_run() {
             let correction = read("cycle-1/correction.csv");
             assert!(correction.contains("# parameter: wheel radius: off by "), "{}", &correction[..900]);
             assert!(read("cycle-1/toolpath.ngc").contains("parameter: wheel radius: off by "));
-            assert!(said.contains("remaining error for the map: "), "{said}");
+            assert!(said.contains("error that remains for the correction map: "), "{said}");
         }
         passes
     });

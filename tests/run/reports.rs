@@ -151,7 +151,7 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     assert!(means[2].starts_with("radius 12.5000 mm, as the grinder reported"), "{means:?}");
     let found = json_in(folder, &format!("cycle-{cycles}/registration.json"));
     let radius = format!(
-        "radius {:.5} mm; on the reference sphere in cycle {cycles} off by ",
+        "radius {:.5} mm; the radius measured on the reference sphere in cycle {cycles} differs by ",
         found["probe_radius_mm"].as_f64().unwrap()
     );
     assert!(means[3].starts_with(&radius), "{means:?}");
@@ -159,7 +159,7 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     let used = format!("{} of {} points used", found["used"], found["points"]);
     assert!(registration[0].contains("converged in ") && registration[0].contains(&used), "{registration:?}");
     let x = 1e3 * found["standard_uncertainty"]["x_mm"].as_f64().unwrap();
-    assert!(registration[1].starts_with(&format!("{x:.2} ")), "{registration:?}");
+    assert!(registration[1].starts_with(&format!("shift {x:.2} ")), "{registration:?}");
     assert_eq!(page.rows("signatures").len(), 4);
 }
 
@@ -268,7 +268,7 @@ fn report_of_stopped_run() {
     let mut told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
     let last = told.rfind(|event| event["device"] == "grinder").expect("a pass that moves tells how far it is");
     let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
-    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of its path was ground")), "{last}");
+    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of the path was ground")), "{last}");
 }
 
 #[test]
@@ -385,7 +385,8 @@ fn report_lists_alarms_with_times() {
     assert!(grinder[0].contains(&times[2]) && grinder[1].contains(&times[3]), "{grinder:?} {times:?}");
     assert!(cmm[1].contains(&times[6]), "{cmm:?} {times:?}");
     assert_eq!(fault[1], "not withdrawn");
-    assert!(page.verdict().0.starts_with("ABORTED, and not every machine has confirmed that it is at rest: smoke"));
+    let standstill = "ABORTED, but at least one machine has not confirmed its standstill: check the machines.";
+    assert!(page.verdict().0.starts_with(&format!("{standstill} Reason of the abort: smoke")));
     let shown = shown(&folder);
     let said = |words: &str| shown.iter().any(|(_, row)| row.contains(words));
     assert!(said("ALARM A machine is in fault: grinder. The cell is held."), "{shown:#?}");
@@ -459,11 +460,11 @@ fn report_shows_no_raw_record() {
     said("812 points fetched in 0.50 s, 0.616 ms per point, probe centres");
     said("CMM: waits for a file; left alone: old.csv");
     said("grinder: done, map 3fa9c210");
-    said("grinder: to be brought home by CLEAR, its state is FAULTED");
+    said("grinder: order CLEAR to recover the machine; state before the order: FAULTED");
     said("answered: IDLE");
     // A person's confirmation about a machine is an order like any other. The report shows why an order was refused.
     let orders: Vec<String> = Page::read(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
-    for words in ["grinder: done, map 3fa9c210", "grinder: to be brought home by CLEAR"] {
+    for words in ["grinder: done, map 3fa9c210", "grinder: order CLEAR to recover the machine"] {
         assert!(orders.iter().any(|row| row.contains(words)), "{words}: {orders:#?}");
     }
 }

@@ -105,7 +105,7 @@ fn results_refused_without_measurement() {
     let (home, folder) = written.ended(&aborted());
     let (code, _, errors) = run(&["report", folder.to_str().unwrap(), "--qif"], home.path());
     assert_eq!(code, 2);
-    assert!(errors.contains("nothing was measured that could be registered"), "{errors}");
+    assert!(errors.contains("no measurement of this run could be registered"), "{errors}");
     assert!(!folder.join("results.qif").exists());
 }
 

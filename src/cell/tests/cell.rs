@@ -1632,7 +1632,11 @@ fn progress_timeout_alarms_then_holds() {
     let commands = run.send(Event::Deadline);
     let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
     assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
-    assert!(alarm.what.contains("grinder, for 30 s; the cell holds it after 30 s more"), "{}", alarm.what);
+    assert!(
+        alarm.what.contains("grinder, no progress for 30 s; without progress, the cell holds this machine in 30 s"),
+        "{}",
+        alarm.what
+    );
     assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * SECOND));
     // It goes on: the alarm goes away by itself.
     let progressed = |done| Event::Progressed { device, done, total: 1000 };

@@ -59,9 +59,9 @@ pub(in super::super) fn prove(
         } else if !json {
             let signed = match proven.signed {
                 0 => "not signed".to_owned(),
-                signed => format!("signed up to record {signed} by a key that the plant knows of {}", found.cell),
+                signed => format!("signatures up to record {signed}, with a key that is enrolled for {}", found.cell),
             };
-            let signed = if found.keys.is_empty() && proven.signed > 0 { "signed by a key that the plant does not know".to_owned() } else { signed };
+            let signed = if found.keys.is_empty() && proven.signed > 0 { "signed with a key that is not enrolled at the plant".to_owned() } else { signed };
             super::super::print(&format!(
                 "plant       {} records and {} files of {}, {signed}{}\n",
                 proven.records,

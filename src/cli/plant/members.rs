@@ -21,7 +21,7 @@ at any time.
 Example:
   createdb regrind && regrind plant init --plant owner.toml
 
-Exit codes: 0 set up; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 set up; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToInit {
     #[command(flatten)]
     plant: Where,
@@ -30,15 +30,15 @@ pub(super) struct ToInit {
 /// Enrol a cell, a planner, a reader or a worker, with a new password
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A cell reads its own data, replicates its records and takes work. A planner reads everything, proposes recipes and queues
-parts. A reader, such as Grafana, reads everything. A worker makes the runs of studies. The password is in a file that
-only its owner can read: carry it to the computer that signs in.
+A cell reads its own data, replicates its records and takes parts from the queue. A planner reads everything,
+proposes recipes and queues parts. A reader, such as Grafana, reads everything. A worker simulates the runs of studies.
+The password is in a file that only its owner can read: carry this file to the computer that signs in.
 
 Examples:
   regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
   regrind plant enrol office --as reader --plant owner.toml --password-file office.password
 
-Exit codes: 0 enrolled; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 enrolled; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToEnrol {
     /// Name in the plant, and of the role in the database: small letters, digits and `_`
     #[arg(value_name = "NAME", value_parser = name)]
@@ -75,7 +75,8 @@ enum Kind {
 Example:
   regrind plant retire cell-1 --plant owner.toml
 
-Exit codes: 0 retired; 1 there is no such cell; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 retired; 1 there is no such cell; 2 the database refuses the command; 3 the database
+cannot be reached.")]
 pub(super) struct ToRetire {
     /// Name of the cell in the plant
     #[arg(value_name = "NAME")]
@@ -90,7 +91,7 @@ pub(super) struct ToRetire {
 Example:
   regrind plant cells --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
@@ -151,7 +152,7 @@ pub(super) fn retire(arguments: &ToRetire) -> Result<Outcome, Failure> {
         let mut link = open(&config).await?;
         let name = &arguments.name;
         if retire_cell(&mut link, name).await? {
-            super::super::print(&format!("{name} can no longer sign in; its records stay\n"))?;
+            super::super::print(&format!("the cell {name} can no longer sign in; the plant keeps its records\n"))?;
             return Ok(Outcome::Accepted);
         }
         super::super::print(&format!("there is no cell {name}; `regrind plant cells` lists them\n"))?;

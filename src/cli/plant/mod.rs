@@ -23,8 +23,8 @@ pub(super) use recipes::is_below;
 /// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A cell runs, holds and accepts without a plant. The plant never commands a motion. The database is PostgreSQL 15 or later;
-a plant file (config/plant/plant.toml) gives its address and user. docs/plant.md leads from one cell to four.
+A cell makes parts also without a plant. The plant never commands a motion. The database is PostgreSQL 15 or later;
+a plant file (config/plant/plant.toml) gives its address and user. docs/plant.md shows the steps from one cell to four.
 
 Examples:
   regrind plant init --plant owner.toml
@@ -32,7 +32,7 @@ Examples:
   regrind plant cells --plant planner.toml
 
 Exit codes: 0 done; 1 a check failed, or something does not exist; 2 bad arguments, or the
-database refuses it; 3 it cannot be reached.")]
+database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct Arguments {
     #[command(subcommand)]
     what: PlantCommand,
@@ -98,7 +98,14 @@ pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
 
 /// Returns the table `[database]` of a plant file. If there is none, prints this problem and returns a failure.
 fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
-    let missing = || config.problem("database", "is missing", "", "say where the database is, and who signs in");
+    let missing = || {
+        config.problem(
+            "database",
+            "is missing",
+            "",
+            "add the table [database] with the address of the database and the user that signs in",
+        )
+    };
     check::or_show(config.database.as_ref().ok_or_else(missing))
 }
 

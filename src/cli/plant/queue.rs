@@ -17,8 +17,8 @@ confirms each part, unless the recipe has cycle.confirm_work = false.
 Example:
   regrind plant queue SN-0042 SN-0043 --recipe freeform-mirror --due 2027-03-01 --plant planner.toml
 
-Exit codes: 0 queued; 2 no such recipe, it lacks the signatures of two people, or a part is queued already; 3 the
-database cannot be reached.")]
+Exit codes: 0 queued; 2 there is no such recipe, the recipe lacks the signatures of two people, or a part is
+queued already; 3 the database cannot be reached.")]
 pub(super) struct ToQueue {
     /// Serial numbers of the parts
     #[arg(value_name = "SERIAL", required = true, value_parser = name)]
@@ -45,7 +45,8 @@ pub(super) struct ToQueue {
 Example:
   regrind plant unqueue 17 --why \"the blank is broken\" --plant planner.toml
 
-Exit codes: 0 removed; 1 it is started, or there is no such part; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 removed; 1 the part is started, or there is no such part; 2 the database refuses the command; 3 the
+database cannot be reached.")]
 pub(super) struct ToUnqueue {
     /// Number of the part in the queue, as `regrind plant work` lists it
     #[arg(value_name = "N")]
@@ -63,7 +64,7 @@ pub(super) struct ToUnqueue {
 Example:
   regrind plant work --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
@@ -83,7 +84,7 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
         let made = link.query(text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
         let numbers: Vec<i64> = made.iter().map(|row| row.get(0)).collect();
         let lines = numbers.iter().zip(&arguments.serials).map(|(number, serial)| {
-            format!("{number:>6}  {serial}  by version {} of {}\n", recipe.version, recipe.name)
+            format!("{number:>6}  {serial}  to be made by version {} of the recipe {}\n", recipe.version, recipe.name)
         });
         super::super::print(&lines.collect::<String>())?;
         Ok(Outcome::Accepted)
@@ -97,10 +98,12 @@ pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let done = link.query("SELECT withdraw_work($1, $2)", &[work, why]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
-            super::super::print(&format!("part {work} is removed from the queue\n"))?;
+            super::super::print(&format!("the part with number {work} is removed from the queue\n"))?;
             return Ok(Outcome::Accepted);
         }
-        super::super::print(&format!("part {work} is already started or over, or no part has this number\n"))?;
+        super::super::print(&format!(
+            "no part was removed: part number {work} is already started or finished, or is not in the queue\n"
+        ))?;
         Ok(Outcome::NotInTolerance)
     })
 }

@@ -16,13 +16,15 @@ use super::{Where, open};
 /// Propose a recipe to the plant, as the next version under its name
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The recipe is checked as by `regrind check`. The files that it names, in its folder or below, are proposed with it. No
-part is made by it before two people have signed it.
+The recipe is checked as with `regrind check`. The files that the recipe names are proposed together with the recipe.
+These files must be in the folder of the recipe or below. Cells make no part by a recipe before two people have
+signed the recipe.
 
 Example:
   regrind plant propose recipes/freeform-mirror.toml --plant planner.toml
 
-Exit codes: 0 proposed; 2 the recipe is bad or exists already, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 proposed; 2 the recipe is invalid or exists already, or the database refuses the recipe; 3 the database
+cannot be reached.")]
 pub(super) struct ToPropose {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
@@ -37,15 +39,15 @@ pub(super) struct ToPropose {
 /// Sign a recipe; cells make parts by it after two people have signed it
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The key belongs to one person (`regrind audit key --key FILE` creates one). The plant file of each cell has its public
-half in `[[approver]]`, with the name, so that the cell verifies the signature itself. The signature covers the hash of
-name, version, text and files together.
+The key belongs to one person (`regrind audit key --key FILE` creates one). The plant file of each cell has the
+public half of the key in `[[approver]]`, with the name of the person. With this key the cell verifies the signature
+itself. The signature covers one hash of name, version, text and files.
 
 Example:
   regrind plant approve freeform-mirror --person \"A. Smith\" --key smith.key --plant planner.toml
 
-Exit codes: 0 signed; 2 no such recipe, the person has signed it already, or the database refuses it; 3 it cannot be
-reached.")]
+Exit codes: 0 signed; 2 there is no such recipe, the person has signed the recipe already, or the database refuses the
+signature; 3 the database cannot be reached.")]
 pub(super) struct ToApprove {
     /// Name of the recipe in the plant
     #[arg(value_name = "NAME")]
@@ -72,7 +74,8 @@ pub(super) struct ToApprove {
 Example:
   regrind plant withdraw freeform-mirror --version 3 --why \"wrong radius of the wheel\" --plant planner.toml
 
-Exit codes: 0 withdrawn; 1 there is no such recipe, or it was withdrawn before; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 withdrawn; 1 there is no such recipe, or the recipe was withdrawn before; 2 the database refuses the command;
+3 the database cannot be reached.")]
 pub(super) struct ToWithdraw {
     /// Name of the recipe in the plant
     #[arg(value_name = "NAME")]
@@ -93,7 +96,7 @@ pub(super) struct ToWithdraw {
 Example:
   regrind plant recipes --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
@@ -136,7 +139,7 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
         let inside = path.strip_prefix(folder).ok().filter(|inside| is_below(inside)).and_then(Path::to_str);
         let Some(inside) = inside else {
             let what = format!(
-                "{} names {}, which is not in the folder of the recipe or below: move it there, because the recipe is copied to other computers together with its files",
+                "the recipe {} names the file {}, which is outside of the folder of the recipe; move the file into this folder, because the plant copies the recipe and its files to other computers",
                 recipe.path().display(),
                 path.display()
             );
@@ -185,7 +188,9 @@ pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
             super::super::print(&format!("version {version} of {name} is withdrawn\n"))?;
             return Ok(Outcome::Accepted);
         }
-        super::super::print(&format!("there is no version {version} of {name}, or it was withdrawn before\n"))?;
+        super::super::print(&format!(
+            "the recipe {name} has no version {version}, or this version was withdrawn before\n"
+        ))?;
         Ok(Outcome::NotInTolerance)
     })
 }

@@ -17,7 +17,7 @@ Examples:
   regrind plant runs --plant planner.toml
   regrind plant runs --part SN-00 --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToList {
     /// Serial number of the part, or its first characters
     #[arg(long, value_name = "SERIAL")]
@@ -62,7 +62,7 @@ pub(super) struct ToFetch {
 Example:
   regrind plant incidents --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToListIncidents {
     /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]

@@ -17,16 +17,16 @@ const ADDRESS: &str = "127.0.0.1:7374";
 /// Show all cells, their parts and their trends as a page in the browser
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The page gives no orders: it signs in as a reader of the plant. Open it on this computer, with the printed address and its
-key. For other computers, the page needs a certificate with the names by which they reach it, and users that sign in
-(regrind users).
+The page gives no orders: it signs in as a reader of the plant. Open the page on this computer with the printed address,
+which contains a key. For other computers, the page needs users that sign in (regrind users) and a certificate. The
+certificate has the names by which these computers reach the page.
 
 Examples:
   regrind plant enrol page --as reader --plant owner.toml --password-file page.password
   regrind plant serve --plant page.toml
   regrind plant serve --plant page.toml --listen 0.0.0.0:7374 --certificate plant.pem --key plant.key --users users.toml
 
-Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or the database refuses it. The page waits for a
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or the database refuses the page. The page waits for a
 database that cannot be reached.")]
 pub(super) struct Arguments {
     /// Address and port of the page; port 0 selects a free port

@@ -27,16 +27,17 @@ const Z: f64 = 1.96;
 /// Simulate a recipe many times, on any number of computers, and summarise the results
 #[derive(Args, Debug)]
 #[command(after_help = "\
-For commissioning: a study shows how often a recipe is accepted, in how many cycles, with which gain or tolerance, and how
-often an accepted part is truly out of tolerance. Each run is a job in the plant's database. If a worker dies, nothing is
-lost: another worker gets its job.
+For commissioning: a study shows how often a part of a recipe is accepted, and after how many cycles, for each set of
+values (such as gain or tolerance). It also shows how often an accepted part is truly out of tolerance. Each run is a
+job in the plant's database. If a worker dies, nothing is lost: another worker gets its job.
 
 Examples:
   regrind study begin recipes/freeform-mirror.toml --name gains --seeds 1..200 --vary compensation.gain=0.6,0.8,1.0 --plant planner.toml
   regrind study work --plant worker.toml --workers 2
   regrind study show gains --plant planner.toml
 
-Exit codes: 0 done; 1 there is no such study; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 done; 1 there is no such study; 2 bad arguments, or the database refuses the command; 3 the database
+cannot be reached.")]
 pub(in super::super) struct Arguments {
     #[command(subcommand)]
     what: StudyCommand,
@@ -56,7 +57,7 @@ enum StudyCommand {
 Example:
   regrind study begin mirror.toml --name limits --seeds 1..50 --vary acceptance.pv_um=2.5,3.0 --vary cycle.max_cycles=3,5 --plant planner.toml
 
-Exit codes: 0 started; 2 the recipe is bad with one of the values, or there is a study of that name; 3 the database
+Exit codes: 0 started; 2 the recipe is invalid with one of the values, or a study has this name already; 3 the database
 cannot be reached.")]
 struct ToBegin {
     /// Recipe, with a table [simulation]
@@ -82,7 +83,7 @@ struct ToBegin {
 Example:
   regrind study work --plant worker.toml --workers 2 --wait
 
-Exit codes: 0 none is left; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 no job is left; 2 bad arguments, or the database refuses the command; 3 the database cannot be reached.")]
 struct ToWork {
     /// Number of runs at a time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
@@ -103,7 +104,8 @@ of tolerance.
 Example:
   regrind study show gains --plant planner.toml
 
-Exit codes: 0 shown; 1 there is no such study; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 shown; 1 there is no such study; 2 the database refuses the command; 3 the database cannot be
+reached.")]
 struct ToShow {
     /// Name of the study
     #[arg(value_name = "NAME")]
@@ -121,7 +123,8 @@ struct ToShow {
 Example:
   regrind study stop gains --plant planner.toml
 
-Exit codes: 0 stopped; 1 there is no such study, or it was stopped before; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 stopped; 1 there is no such study, or the study was stopped before; 2 the database refuses the command; 3 the
+database cannot be reached.")]
 struct ToStop {
     /// Name of the study
     #[arg(value_name = "NAME")]
@@ -145,7 +148,7 @@ fn seeds(text: &str) -> Result<(u64, u64), String> {
     let number = |of: &str| of.trim().parse::<u64>().map_err(|_| words());
     match (number(first)?, number(last)?) {
         (first, last) if first <= last && last - first < MAX_JOBS as u64 => Ok((first, last)),
-        _ => Err(format!("the last seed must not be below the first, and {MAX_JOBS} seeds are the maximum")),
+        _ => Err(format!("the last seed must not be less than the first, and at most {MAX_JOBS} seeds are allowed")),
     }
 }
 
@@ -157,10 +160,11 @@ fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     let is_key =
         |part: &str| !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-');
     if !key.split('.').all(is_key) {
-        return Err(format!("{key:?} cannot be a key of a recipe"));
+        return Err(format!("{key:?} is not a valid key of a recipe; write a key such as compensation.gain"));
     }
-    let table: toml::Table =
-        format!("values = [{values}]").parse().map_err(|_| format!("{values:?} are not values in TOML notation"))?;
+    let table: toml::Table = format!("values = [{values}]")
+        .parse()
+        .map_err(|_| format!("{values:?} is not a list of TOML values; write values such as 0.8,1.0"))?;
     let values = serde_json::to_value(&table["values"]).map_err(|error| error.to_string())?;
     match values {
         Value::Array(values) if !values.is_empty() => Ok((key.to_owned(), values)),
@@ -292,7 +296,9 @@ fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     for (name, content) in &study.files {
         let inside = Path::new(name);
         if !is_below(inside) {
-            return Err(format!("the file {name:?} would lie outside of its folder"));
+            return Err(format!(
+                "the recipe names the file {name:?}, which is outside of the folder of the recipe; begin the study again"
+            ));
         }
         write(&scratch.path().join(inside), content)?;
     }
@@ -425,7 +431,10 @@ fn stop(arguments: &ToStop) -> Result<Outcome, Failure> {
             super::super::print(&format!("{} is stopped: no further jobs are assigned\n", arguments.name))?;
             return Ok(Outcome::Accepted);
         }
-        super::super::print(&format!("there is no study {:?}, or it was stopped before\n", arguments.name))?;
+        super::super::print(&format!(
+            "no study has the name {:?}, or this study was stopped before\n",
+            arguments.name
+        ))?;
         Ok(Outcome::NotInTolerance)
     })
 }

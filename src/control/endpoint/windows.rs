@@ -39,9 +39,10 @@ impl Endpoint {
         let name = pipe_name(folder)?;
         let next = regrind_windows::listen(&name, true).map_err(|error| match error.kind() {
             // Windows reports a name in use as access denied.
-            io::ErrorKind::PermissionDenied => {
-                io::Error::new(io::ErrorKind::AddrInUse, "another program has the control pipe of this run")
-            }
+            io::ErrorKind::PermissionDenied => io::Error::new(
+                io::ErrorKind::AddrInUse,
+                "another program already uses the control pipe of this run; check whether this run is already open",
+            ),
             _ => error,
         })?;
         Ok(Self { name, next })
@@ -182,7 +183,7 @@ fn block_on_thread<T: Send + 'static>(what: impl Future<Output = io::Result<T>> 
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)
     })?;
-    thread.join().unwrap_or_else(|_| Err(io::Error::other("the thread of the request has ended")))
+    thread.join().unwrap_or_else(|_| Err(io::Error::other("this program failed; send the request again")))
 }
 
 #[cfg(test)]

@@ -19,7 +19,7 @@ pub enum MapError {
     Cutoff { cutoff_mm: f64 },
     #[error("{name} is {value}; it must be {wanted}")]
     Option { name: &'static str, value: f64, wanted: &'static str },
-    #[error("deviation {} is not finite; do not use this measurement", index + 1)]
+    #[error("deviation number {} is not a finite number; do not use this measurement", index + 1)]
     NotFinite { index: usize },
     #[error(
         "only {valid} of {nodes} nodes have {MIN_READINGS} measured points within the cut-off of {cutoff_mm} mm; \

@@ -37,7 +37,8 @@ pub enum RegistrationError {
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
     #[error(
-        "the nominal point at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others; remove it or correct it",
+        "the nominal point at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the other points, \
+         too far to belong to the part; remove or correct this point",
         at[0], at[1], at[2]
     )]
     NominalFarOff { at: [f64; 3], distance_mm: f64 },

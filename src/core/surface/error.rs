@@ -12,7 +12,8 @@ pub enum SurfaceError {
     #[error("nominal point {} has a coordinate that is not a finite number; remove or correct the point", index + 1)]
     NotFinite { index: usize },
     #[error(
-        "nominal point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others; remove it or correct it",
+        "nominal point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the other points, \
+         too far to belong to the part; remove or correct this point",
         index + 1, at[0], at[1], at[2]
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
@@ -29,7 +30,8 @@ pub enum SurfaceError {
     )]
     NearDuplicates { first: usize, second: usize, at: [f64; 3], apart_mm: f64 },
     #[error(
-        "no projection of the nominal points is one-to-one: {tried}; divide the surface into patches, or give a mesh"
+        "parts of the nominal surface overlap in every projection that was tried: {tried}; divide the surface into \
+         patches, or give a mesh"
     )]
     NoProjection { tried: String },
     #[error("the nominal mesh has no triangle; give a file with faces")]

@@ -274,7 +274,8 @@ impl Judge {
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
-            notes.push(format!("{} was there before the plan was handed over; ignored", file.name));
+            notes
+                .push(format!("{} was in the folder before the plan was handed over; the file was ignored", file.name));
         }
         !earlier
     }
@@ -290,7 +291,10 @@ impl Judge {
                 continue;
             }
             if !file.settled {
-                notes.push(format!("{} is still changing or changed a moment ago; waiting", file.name));
+                notes.push(format!(
+                    "{} is still changing or changed a moment ago; waiting until the file is complete",
+                    file.name
+                ));
                 // Another file must not be accepted before a file that matches the pattern has settled.
                 if pattern.fits(&file.name) {
                     return Ok(None);
@@ -341,7 +345,7 @@ impl Judge {
             let most = MAX_UNMATCHED_BYTES >> 20;
             let pattern = pattern.as_str();
             return Ok(Some(format!(
-                "is larger than {most} MiB, and its name does not match {pattern}: it was not read"
+                "is larger than {most} MiB, and its name does not match {pattern}, so the file was not read"
             )));
         }
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
@@ -350,7 +354,7 @@ impl Judge {
             match says_so || pattern.fits(&file.name) {
                 true => None,
                 false => Some(format!(
-                    "does not state that it is of this job, and its name does not match {}",
+                    "does not name this job or its plan, and the file name does not match {}",
                     pattern.as_str()
                 )),
             }
@@ -431,14 +435,14 @@ impl Judge {
         let used = |name: &str| pairs.iter().any(|(p, r)| p.name == name || r.name == name);
         let left: Vec<&str> = new.iter().map(|f| f.name.as_str()).filter(|name| !used(name)).collect();
         if !left.is_empty() {
-            notes.push(format!("ignored, because they belong to no station: {}", left.join(", ")));
+            notes.push(format!("these files were ignored, because they belong to no station: {}", left.join(", ")));
         }
         let accepted = self.merge(expected, stations, &pairs)?;
         let (there, least) = (accepted.measurement.points.len(), self.settings.min_points);
         if self.settings.free_count && there < least {
             notes.extend(accepted.notes);
             notes.push(format!(
-                "{there} points of {} stations; at least {least} are required; waiting for further stations",
+                "{there} points from {} stations; at least {least} points are required; waiting for further stations",
                 pairs.len()
             ));
             return Ok(None);
@@ -661,7 +665,7 @@ impl Exchange for CmmFolders {
 
 fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     let off = result.switched_off;
-    (off > 0).then(|| format!("{name}: {off} rows are switched off and were ignored"))
+    (off > 0).then(|| format!("{name}: {off} rows are marked as disabled in the file and were ignored"))
 }
 
 /// Reads a plan that was handed over from the files `plan.json` and `plan.csv` in `folder`. The field `careful_start`
@@ -688,7 +692,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
         stored_target(row).ok_or_else(|| FormatError::Unexpected {
             path: path.clone(),
             place: format!("line {line}"),
-            expected: "a target as it was handed over".to_owned(),
+            expected: "an unchanged target of the plan that was handed over".to_owned(),
             found: row.chars().take(40).collect(),
         })
     };
@@ -720,8 +724,9 @@ fn stored_target(row: &str) -> Option<PlanTarget> {
 pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\
-         # frame: that of the measuring machine; x y z nominal contact point, nx ny nz outward unit normal\n\
-         # what: 1 the part, 2 the reference sphere\nindex,x,y,z,nx,ny,nz,what\n",
+         # frame: coordinate system of the measuring machine; x y z = nominal contact point, nx ny nz = outward unit \
+         normal\n\
+         # what: 1 = the part, 2 = the reference sphere\nindex,x,y,z,nx,ny,nz,what\n",
         part, job.job, job.cycle, identity, plan.probe_radius_mm
     );
     for target in &plan.targets {

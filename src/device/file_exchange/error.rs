@@ -19,7 +19,8 @@ pub enum ExchangeError {
     /// Neither file nor cell states if the coordinates are probe centres or contact points.
     #[error(
         "{path}: neither the file nor the cell file states whether the coordinates are probe centres or contact \
-         points, and a wrong guess is off by the probe radius; put `# coordinates: centres` or `# coordinates: \
+         points, and a wrong guess causes an error of one probe radius; \
+         write `# coordinates: centres` or `# coordinates: \
          contacts` above the points, or `coordinates = \"centres\"` into the cell file"
     )]
     CoordinatesUnstated { path: PathBuf },
@@ -32,7 +33,7 @@ pub enum ExchangeError {
     /// Too few targets of the plan have a point.
     #[error(
         "{path}: {found} of {expected} targets have a point; at least {min} are required; export the complete \
-         measurement, or touch the missing targets first"
+         measurement, or measure the missing targets first"
     )]
     TooFewTargets { path: PathBuf, found: usize, expected: usize, min: usize },
     /// The radius of the probe differs from that of the plan.
@@ -43,8 +44,8 @@ pub enum ExchangeError {
     ProbeRadius { path: PathBuf, found_mm: f64, expected_mm: f64, limit_mm: f64 },
     /// A station sees too few or too many reference points.
     #[error(
-        "station {station} sees {seen} reference points without names, the nominal file has {nominal} ({names}); \
-         {reason}: measure all of them, or give the points the nominal names"
+        "station {station} has {seen} reference points without names, but the nominal file has {nominal} ({names}); \
+         {reason}. Measure all nominal points, or give the points the nominal names"
     )]
     ReferenceCount { station: String, seen: usize, nominal: usize, names: String, reason: &'static str },
     /// Too few reference points have a nominal name.
@@ -57,46 +58,65 @@ pub enum ExchangeError {
     #[error("station {station}: {source}")]
     Fit { station: String, source: RigidError },
     /// A reference point is too far from its nominal position.
-    #[error("station {station}: reference point {point} is off by {off_mm:.3} mm, limit {limit_mm} mm; {diagnosis}")]
+    #[error(
+        "station {station}: reference point {point} is {off_mm:.3} mm from its nominal position, limit {limit_mm} mm; \
+         {diagnosis}"
+    )]
     ReferenceOff { station: String, point: String, off_mm: f64, limit_mm: f64, diagnosis: String },
     /// Several files match where one is required.
-    #[error("{folder}: {} files match `{pattern}`: {}; leave only the right one there", names.len(), names.join(", "))]
+    #[error(
+        "{folder}: {} files match `{pattern}`: {}; leave only the requested file in this folder",
+        names.len(), names.join(", ")
+    )]
     Several { folder: PathBuf, pattern: String, names: Vec<String> },
     /// The file was already accepted for another cycle.
-    #[error("{path}: the same bytes were already the result of job {job} cycle {cycle}; export the new measurement")]
+    #[error(
+        "{path}: a file with exactly this content was already the result of job {job} cycle {cycle}; export the new \
+         measurement"
+    )]
     AcceptedBefore { path: PathBuf, job: u32, cycle: u16 },
     /// The confirmation is for another hand-over.
-    #[error("{path}: confirms {found}, expected {expected}; {remedy}")]
+    #[error("{path}: this confirmation contains {found}, but {expected} must be there; {remedy}")]
     Confirmation { path: PathBuf, found: String, expected: String, remedy: &'static str },
     /// The same job and cycle was handed over before.
-    #[error("job {job} cycle {cycle} was already handed over, see {folder}; it is never handed over twice")]
+    #[error(
+        "job {job} cycle {cycle} was already handed over (see {folder}), and Regrind hands over each job and cycle \
+         only once"
+    )]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
     /// The client had stopped waiting for the hand-over, so it was not published.
     #[error(
-        "job {job} cycle {cycle} was not handed over: writing its files took too long, and the start was withdrawn"
+        "job {job} cycle {cycle} was not handed over: the start was cancelled, because writing the files took too \
+         long; check the folder and its disk"
     )]
     Withdrawn { job: u32, cycle: u16 },
     /// The confirmation names another map than the one that was handed over.
-    #[error("the confirmation names the map {}, but the map {} was handed over", hex(&found[..8]), hex(&expected[..8]))]
+    #[error(
+        "the confirmation names the map {}, but the map {} was handed over; check which map the grinder has",
+        hex(&found[..8]), hex(&expected[..8])
+    )]
     OtherMap { expected: [u8; 32], found: [u8; 32] },
     /// No hand-over of the job is open.
-    #[error("no hand-over of job {job} cycle {cycle} is open")]
+    #[error("no hand-over of job {job} cycle {cycle} waits for an answer")]
     NotOpen { job: u32, cycle: u16 },
     /// The hand-over is not where it was put.
     #[error(
-        "{folder}: the hand-over is missing: check whether it was moved or deleted, and put it back or stop the job"
+        "{folder}: the folder of the hand-over is missing; check whether this folder was moved or deleted. Put the \
+         folder back, or stop the job"
     )]
     Missing { folder: PathBuf },
     /// The thread that read the files has failed.
     #[error(
-        "{folder}: this program failed to read a file there; remove files that do not belong there, and report this \
-         error"
+        "{folder}: this program failed to read a file in this folder; remove the files that do not belong in this \
+         folder, and report this error"
     )]
     ReaderFailed { folder: PathBuf },
     /// The header of the file, or its points, show that it is not the requested measurement.
     #[error("{path}: {reason}; export the requested measurement")]
     Foreign { path: PathBuf, reason: String },
     /// The file was already a measurement of this run.
-    #[error("{path}: the same bytes were already a measurement of this run; export the new one")]
+    #[error(
+        "{path}: a file with exactly this content was already a measurement of this run; export the new measurement"
+    )]
     AlreadyMeasured { path: PathBuf },
 }

@@ -81,14 +81,14 @@ impl Confirmation {
         if map.len() < 8 || !identity.starts_with(&map) {
             let found = if map.is_empty() { "no map".to_owned() } else { format!("map `{}`", self.map) };
             let remedy =
-                "check whether the grinder has another map, and copy the file from the folder of the hand-over";
+                "check which map the grinder has; then copy the confirmation from the folder of the hand-over again";
             return wrong(found, format!("map {identity}"), remedy);
         }
         let job = (self.job.unwrap_or(ticket.job), self.cycle.unwrap_or(ticket.cycle));
         if job != (ticket.job, ticket.cycle) {
             let (found, expected) =
                 (format!("job {} cycle {}", job.0, job.1), format!("job {} cycle {}", ticket.job, ticket.cycle));
-            return wrong(found, expected, "copy the file from the folder of the hand-over");
+            return wrong(found, expected, "copy the confirmation from the folder of the hand-over again");
         }
         let positive = |value: Option<f64>| value.is_none_or(|v| v.is_finite() && v >= 0.0);
         if !positive(self.wheel_radius_mm)
@@ -138,11 +138,11 @@ impl GrinderFolders {
     ) -> Option<(Confirmation, String)> {
         let file = found.iter().find(|f| f.name == name)?;
         if stored.header.is_earlier(name, &file.stamp) {
-            notes.push(format!("{name} was there before the map was handed over; ignored"));
+            notes.push(format!("{name} was in the inbox before the map was handed over; this file is ignored"));
             return None;
         }
         if !file.settled {
-            notes.push(format!("{name} is still changing or changed a moment ago; waiting"));
+            notes.push(format!("{name} still changes or changed a moment ago; Regrind waits until it is stable"));
             return None;
         }
         let read = || -> Result<(Confirmation, String), ExchangeError> {
@@ -207,15 +207,16 @@ impl Exchange for GrinderFolders {
             let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
             let map = stored.header.identity.get(..8).unwrap_or_default();
             notes.push(format!(
-                "waiting for the confirmation of the {what}: regrind confirm {word} --map {map}, or copy {file} from \
-                 {} to {}",
+                "waiting for the confirmation of the {what} of the pass: type regrind confirm {word} --map {map}, or \
+                 copy {file} from {} to {}",
                 stored.path.display(),
                 self.settings.inbox.display()
             ));
             return Ok(PollResult { answer: None, start_confirmed: begun, notes });
         };
         if self.started.is_none() {
-            notes.push("the end of the pass was confirmed, but not its start".to_owned());
+            let note = "the end of the pass was confirmed, but not the start: the duration of the pass is unknown";
+            notes.push(note.to_owned());
         }
         let taken = AcceptedFiles { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
         self.outbox.record_accepted(&stored, &taken)?;
@@ -239,7 +240,8 @@ impl Exchange for GrinderFolders {
 fn correction_csv(ticket: &HandOverHeader, map: &CorrectionMap) -> String {
     let mut text = format!(
         "# Regrind correction\n# part: {}\n# job: {}\n# cycle: {}\n# map: {}\n# units: mm\n# frame: model\n\
-         # correction: required displacement of the ground surface along the outward normal; positive leaves material\n\
+         # correction: required displacement of the ground surface along the outward normal; \
+         a positive value leaves material\n\
          x_mm,y_mm,correction_mm\n",
         ticket.part, ticket.job, ticket.cycle, ticket.identity
     );
@@ -255,7 +257,8 @@ fn correction_json(ticket: &HandOverHeader, order: &GrindOrder, inbox: &Path) ->
     let (map, grid, pass) = (&order.map, &order.map.grid, &order.pass);
     serde_json::json!({
         "kind": "correction map", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "map": ticket.identity,
-        "units": "mm", "frame": "model", "sign": "positive leaves material, along the outward normal", "absolute": true,
+        "units": "mm", "frame": "model",
+        "sign": "a positive value leaves material, along the outward normal", "absolute": true,
         "columns": grid.columns, "rows": grid.rows, "first_mm": grid.first_mm, "spacing_mm": grid.spacing_mm,
         "nominal_surface": hex(&map.part_identity),
         "pass": {
@@ -263,6 +266,10 @@ fn correction_json(ticket: &HandOverHeader, order: &GrindOrder, inbox: &Path) ->
             "level_mm": pass.level_mm, "depth_of_cut_mm": pass.depth_of_cut_mm, "spark_out_passes": pass.spark_out_passes,
             "x_mm": pass.x_mm, "y_mm": pass.y_mm,
         },
-        "confirm": format!("copy {STARTED} when the grinder has begun, {DONE} when it has ended and the part is clear, to {}", inbox.display()),
+        "confirm": format!(
+            "copy {STARTED} when the pass has begun, and {DONE} when the pass has ended and the wheel is clear of the \
+             part; copy both files to {}",
+            inbox.display()
+        ),
     })
 }

@@ -374,13 +374,13 @@ impl<M: Exchange> FolderMachine<M> {
     fn withdrawal_notes(&self) -> Vec<String> {
         let words = match (self.start_confirmed, self.kind) {
             (true, MachineKind::Grinder) => {
-                "the hand-over was withdrawn, but the start was confirmed: stop the grinder at its own panel"
+                "the hand-over was withdrawn after the start was confirmed: stop the grinder at its own panel"
             }
             (_, MachineKind::Grinder) => {
-                "the hand-over was withdrawn; if the grinder runs on it, stop the grinder at its own panel"
+                "the hand-over was withdrawn; if the grinder already runs, stop the grinder at its own panel"
             }
             (_, MachineKind::Cmm) => {
-                "the plan was withdrawn; if the measuring machine runs on it, stop the machine at its own panel"
+                "the plan was withdrawn; if the machine already measures, stop the machine at its own panel"
             }
         };
         vec![words.to_owned()]
@@ -433,7 +433,7 @@ impl<M: Exchange> FolderMachine<M> {
         };
         if handed.job != intended.job || handed.sequence != intended.start_sequence {
             let why = format!(
-                "the folder has a hand-over of {} with START number {}, expected {} with START number {}",
+                "the folder has a hand-over of {} with START number {}, but {} with START number {} is expected",
                 handed.job, handed.sequence, intended.job, intended.start_sequence
             );
             return Ok(Reconciled::Unknown { reason: why });
@@ -461,7 +461,7 @@ impl<M: Exchange> FolderMachine<M> {
             }
             HandOverStatus::Closed => {
                 (self.state, self.job) = (MachineState::Idle, None);
-                let why = "its result was already acknowledged; look for it in the journal".to_owned();
+                let why = "the result of this job was already acknowledged: see the journal for the result".to_owned();
                 Reconciled::Unknown { reason: why }
             }
         })

@@ -119,7 +119,7 @@ impl DriverFactory for ExchangeWire {
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if self.outbox == self.inbox && !self.outbox.is_empty() {
-            let allowed = "written files and awaited files require different folders";
+            let allowed = "the outbox and the inbox must be different folders";
             document.report(&place.key("wire.inbox"), "is the same folder as `outbox`", allowed, "give each a folder");
         }
         self.check_result(place, document);
@@ -222,7 +222,7 @@ impl ExchangeWire {
         }
         if plain.contains(['/', '\\', '{', '}']) || plain.matches('*').count() > 1 {
             let allowed =
-                "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and at most one `*`";
+                "the value must be a file name without a folder; `{part}`, `{job}`, `{cycle}` and one `*` are allowed";
             let remedy = "the usual name is \"{part}_c{cycle}.*\"";
             document.report(&place.key("wire.result"), format!("is {name:?}"), allowed, remedy);
         }
@@ -236,11 +236,11 @@ impl ExchangeWire {
             return document.report(&key, "is given for a grinder", allowed, "remove it");
         }
         if !sensor.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
-            let allowed = "it must be a label of DMIS: letters, digits, _ and -";
+            let allowed = "a DMIS label has only letters, digits, _ and -";
             document.report(&key, format!("is {sensor:?}"), allowed, "write it as in S(...)");
         }
         if self.coordinates.is_none() {
-            let allowed = "a DMIS program states whether the radius of the probe is subtracted";
+            let allowed = "the DMIS program must state whether the points are probe centres or contact points";
             document.report(
                 &place.key("wire.coordinates"),
                 "is missing; `dmis_sensor` requires it",
@@ -258,7 +258,7 @@ impl ExchangeWire {
                 document.report(&stations, "have no `reference_points`", allowed, "name their file");
             }
             (true, true) if !document.has_problem(&stations) => {
-                let allowed = "they merge stations, and no station is given";
+                let allowed = "reference points are used only to merge stations";
                 document.report(&reference, "is given without stations", allowed, "add [[cmm.wire.stations]]");
             }
             _ => {}
@@ -271,7 +271,7 @@ impl ExchangeWire {
             for (name, key) in [(points, "points"), (reference, "reference")] {
                 let key = place.key(&format!("wire.stations[{k}].{key}"));
                 if name.contains(['/', '\\']) || name.matches('*').count() > 1 {
-                    let allowed = "it must be the name of a file in the inbox, with at most one `*`";
+                    let allowed = "the value must be a file name without a folder, with at most one `*`";
                     document.report(&key, format!("is {name:?}"), allowed, "remove the folder");
                 }
             }

@@ -35,7 +35,7 @@ impl PlacedStation {
     pub fn summary(&self) -> String {
         let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
         let mut words = format!(
-            "station {}: reference points fit to {:.3} mm rms ({} mm)",
+            "station {}: the residuals of the reference points are {:.3} mm rms (each point: {} mm)",
             self.station,
             self.rms_mm,
             each.join(", ")
@@ -138,9 +138,9 @@ fn match_points(
     };
     match have {
         _ if have == want => Ok(Matching { pairs: (0..have).map(|k| (k, k)).collect() }),
-        _ if have > want => Err(refuse("it is unknown which points are extra")),
+        _ if have > want => Err(refuse("Regrind cannot determine which points of the station are extra")),
         _ if have < 3 => Err(refuse("at least 3 are required")),
-        _ if want > MAX_NOMINAL => Err(refuse("it is unknown which points are missing")),
+        _ if want > MAX_NOMINAL => Err(refuse("Regrind cannot determine which nominal points are missing")),
         _ => match_subset(seen, nominal, limit_mm).map_err(refuse),
     }
 }
@@ -162,8 +162,8 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     let mut fits: Vec<Matching> = fits.take(2).collect();
     match fits.len() {
         1 => Ok(fits.remove(0)),
-        0 => Err("their distances match none of the nominal points"),
-        _ => Err("their distances match in more than one way"),
+        0 => Err("the distances between the points match no set of nominal points"),
+        _ => Err("the distances between the points match more than one set of nominal points"),
     }
 }
 
@@ -181,7 +181,7 @@ fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (O
             exchanged.swap(a, b);
             if fits(fit_rigid(&exchanged, to).ok()) {
                 let words =
-                    format!("{} and {} are probably swapped: with the two swapped all points fit", names[a], names[b]);
+                    format!("{} and {} are probably swapped: all points fit if both are exchanged", names[a], names[b]);
                 return (Some(a), words);
             }
         }
@@ -192,8 +192,11 @@ fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (O
         .filter(|&k| from.len() > 3 && fits(fit_rigid(&without(from, k), &without(to, k)).ok()))
         .collect();
     match alone[..] {
-        [k] => (Some(k), "without it the other points fit: measure it again, or correct the nominal point".to_owned()),
-        _ => (None, "no single point explains it: check the order of the points and the nominal file".to_owned()),
+        [k] => {
+            let words = "without this point the others fit: measure this point again, or correct the nominal point";
+            (Some(k), words.to_owned())
+        }
+        _ => (None, "no single point causes the deviation: check the point order and the nominal file".to_owned()),
     }
 }
 
@@ -260,15 +263,14 @@ mod tests {
     fn station_names_swapped_or_moved_point() {
         let message = place_station("3", &seen(&[0, 2, 1, 3, 4], false), &nominal(5), 0.1).unwrap_err().to_string();
         assert!(
-            message.contains("station 3: reference point b is off by")
-                && message.contains("b and c are probably swapped"),
+            message.contains("station 3: reference point b is") && message.contains("b and c are probably swapped"),
             "{message}"
         );
         let mut moved = seen(&[0, 1, 2, 3, 4], false);
         moved.points[3].at.x += 2.0;
         let message = place_station("3", &moved, &nominal(5), 0.1).unwrap_err().to_string();
         assert!(
-            message.contains("reference point d is off by 2.000 mm, limit 0.1 mm; without it the other points fit"),
+            message.contains("reference point d is 2.000 mm from its nominal position, limit 0.1 mm; without it"),
             "{message}"
         );
         assert!(place_station("3", &moved, &nominal(5), 2.0).is_ok());
@@ -280,7 +282,7 @@ mod tests {
             (seen(&[0, 1, 2, 3, 4], false), 4, "extra"),
             (seen(&[0, 1], false), 4, "3 are required"),
             (seen(&[0, 4], true), 4, "missing: b, c, d; unknown: e"),
-            (seen(&[4, 0, 1], false), 4, "their distances match none of the nominal points"),
+            (seen(&[4, 0, 1], false), 4, "the distances between the points match no set of nominal points"),
         ];
         for (seen, count, expected) in cases {
             let message = place_station("3", &seen, &nominal(count), 0.1).unwrap_err().to_string();

@@ -144,7 +144,7 @@ impl MeasurementSession {
         match gathered {
             ReceivedLine::Line(line) => self.line(&line),
             ReceivedLine::Endless(text) => {
-                self.reject_line(&text, "it has no line end: check baud rate, parity and the cable")
+                self.reject_line(&text, "the line has no line end: check baud rate, parity and the cable")
             }
         }
     }
@@ -152,7 +152,7 @@ impl MeasurementSession {
     /// Rejects the incomplete line `text`, whose end did not arrive in time. A running measurement then holds, because
     /// the touch may be lost.
     pub(super) fn cut_short(&mut self, text: &str) {
-        self.reject_line(text, "it is incomplete: its end did not arrive; touch that point again");
+        self.reject_line(text, "the line is incomplete, because its end did not arrive: touch this point again");
     }
 
     fn line(&mut self, line: &str) {
@@ -160,12 +160,12 @@ impl MeasurementSession {
         if begins {
             if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
                 asked.lines += 1;
-                asked.log_line(line, None, Some("it begins with an ignored prefix of the cell file"), None);
+                asked.log_line(line, None, Some("the line begins with a prefix that the cell file ignores"), None);
             }
             return;
         }
         let judging = &self.rules;
-        let read = judging.parser.read(line).map_err(|flaw| format!("{flaw}; touch that point again"));
+        let read = judging.parser.read(line).map_err(|flaw| format!("{flaw}; touch this point again"));
         let hit = match read {
             Ok(hit) => hit,
             Err(why) => return self.reject_line(line, &why),
@@ -175,8 +175,8 @@ impl MeasurementSession {
         {
             let [wanted_deg, within_deg] = judging.rotary_deg;
             let why = format!(
-                "the rotary table is at {stands_deg}°; {wanted_deg}° ± {within_deg}° is required: turn it back, and \
-                 touch the point again"
+                "the rotary table is at {stands_deg}°; {wanted_deg}° ± {within_deg}° is required: turn the table \
+                 back, and touch the point again"
             );
             return self.reject_line(line, &why);
         }
@@ -191,7 +191,7 @@ impl MeasurementSession {
             }
             Ok(TouchAssignment::DuplicateLine) => {
                 asked.duplicate_lines += 1;
-                asked.log_line(line, None, Some("it repeats the line before"), None);
+                asked.log_line(line, None, Some("the line repeats the line before"), None);
             }
             Err(why) => self.refuse(line, &why),
         }
@@ -213,7 +213,7 @@ impl MeasurementSession {
             }
             (Some(asked), MachineState::Held) => {
                 asked.lines += 1;
-                let held = "it arrived after the confirmation `still`: resume, then touch that point again";
+                let held = "the line arrived after the confirmation `still`: resume, then touch this point again";
                 asked.refuse(line, held);
             }
             _ => self.unrequested_lines = (self.unrequested_lines.0 + 1, line.chars().take(80).collect()),
@@ -236,7 +236,7 @@ impl MeasurementSession {
             self.cut_short(&text);
         }
         if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
-            asked.refuse("", "the connection was lost; touches since then did not arrive: check the remaining targets");
+            asked.refuse("", "the connection was lost; later touches did not arrive: touch the targets still listed");
             self.state = if self.state == MachineState::Execute { MachineState::Holding } else { self.state };
         }
         self.link_error = Some(error);
@@ -280,17 +280,20 @@ impl MeasurementSession {
         let unrequested_lines = (*count > 0).then(|| {
             let fitting = LineParser::fitting(last);
             let fits = match &fitting[..] {
-                [] => "it matches none of the eight formats".to_owned(),
+                [] => "this line matches none of the eight formats".to_owned(),
                 several => {
-                    format!("it matches {}", several.iter().map(ToString::to_string).collect::<Vec<_>>().join("; or "))
+                    let formats: Vec<String> = several.iter().map(ToString::to_string).collect();
+                    format!("this line matches {}", formats.join("; or "))
                 }
             };
             let ours = &self.rules.parser;
             let (last, read) = (LineError::whole_line(format!("{last:?}")), ours.read(last).err());
-            let read = read.map_or("and accepts it".to_owned(), |flaw| format!("and rejects it: {flaw}"));
+            let read = read.map_or("this format accepts the line".to_owned(), |flaw| {
+                format!("this format rejects the line: {flaw}")
+            });
             format!(
-                "lines arrived without a request and were not used; the last one is {last}: {fits}; the cell \
-                     file has {ours}, {read}"
+                "lines arrived while no measurement was requested, so they were not used; the last line is {last}: \
+                     {fits}; the cell file has {ours}: {read}"
             )
         });
         refused.chain(duplicate_lines).chain(unrequested_lines).collect()

@@ -93,8 +93,9 @@ impl HitLinesCmm {
         };
         let then = |word: &str| format!("then: regrind confirm {word} --machine cmm{run}");
         let part = &self.settings.part;
-        let stop =
-            |what: &str| vec![format!("{what} it at its own panel; {}", hearing.remaining_targets()), then("still")];
+        let stop = |what: &str| {
+            vec![format!("{what} the machine at its own panel; {}", hearing.remaining_targets()), then("still")]
+        };
         match hearing.state {
             MachineState::Execute if asked.list.is_complete() => match self.settings.clear_after {
                 None => vec!["every target is touched; when the probe is clear of the part,".to_owned(), then("done")],
@@ -114,10 +115,10 @@ impl HitLinesCmm {
                         asked.job.batch_id(),
                         hearing.plan_digits()
                     ),
-                    "check: right part, clean, clamped; wheel clear of it; the probe that the list names".to_owned(),
+                    "check: right part, clean, clamped; wheel clear of the part; probe as in the list".to_owned(),
                 ];
                 if self.settings.clear_after.is_none() {
-                    prompt.push("when it is measured and the probe is clear of the part,".to_owned());
+                    prompt.push("when the part is measured and the probe is clear of the part,".to_owned());
                     prompt.push(then("done"));
                 }
                 prompt
@@ -125,7 +126,9 @@ impl HitLinesCmm {
             MachineState::Holding => stop("HOLD"),
             MachineState::Stopping => stop("STOP"),
             MachineState::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
-            MachineState::Aborting => vec!["ABORT: stop it at its own panel NOW; Regrind cannot".to_owned()],
+            MachineState::Aborting => {
+                vec!["ABORT: stop the machine at its own panel NOW; Regrind cannot stop the machine".to_owned()]
+            }
             _ => Vec::new(),
         }
     }
@@ -156,7 +159,7 @@ impl HitLinesCmm {
         let mut hearing = locked(&self.session);
         let taken = match (word, hearing.state) {
             (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
-                Err("this machine sends its points over its line: remove --file".to_owned())
+                Err("this machine sends its points to Regrind directly, so no file is needed: remove --file".to_owned())
             }
             (OperatorConfirmation::Done { .. }, MachineState::Execute | MachineState::Holding | MachineState::Held) => {
                 self.finish_measurement(&mut hearing)
@@ -170,9 +173,9 @@ impl HitLinesCmm {
                 Ok(Vec::new())
             }
             (OperatorConfirmation::Started { .. }, _) => {
-                Err("a measurement has no start to confirm; measure, and confirm done".to_owned())
+                Err("the start of a measurement needs no confirmation: measure, then confirm done".to_owned())
             }
-            (_, state) => Err(format!("it is {state}, and no confirmation of this kind is expected")),
+            (_, state) => Err(format!("the machine is {state}; no confirmation of this kind is expected")),
         };
         drop(hearing);
         taken.map_err(|why| self.not_accepted(why))
@@ -405,7 +408,9 @@ impl Machine for HitLinesCmm {
             state if ours && (state.is_moving() || state == MachineState::Held) => {
                 Reconciled::Running(status_of(&hearing))
             }
-            _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
+            _ => Reconciled::Unknown {
+                reason: "the machine does not report the outcome of the job; ask the operator".to_owned(),
+            },
         })
     }
 

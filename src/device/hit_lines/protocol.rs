@@ -147,7 +147,7 @@ impl fmt::Display for LineError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.value {
             0 => f.write_str(&self.reason),
-            value => write!(f, "its value {value} {}", self.reason),
+            value => write!(f, "value {value} of the line {}", self.reason),
         }
     }
 }
@@ -161,7 +161,7 @@ impl LineParser {
     /// exceeds its limit.
     pub fn read(&self, line: &str) -> Result<Hit, LineError> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
-            let why = format!("its character {} is {c:?}, which is not plain text", at + 1);
+            let why = format!("character {} of the line is {c:?}, which is not plain text", at + 1);
             return Err(LineError::whole_line(why));
         }
         let fields = self.fields(line)?;
@@ -183,11 +183,11 @@ impl LineParser {
         };
         let expected = if self.format.has_rotary() { 4 } else { 3 };
         let why = match fields.len() {
-            found if found < expected => "it is incomplete, or in another format",
-            found if found > expected => "two lines are joined, or it is in another format",
+            found if found < expected => "the line is incomplete, or has another format",
+            found if found > expected => "two lines are joined, or the line has another format",
             _ => return Ok(fields),
         };
-        Err(LineError::whole_line(format!("it has {} values instead of {expected}: {why}", fields.len())))
+        Err(LineError::whole_line(format!("the line has {} values instead of {expected}: {why}", fields.len())))
     }
 
     /// Returns the number in `field` as text, without blanks and without the axis letter. `field` is the text between
@@ -202,10 +202,7 @@ impl LineParser {
         }
         let letter = LETTERS[k];
         let number = field.strip_prefix(letter).or(field.strip_prefix(letter.to_ascii_lowercase()));
-        number.ok_or_else(|| LineError {
-            value: k + 1,
-            reason: format!("is {field:?}, and does not begin with {letter}"),
-        })
+        number.ok_or_else(|| LineError { value: k + 1, reason: format!("is {field:?}, but must begin with {letter}") })
     }
 
     fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineError> {
@@ -216,12 +213,12 @@ impl LineParser {
             false => (self.decimals, self.unit_mm),
         };
         let value = exact(number, self.mark, digits, digits).ok_or_else(|| match digits {
-            0 => flaw("and not a whole number".to_owned()),
-            _ => flaw(format!("and not a number with {digits} digits after a {:?}", self.mark)),
+            0 => flaw("but must be a whole number".to_owned()),
+            _ => flaw(format!("but must be a number with {digits} digits after a {:?}", self.mark)),
         })?;
         let value_mm = if scale_mm == 1e-3 { value / 1e3 } else { value * scale_mm };
         if value_mm.abs() > MAX_COORDINATE_MM {
-            return Err(flaw(format!("and the limit is {MAX_COORDINATE_MM} mm")));
+            return Err(flaw(format!("but the limit is {MAX_COORDINATE_MM} mm")));
         }
         Ok(value_mm)
     }
@@ -235,7 +232,7 @@ impl LineParser {
         };
         let angle = angle.ok_or_else(|| flaw("and not an angle"))?;
         if angle.abs() > MAX_ANGLE_DEG {
-            return Err(flaw("and the limit is 36000°"));
+            return Err(flaw("but the limit is 36000°"));
         }
         Ok(angle)
     }
@@ -340,21 +337,21 @@ mod tests {
     fn line_parser_refuses_damaged_line() {
         let reading = LineParser::default();
         for (line, why) in [
-            ("100.000,200.000", "it has 2 values instead of 3: it is incomplete"),
-            ("100.000,200.000,300.00", "its value 3 is \"300.00\", and not a number with 3 digits"),
-            ("100.000,200.000,300.000100.000,200.000,300.000", "it has 5 values instead of 3: two lines"),
-            ("100.000,200.000,300.0001", "its value 3"),
-            ("100.000,,300.000", "its value 2 is \"\""),
-            ("1OO.000,200.000,300.000", "its value 1"),
-            (".000,200.000,300.000", "its value 1"),
-            ("100.000,200.000,3e2", "its value 3"),
-            ("100.000,200.000,NaN", "its value 3"),
-            ("100.000,2\u{0}0.000,300.000", "its character 10"),
-            ("100.000,200 .000,300.000", "its value 2"),
-            ("--1.000,200.000,300.000", "its value 1"),
+            ("100.000,200.000", "the line has 2 values instead of 3: the line is incomplete"),
+            ("100.000,200.000,300.00", "value 3 of the line is \"300.00\", but must be a number with 3 digits"),
+            ("100.000,200.000,300.000100.000,200.000,300.000", "the line has 5 values instead of 3: two lines"),
+            ("100.000,200.000,300.0001", "value 3 of the line"),
+            ("100.000,,300.000", "value 2 of the line is \"\""),
+            ("1OO.000,200.000,300.000", "value 1 of the line"),
+            (".000,200.000,300.000", "value 1 of the line"),
+            ("100.000,200.000,3e2", "value 3 of the line"),
+            ("100.000,200.000,NaN", "value 3 of the line"),
+            ("100.000,2\u{0}0.000,300.000", "character 10 of the line"),
+            ("100.000,200 .000,300.000", "value 2 of the line"),
+            ("--1.000,200.000,300.000", "value 1 of the line"),
             ("999999.000,200.000,300.000", "the limit is 100000 mm"),
-            ("PROBE 1 QUALIFIED", "it has 1 values"),
-            ("", "it has 1 values"),
+            ("PROBE 1 QUALIFIED", "the line has 1 values"),
+            ("", "the line has 1 values"),
         ] {
             let flaw = reading.read(line).unwrap_err().to_string();
             assert!(flaw.contains(why), "{line:?}: {flaw}");

@@ -335,7 +335,7 @@ impl HitLinesWire {
     }
 
     fn check_line(&self, place: &MachineTable<'_>, document: &mut Document) {
-        let one = "the lines come from a serial port or a terminal server";
+        let one = "the lines come either from a serial port (`device`) or from a terminal server (`host`)";
         match (&self.device, &self.host) {
             (None, None) => {
                 document.report(&place.key("wire.device"), "is missing, and so is `host`", one, "name one of them");
@@ -344,12 +344,12 @@ impl HitLinesWire {
                 document.report(&place.key("wire.host"), "is given together with `device`", one, "remove one of them");
             }
             (Some(device), None) if device == AUTO && place.simulated == Some(false) => {
-                let allowed = "only a simulated cell makes its own port";
+                let allowed = "only a simulated cell creates a port itself";
                 document.report(&place.key("wire.device"), "is \"auto\" in a real cell", allowed, "name the port");
             }
             (None, Some(_)) if self.port == 0 && place.simulated == Some(false) => {
                 let found = "is 0 in a cell that is not simulated";
-                let allowed = "it must be a whole number from 1 to 65535";
+                let allowed = "the port must be a whole number from 1 to 65535";
                 document.report(&place.key("wire.port"), found, allowed, "check the settings of the terminal server");
             }
             _ => {}
@@ -359,9 +359,9 @@ impl HitLinesWire {
     fn check_format(&self, document: &mut Document) {
         let Some(format) = self.format else { return };
         if format.is_integer() && self.unit == Unit::Inch {
-            let found = "is inch, and the format has whole numbers";
+            let found = "is inch, but the format has whole numbers";
             let allowed = "whole numbers are in µm";
-            document.report("cmm.wire.unit", found, allowed, "remove it, or set the machine to print decimals");
+            document.report("cmm.wire.unit", found, allowed, "remove this key, or set the machine to print decimals");
         }
         if self.decimal == Mark::Comma && self.separator == Separator::Comma && !format.is_integer() {
             let found = "is \"comma\", the same as the separator";
@@ -369,7 +369,7 @@ impl HitLinesWire {
             document.report("cmm.wire.decimal", found, allowed, "set `separator` to the mark between two values");
         }
         if format.is_lettered() && self.axes != Axes::Xyz {
-            let found = "is given, and the lines have letters";
+            let found = "is given, but the lines have letters";
             document.report("cmm.wire.axes", found, "the letters name the axes", "remove it");
         }
     }

@@ -98,8 +98,8 @@ impl TargetList {
         let (index, limit_mm) = (self.indices[k], self.rules.limit_mm);
         if away_mm > limit_mm {
             return Err(format!(
-                "it is {away_mm:.3} mm from the nearest target, {index}, and limit_mm is {limit_mm}: check that the \
-                 right part is at the position of the cell file, and touch the target again"
+                "the touch is {away_mm:.3} mm from the nearest target, {index}; the limit (limit_mm) is {limit_mm} mm: \
+                 check that the right part is at the position of the cell file, and touch the target again"
             ));
         }
         match (self.points[k].replace(point(index)), self.rules.repeated) {
@@ -109,8 +109,8 @@ impl TargetList {
                 self.points[k] = Some(first);
                 let apart_mm = distance(first.position_mm, at_mm);
                 Err(format!(
-                    "target {index} was already touched, {apart_mm:.4} mm from here, and that touch is valid: \
-                     continue with the remaining targets, or write repeated = \"replace\" into the cell file"
+                    "target {index} was already touched, {apart_mm:.4} mm from this touch; the first touch remains \
+                     valid: continue with the remaining targets, or write repeated = \"replace\" into the cell file"
                 ))
             }
         }
@@ -225,7 +225,7 @@ pub(super) mod tests {
         assert_eq!(list.assign("a", centre, at(300)), Ok(TouchAssignment::DuplicateLine));
         let repeated = list.assign("a", centre, at(600)).unwrap_err();
         assert!(repeated.contains("target 100 was already touched, 0.0000 mm"), "{repeated}");
-        assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch is valid"));
+        assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("the first touch remains valid"));
         assert_eq!(list.points()[0].position_mm, centre);
         let telling = TouchRules { repeated: Repeated::Replace, ..RULES };
         let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, telling);

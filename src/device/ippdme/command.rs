@@ -51,7 +51,7 @@ impl DmeCommand {
             return Err(SyntaxError { number: 507, reason: "there is text after the command" });
         }
         if command.is_event() != matches!(tag, Tag::Event(_)) {
-            return Err(SyntaxError { number: 1, reason: "only commands that end in E have event tags" });
+            return Err(SyntaxError { number: 1, reason: "only a command whose name ends in E has an event tag" });
         }
         grammar::check(&command)?;
         Ok((tag, command))

@@ -151,7 +151,7 @@ pub(super) fn check(command: &DmeCommand) -> Result<(), SyntaxError> {
         Whole => one()?.number().filter(|n| n.fract() == 0.0).map(drop).ok_or(bad("the argument is a whole number")),
         OneOf(names) => match one()? {
             Item::Name(name) if names.contains(&name.as_str()) => Ok(()),
-            _ => Err(arguments("the argument is not one of the names")),
+            _ => Err(arguments("the argument is not a name that this command allows")),
         },
         Numbers(counts, wanted) => numbers(items, counts, wanted),
         Transformation => transformation(items),
@@ -175,7 +175,7 @@ fn numbers(items: &[Item], counts: &[usize], wanted: &[NumberCondition]) -> Resu
     for wanted in wanted {
         let (P(k) | T(k)) = wanted;
         if numbers[*k] <= 0.0 {
-            return Err(bad("a step, a diameter and a number of crossings are positive"));
+            return Err(bad("a step, a diameter and a number of crossings must be positive"));
         }
         if matches!(wanted, T(_)) && numbers[*k].fract() != 0.0 {
             return Err(bad("the number of crossings is whole"));
@@ -190,7 +190,7 @@ fn transformation(items: &[Item]) -> Result<(), SyntaxError> {
         return Err(arguments("it has a name and six numbers"));
     }
     if !CSYS.contains(&csy.as_str()) {
-        return Err(bad("the name is not that of a coordinate system"));
+        return Err(bad("the name is not the name of a coordinate system"));
     }
     match rest[3].number() {
         Some(theta) if (0.0..=180.0).contains(&theta) => Ok(()),
@@ -211,7 +211,7 @@ fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<()
     for (k, item) in items.iter().enumerate() {
         let Item::Call(name, values) = item else { return Err(arguments("an argument is not a property")) };
         if !fits(name, values) {
-            return Err(arguments("an argument is not one of its properties"));
+            return Err(arguments("an argument is not a property that this command allows"));
         }
         once(&items[..k], name)?;
     }
@@ -249,7 +249,7 @@ fn touch(items: &[Item]) -> Result<(), SyntaxError> {
         _ => PART_AXES.contains(&name) && values.len() == 1,
     })?;
     let is_place = |item: &Item| matches!(item, Item::Call(name, _) if matches!(name.as_str(), "X" | "Y" | "Z"));
-    if items.iter().any(is_place) { Ok(()) } else { Err(arguments("one of X, Y and Z must be there")) }
+    if items.iter().any(is_place) { Ok(()) } else { Err(arguments("at least one of X, Y and Z is required")) }
 }
 
 // ---- properties of tools --------------------------------------------------------------------------------------------------------
@@ -281,56 +281,56 @@ fn enumerated(item: &Item, items: &[Item]) -> Result<(), SyntaxError> {
     let Item::Call(name, values) = item else { return trailing(items, arguments("the argument is not a property")) };
     let parts: Vec<&str> = name.split('.').collect();
     if !values.is_empty() {
-        return Err(arguments("a property is asked for with empty parentheses"));
+        return Err(arguments("the parentheses of a requested property must be empty"));
     }
     tool(&parts)?;
     if parts.len() > 1 && !matches!(parts[1], "GoToPar" | "PtMeasPar" | "ScanPar") {
-        return Err(bad("the second part is GoToPar, PtMeasPar or ScanPar"));
+        return Err(bad("the second part must be GoToPar, PtMeasPar or ScanPar"));
     }
     third_and_fourth(&parts, &["Act", "Def", "Max", "Min"])
 }
 
 fn tool(parts: &[&str]) -> Result<(), SyntaxError> {
-    if matches!(parts[0], "Tool" | "FoundTool") { Ok(()) } else { Err(bad("the first part is Tool or FoundTool")) }
+    if matches!(parts[0], "Tool" | "FoundTool") { Ok(()) } else { Err(bad("the first part must be Tool or FoundTool")) }
 }
 
 fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), SyntaxError> {
     if parts.get(2).is_some_and(|part| !PARAMETERS.contains(part)) {
-        return Err(bad("the third part is not a parameter"));
+        return Err(bad("the third part is not the name of a parameter"));
     }
     if parts.get(3).is_some_and(|part| !fourth.contains(part)) {
-        return Err(bad("the fourth part is not a side of a parameter"));
+        return Err(bad("the fourth part is not allowed; Act is allowed"));
     }
-    if parts.len() > 4 { Err(arguments("a property has at most four parts")) } else { Ok(()) }
+    if parts.len() > 4 { Err(arguments("the name of a property has at most four parts")) } else { Ok(()) }
 }
 
 fn check_read_property(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     if !values.is_empty() {
-        return Err(arguments("a property is asked for with empty parentheses"));
+        return Err(arguments("the parentheses of a requested property must be empty"));
     }
     tool(parts)?;
     match parts {
-        [_] => Err(arguments("a tool alone is not a property")),
+        [_] => Err(arguments("the name of a tool is not a property: a second part is required")),
         ["FoundTool", "Alignment"] => Err(arguments("only the active tool has an alignment")),
         [
             _,
             "Alignment" | "CollisionVolume" | "Id" | "Name" | "AvrRadius" | "AvrOffsets" | "QualSigma" | "QualTime",
         ] => Ok(()),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act", "Def", "Max", "Min"]),
-        _ => Err(bad("the second part is not a property of a tool")),
+        _ => Err(bad("the second part is not the name of a tool property")),
     }
 }
 
 fn set(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     tool(parts)?;
     match parts {
-        [_] | [_, _] => Err(arguments("a property that is set has three or four parts")),
+        [_] | [_, _] => Err(arguments("the name of a property to set must have three or four parts")),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act"]),
-        _ => Err(bad("the second part is GoToPar, PtMeasPar or ScanPar")),
+        _ => Err(bad("the second part must be GoToPar, PtMeasPar or ScanPar")),
     }?;
     match (values.len(), parts.len()) {
         (1, _) => Ok(()),
-        (_, 4) => Err(bad("a property is set by one number")),
-        _ => Err(arguments("a property is set by one number")),
+        (_, 4) => Err(bad("a property to set requires exactly one number")),
+        _ => Err(arguments("a property to set requires exactly one number")),
     }
 }

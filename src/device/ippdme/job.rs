@@ -277,7 +277,7 @@ impl Worker {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = MachineState::Holding;
-            shared.stop_reason = Some("no status request arrived for too long, so the machine holds".to_owned());
+            shared.stop_reason = Some("Regrind sent no status request for too long, so the machine holds".to_owned());
             return JobRequest::Hold;
         }
         *self.job_request.borrow()
@@ -349,7 +349,7 @@ impl Worker {
         let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
             self.session
-                .note("it does not report the radius of its tool; the radius of each touch is checked".to_owned());
+                .note("the machine does not report the tool radius; the radius of each touch is checked".to_owned());
             return Ok(());
         };
         let missing = || self.missing_value("GetProp", "Tool.AvrRadius");
@@ -390,7 +390,8 @@ impl Worker {
             // A lower speed only costs time. Any other difference changes the measurement.
             let slower = name.ends_with("Speed") && value > 0.0 && value < *wanted;
             if slower {
-                self.session.note(format!("{property} is {value} instead of the requested {wanted}"));
+                let note = format!("the machine limits {property} to {value} mm/s; {wanted} mm/s was requested");
+                self.session.note(note);
             } else if (value - wanted).abs() > 1e-4 * wanted.abs() + 1e-6 {
                 let machine = Arc::clone(&self.session.machine);
                 return Err(Failure::Implausible(DeviceError::NotSet {
@@ -577,7 +578,7 @@ pub(super) async fn request_if_supported(
     match session.ask(name, arguments).await {
         Ok(answer) => Ok(Some(answer)),
         Err(Failure::Refused(error)) if UNSUPPORTED_ERRORS.contains(&error.number) => {
-            session.note(format!("it does not support this {name}: {error}"));
+            session.note(format!("the server does not support this {name} request: {error}"));
             session.clear_errors(1).await?;
             Ok(None)
         }

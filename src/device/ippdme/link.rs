@@ -312,7 +312,7 @@ impl Session {
             (Tag::UNSOLICITED, _) => Ok(()),
             (Tag::Command(number), _) if self.was_sent(number) => Ok(()),
             (Tag::Event(number), _) if number <= self.last_event => Ok(()),
-            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "it answers a request that was not sent"))),
+            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "the line answers a request never sent"))),
         }
     }
 
@@ -340,7 +340,7 @@ impl Session {
     fn parse_response(&mut self, line: std::io::Result<String>) -> Result<DmeResponse, Failure> {
         let line = line.map_err(|e| match e.kind() {
             std::io::ErrorKind::InvalidData => {
-                Failure::Link(self.unreadable(String::new(), "a line that does not end, or is not ASCII"))
+                Failure::Link(self.unreadable(String::new(), "the line has no end, or is not ASCII"))
             }
             _ => Failure::Link(self.disconnected("reading")),
         })?;

@@ -275,7 +275,7 @@ impl Machine for IppdmeCmm {
         let shared = locked(&self.shared);
         let way = self.memory.loaded.as_ref().map(|(work, _)| {
             let Route { travel_m, plan_order_m: plain_m, .. } = work.route;
-            format!("the travel between targets is {travel_m:.2} m, {plain_m:.2} m in the plan's order")
+            format!("the travel between targets is {travel_m:.2} m; in the plan's order the travel is {plain_m:.2} m")
         });
         let why = shared.stop_reason.iter().cloned();
         why.chain(shared.notes.iter().cloned()).chain(way).collect()
@@ -464,7 +464,7 @@ impl Machine for IppdmeCmm {
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
-        let why = "the server stores no job, and this program knows no job with this START number".to_owned();
+        let why = "the server stores no job, and Regrind has no record of a job with this START number".to_owned();
         Ok(Reconciled::Unknown { reason: why })
     }
 }

@@ -29,7 +29,7 @@ impl Worker {
         if locked(&self.shared).radius_mm.is_none() {
             // A point of a scan does not report the radius either.
             self.session
-                .note("it does not report the radius of its tool, so rows are not scanned but touched".to_owned());
+                .note("the machine does not report the tool radius, so rows are touched instead of scanned".to_owned());
             return Ok(());
         }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
@@ -64,7 +64,10 @@ impl Worker {
             Ok(answer) if answer.data.is_empty() && answer.warnings.iter().any(is_missed) => None,
             Ok(answer) => Some(self.decode_scan(work, targets, &answer.data)?),
             Err(Failure::Refused(error)) if is_missed(&error) && error.severity <= 2 => {
-                self.session.note(format!("the row from target {} is touched, not scanned: {error}", targets[0].index));
+                self.session.note(format!(
+                    "the row from target {} is touched, because the scan failed: {error}",
+                    targets[0].index
+                ));
                 self.session.clear_errors(1).await?;
                 None
             }

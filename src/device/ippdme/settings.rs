@@ -145,11 +145,11 @@ impl DriverFactory for IppdmeWire {
         }
         self.check_address(place, document);
         if !document.contains_key("cmm.travel") {
-            let allowed = "every position is checked against the machine's volume before it moves";
+            let allowed = "every position is checked against the machine's volume before the machine moves";
             document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
         }
         if self.tool.contains(['"', '\r', '\n']) || !self.tool.is_ascii() {
-            let allowed = "names of tools are plain ASCII without quotes";
+            let allowed = "the name of a tool must be plain ASCII without quotes";
             document.report("cmm.wire.tool", format!("is {:?}", self.tool), allowed, "correct it");
         }
         if let Some([_, _, _, theta, ..]) = self.part_frame
@@ -203,24 +203,24 @@ impl IppdmeWire {
         if host.is_empty() {
             // The schema reports this.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be only a name or an address, such as \"192.168.0.20\"";
+            let allowed = "`host` must be only a name or an address, such as \"192.168.0.20\"";
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?}"),
                 allowed,
-                "write the port into its own key",
+                "write the port into the key `port`",
             );
         } else if place.simulated == Some(true) && !is_here {
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?} in a simulated cell"),
-                "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
+                "a simulated machine must be on this computer: 127.0.0.1, ::1 or localhost",
                 "if the machine is real, write `simulated = false`",
             );
         }
         if self.port == 0 && place.simulated == Some(false) {
             let found = "is 0 in a cell that is not simulated";
-            let allowed = "it must be a whole number from 1 to 65535";
+            let allowed = "the port must be a whole number from 1 to 65535";
             document.report(&place.key("wire.port"), found, allowed, "the usual port of I++ DME is 1294");
         }
     }

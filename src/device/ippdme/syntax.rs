@@ -243,7 +243,7 @@ impl<'a> Reader<'a> {
                 self.rest = &self.rest[1..];
             }
             if !(1..=3).contains(&self.take_while(|b| b.is_ascii_digit()).len()) {
-                return Err(bad("an exponent without one, two or three digits"));
+                return Err(bad("an exponent that does not have 1 to 3 digits"));
             }
         }
         let value = all[..all.len() - self.rest.len()].parse().ok().filter(|value: &f64| value.is_finite());

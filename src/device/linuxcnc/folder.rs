@@ -41,7 +41,10 @@ impl Folders {
             cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(PASS_PROGRAM_FILE))));
         let newest = cycles.filter(|(_, file)| file.is_file()).max_by_key(|(cycle, _)| *cycle);
         let (cycle, file) = newest.ok_or_else(|| {
-            format!("{} has no {PASS_PROGRAM_FILE}: see the journal for the reason", self.run.display())
+            format!(
+                "the run folder {} has no file {PASS_PROGRAM_FILE}: see the journal for the reason",
+                self.run.display()
+            )
         })?;
         self.framed(cycle, &file, map, rounds)
     }
@@ -67,7 +70,9 @@ impl Folders {
         write_atomic(&file, &program.text).map_err(|error| error.to_string())?;
         match lies_there(&file) {
             true => Ok(()),
-            false => Err(format!("{} differs from the data that were written to it", file.display())),
+            false => {
+                Err(format!("the file {} differs from the data that Regrind wrote: check the folder", file.display()))
+            }
         }
     }
 

@@ -306,7 +306,7 @@ impl Machine for LinuxcncGrinder {
             }
         }
         if self.job.as_ref().is_none_or(|work| work.program.is_none()) {
-            return Ok(unknown("the folder of programs has no program whose .log file is of this job"));
+            return Ok(unknown("the folder of programs has no program whose .log file belongs to this job"));
         }
         match self.start_outcome().await? {
             Some(verdict) => Ok(verdict),
@@ -322,7 +322,9 @@ impl Machine for LinuxcncGrinder {
         let program = self.job.as_ref().and_then(|work| work.program.clone());
         let ended = match word {
             OperatorConfirmation::Started { .. } => {
-                return Err(not_taken("it has stopped: confirm done if the pass is complete, otherwise still"));
+                return Err(not_taken(
+                    "the grinder has stopped: confirm done if the pass is complete, otherwise still",
+                ));
             }
             OperatorConfirmation::Done { file: Some(_), .. } => {
                 return Err(not_taken("only a measurement has a file: remove --file"));
@@ -330,7 +332,7 @@ impl Machine for LinuxcncGrinder {
             OperatorConfirmation::Done { map_identity: Some(map), .. }
                 if program.is_none_or(|program| program.map != map) =>
             {
-                return Err(not_taken("the confirmation names another map than that of its program"));
+                return Err(not_taken("the confirmed map is not the map of the program: check which program ran"));
             }
             OperatorConfirmation::Done { .. } => Stage::Ended(MachineState::Complete, Outcome::Complete),
             OperatorConfirmation::Still => Stage::Ended(MachineState::Complete, Outcome::Stopped),

@@ -63,7 +63,9 @@ impl FramedProgram {
         let name = name_begins(order.run, order.cycle) + &hex(&content.finalize()[..8]);
         let record = path(order.folder, &name, RECORD);
         if record.len() > MAX_PATH_LENGTH {
-            return Err(format!("its path at the controller is longer than {MAX_PATH_LENGTH} characters: {record}"));
+            return Err(format!(
+                "the path of the .log file is longer than {MAX_PATH_LENGTH} characters: {record}; use a shorter folder"
+            ));
         }
         let says = |word: &str| format!("(LOGAPPEND,{record})\n(LOG,{word})\n(LOGCLOSE)\n");
         let (repeat, again) = match order.rounds {
@@ -146,20 +148,20 @@ fn plain(c: char) -> char {
 /// Returns the reason as text if the program is not ASCII, is for another map, does not set its path mode and path
 /// tolerance, does not end with M2, or contains M2, M30 or % before its end.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
-    let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
+    let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("the program is not plain text")?;
     let of_map = format!("{MAP_COMMENT}{})", hex(map));
     if !text.lines().any(|line| line.trim() == of_map) {
-        return Err(format!("it is not the program of the map {}", hex(&map[..4])));
+        return Err(format!("the program does not belong to the map {}", hex(&map[..4])));
     }
     let code = text.lines().map(code).filter(|words| !words.is_empty());
     let code: Vec<Vec<&str>> = code.collect();
     check_mode(&code)?;
-    let body = text.trim_end().strip_suffix("M2").ok_or("it does not end with M2")?;
+    let body = text.trim_end().strip_suffix("M2").ok_or("the program does not end with M2")?;
     match body.ends_with('\n')
         && !code[..code.len() - 1].iter().flatten().any(|word| matches!(*word, "M2" | "M30" | "%"))
     {
         true => Ok(body),
-        false => Err("it ends before its last line".to_owned()),
+        false => Err("the program has M2, M30 or % before its last line".to_owned()),
     }
 }
 
@@ -180,17 +182,17 @@ fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
     for words in code {
         let has = |word: &str| words.iter().any(|w| w.eq_ignore_ascii_case(word));
         if has("G64") && !words.iter().any(|w| w.starts_with(['P', 'p'])) {
-            return Err("it sets G64 without a tolerance, which rounds corners without a limit".to_owned());
+            return Err("the program sets G64 without a tolerance (P): corners are rounded without a limit".to_owned());
         }
         says |= has("G61") || has("G61.1") || has("G64");
         let moves = words.iter().any(|w| w.starts_with(['X', 'Y', 'Z', 'x', 'y', 'z']));
         if moves && !says {
-            return Err("it moves before it sets the path mode (G61, G61.1, or G64 with P)".to_owned());
+            return Err("the program moves before the path mode is set (G61, G61.1, or G64 with P)".to_owned());
         }
     }
     match says {
         true => Ok(()),
-        false => Err("it does not set the path mode (G61, G61.1, or G64 with P)".to_owned()),
+        false => Err("the program does not set the path mode (G61, G61.1, or G64 with P)".to_owned()),
     }
 }
 

@@ -117,12 +117,12 @@ impl DriverFactory for LinuxcncWire {
         self.check_path(place, document);
         let host = &self.host;
         if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be only a name or an address, such as \"192.168.0.30\"";
+            let allowed = "`host` must be only a name or an address, such as \"192.168.0.30\"";
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?}"),
                 allowed,
-                "write the port into its own key",
+                "write the port into the key `port`",
             );
         }
         for (key, password) in
@@ -130,7 +130,7 @@ impl DriverFactory for LinuxcncWire {
         {
             let plain = password.chars().all(|c| c.is_ascii_graphic()) && !password.eq_ignore_ascii_case("off");
             if !plain {
-                let allowed = "it must be one word of plain ASCII, and not \"off\"";
+                let allowed = "the password must be one word of plain ASCII; \"off\" is not allowed";
                 document.report(&place.key(&format!("wire.{key}")), "is not a valid password", allowed, "correct it");
             }
         }
@@ -141,8 +141,8 @@ impl DriverFactory for LinuxcncWire {
         let default = Self::default();
         let here = self.host == "localhost" || self.host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         let known = self.control_password == default.control_password;
-        let note = "linuxcncrsh has its default password and listens on every address: let only this computer reach \
-                    its port";
+        let note = "linuxcncrsh has its default password and listens on every address: allow only this \
+                    computer to connect to the port of linuxcncrsh";
         (known && !here).then(|| note.to_owned()).into_iter().collect()
     }
 
@@ -206,7 +206,7 @@ impl LinuxcncWire {
         match (place.simulated, &self.executed_path) {
             (Some(true), None) => {
                 let allowed = "a simulated wheel follows the path that LinuxCNC executes";
-                let remedy = "name the program that prints it (docs/linuxcnc.md), or write `simulated = false`";
+                let remedy = "name the program that prints this path (docs/linuxcnc.md), or write `simulated = false`";
                 document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
             }
             (Some(false), Some(_)) => {
@@ -214,7 +214,8 @@ impl LinuxcncWire {
                 document.report(&key, "is set in a cell that is not simulated", allowed, "remove it");
             }
             (_, Some(words)) if words.iter().any(String::is_empty) => {
-                document.report(&key, "has an empty word", "it must be a program and its arguments", "remove the word");
+                let allowed = "the value must be a program and its arguments";
+                document.report(&key, "has an empty word", allowed, "remove the word");
             }
             _ => {}
         }

@@ -149,8 +149,9 @@ impl ManualMachine {
         let Some((job, _)) = self.job else { return Vec::new() };
         let name = self.kind.name();
         let confirm = |what: &str| format!("then: regrind confirm {what}{}", self.run_argument());
-        let still =
-            |what: &str| vec![format!("{what} it at its own panel"), confirm(&format!("still --machine {name}"))];
+        let still = |what: &str| {
+            vec![format!("{what} the machine at its own panel"), confirm(&format!("still --machine {name}"))]
+        };
         match (self.state, &self.task) {
             (MachineState::Execute, Some((ManualTask::Measure(plan), _))) => {
                 self.prompt_to_measure(job, plan, &confirm)
@@ -160,7 +161,9 @@ impl ManualMachine {
             }
             (MachineState::Holding, _) => still("HOLD"),
             (MachineState::Stopping, _) => still("STOP"),
-            (MachineState::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; Regrind cannot".to_owned()],
+            (MachineState::Aborting, _) => {
+                vec!["ABORT: stop the machine at its own panel NOW; Regrind cannot stop the machine".to_owned()]
+            }
             _ => Vec::new(),
         }
     }
@@ -173,8 +176,11 @@ impl ManualMachine {
         };
         vec![
             format!("MEASURE {part}, cycle {}: {points}", job.batch_id()),
-            format!("check: right part, clean, clamped; wheel clear of it; probe radius {} mm", plan.probe_radius_mm),
-            "when it is measured and the probe is clear of the part,".to_owned(),
+            format!(
+                "check: right part, clean, clamped; wheel clear of the part; probe radius {} mm",
+                plan.probe_radius_mm
+            ),
+            "when the part is measured and the probe is clear of the part,".to_owned(),
             confirm("done --file RESULT"),
         ]
     }
@@ -189,9 +195,10 @@ impl ManualMachine {
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
         let map = hex(&map[..4]);
         vec![
-            format!("GRIND {}, cycle {}: by {by} (map {map})", self.settings.part, job.cycle),
+            format!("GRIND {}, cycle {}: with {by} (map {map})", self.settings.part, job.cycle),
             format!(
-                "check: right part, clamped; probe clear of it; wheel radius {} mm, feed {} mm/min, {} spark-out passes",
+                "check: right part, clamped; probe clear of the part; wheel radius {} mm, feed {} mm/min, {} spark-out \
+                 passes",
                 pass.wheel_radius_mm, pass.feed_mm_min, pass.spark_out_passes
             ),
             "begin the pass,".to_owned(),
@@ -219,10 +226,10 @@ impl ManualMachine {
             OperatorConfirmation::Started { map_identity } | OperatorConfirmation::Done { map_identity, .. }
                 if self.names_other_map(map_identity) =>
             {
-                Err(self.not_accepted("that map is not the requested one: check which program is in the grinder"))
+                Err(self.not_accepted("the map is not the requested map: check which program is in the grinder"))
             }
             OperatorConfirmation::Started { .. } if is_cmm => {
-                Err(self.not_accepted("a measurement has no start to confirm; measure, and confirm done"))
+                Err(self.not_accepted("the start of a measurement needs no confirmation: measure, then confirm done"))
             }
             OperatorConfirmation::Started { .. } if self.state == MachineState::Execute => {
                 self.started_at.get_or_insert_with(Instant::now);
@@ -233,7 +240,7 @@ impl ManualMachine {
             {
                 let kept = match file {
                     Some(file) if is_cmm => self.accept_file(file).await?,
-                    None if is_cmm => return Err(self.not_accepted("name the file of the measurement: --file")),
+                    None if is_cmm => return Err(self.not_accepted("name the file of the measurement with --file")),
                     Some(_) => return Err(self.not_accepted("only a measurement has a file: remove --file")),
                     None if self.started_at.is_none() => {
                         return Err(self.not_accepted("confirm first that the pass has begun: regrind confirm started"));
@@ -253,7 +260,10 @@ impl ManualMachine {
                 self.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
-            _ => Err(self.not_accepted(format!("it is {}, and no confirmation of this kind is expected", self.state))),
+            _ => {
+                let why = format!("the machine is {}; no confirmation of this kind is expected", self.state);
+                Err(self.not_accepted(why))
+            }
         }
     }
 
@@ -495,7 +505,9 @@ impl Machine for ManualMachine {
             state if ours && (state.is_moving() || state == MachineState::Held) => {
                 Reconciled::Running(self.current_status())
             }
-            _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
+            _ => Reconciled::Unknown {
+                reason: "the machine does not report the outcome of the job; ask the operator".to_owned(),
+            },
         })
     }
 

@@ -705,17 +705,21 @@ impl ModbusMachine {
         let identity = block.identity(8);
         let head = |identity: &[u8; 32]| identity[..8].iter().fold(0, |bits, byte| (bits << 8) | u64::from(*byte));
         self.compare([
-            ("the kind of the payload in force", u64::from(kind), u64::from(words[0])),
-            ("the state of the slot in force", 1, u64::from(words[1])),
-            ("the size of the payload in force", u64::from(slot.bytes), u64::from(block.u32(2))),
-            ("the CRC-32 of the payload in force", u64::from(slot.crc), u64::from(block.u32(4))),
-            ("the identity of the payload in force (first 8 bytes)", head(&slot.identity), head(&identity)),
+            ("the kind of the payload that the machine uses", u64::from(kind), u64::from(words[0])),
+            ("the state of the slot of the payload that the machine uses", 1, u64::from(words[1])),
+            ("the size of the payload that the machine uses", u64::from(slot.bytes), u64::from(block.u32(2))),
+            ("the CRC-32 of the payload that the machine uses", u64::from(slot.crc), u64::from(block.u32(4))),
+            (
+                "the identity of the payload that the machine uses (first 8 bytes)",
+                head(&slot.identity),
+                head(&identity),
+            ),
         ])?;
         if identity == slot.identity {
             return Ok(());
         }
         let [sent, held] = [slot.identity, identity].map(|identity| u64::from(crc32fast::hash(&identity)));
-        let field = "the identity of the payload in force (its CRC-32)";
+        let field = "the CRC-32 of the identity of the payload that the machine uses";
         Err(DeviceError::Mismatch { machine: self.machine(), field, sent, found: held })
     }
 
@@ -994,12 +998,14 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     if status.boot_id != boot_id {
         let is = status.boot_id;
         return unknown(format!(
-            "the machine was restarted since then (boot id {boot_id:08x}, now {is:08x}); check the part"
+            "the machine was restarted after this job was prepared (boot id {boot_id:08x}, now {is:08x}); check the part"
         ));
     }
     if status.begun_by == start_sequence {
         return match status.job {
-            Some(held) if held != job => unknown(format!("START {start_sequence} began {held} instead of {job}")),
+            Some(held) if held != job => {
+                unknown(format!("START number {start_sequence} began {held} instead of {job}"))
+            }
             _ if status.done == start_sequence => Some(Reconciled::Finished(status.into())),
             _ => match status.state {
                 MachineState::Execute
@@ -1009,7 +1015,7 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
                 | MachineState::Aborting => Some(Reconciled::Running(status.into())),
                 MachineState::Aborted | MachineState::Faulted => Some(Reconciled::Finished(status.into())),
                 state => unknown(format!(
-                    "the machine accepted START {start_sequence}, but it is {state} and has no result of it"
+                    "the machine accepted START number {start_sequence}, but is in {state} and has no result of this START"
                 )),
             },
         };
@@ -1017,8 +1023,14 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let begun = status.last_begun == (job.job, job.cycle);
     match status.state {
         MachineState::Idle | MachineState::Prepared if !begun => None,
-        _ if begun => unknown(format!("{job} was begun by START {}, not by {start_sequence}", status.begun_by)),
-        state => unknown(format!("the machine is {state} with another job, begun by START {}", status.begun_by)),
+        _ if begun => unknown(format!(
+            "START number {} began {job}, but this program sent number {start_sequence}",
+            status.begun_by
+        )),
+        state => unknown(format!(
+            "the machine is in {state} with another job; START number {} began that job",
+            status.begun_by
+        )),
     }
 }
 
@@ -1205,7 +1217,7 @@ impl Grinder for ModbusGrinder {
         ])?;
         if let Some(map) = machine.loaded.get(&CorrectionMap::KIND).filter(|map| map.identity != header.identity) {
             let (sent, held) = (digest(&[map.identity]).into(), digest(&[header.identity]).into());
-            let field = "the identity of the map that was ground (its CRC-32)";
+            let field = "the CRC-32 of the identity of the map that the grinder used";
             return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, found: held });
         }
         Ok(PassRecord {

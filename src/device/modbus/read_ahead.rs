@@ -206,7 +206,8 @@ impl ModbusMachine {
             }
             (true, 0) => ahead.not_full_at = Some(progress),
             (true, other) => {
-                let (machine, what) = (self.machine(), "data registers of a page that is read while its job runs");
+                let (machine, what) =
+                    (self.machine(), "data registers in a result page that is read while the job runs");
                 return Err(DeviceError::WrongCount {
                     machine,
                     elements: what,

@@ -148,18 +148,18 @@ impl TcpWire {
         if host.is_empty() {
             // Reported by the schema.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be only a name or an address, such as \"192.168.0.10\"";
+            let allowed = "only a host name or an IP address is allowed, such as \"192.168.0.10\"";
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?}"),
                 allowed,
-                "write the port into its own key",
+                "write the port into its own key, `port`",
             );
         } else if place.simulated == Some(true) && !is_here {
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?} in a simulated cell"),
-                "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
+                "a simulated machine must be on this computer: 127.0.0.1, ::1 or localhost",
                 "if the machine is real, write `simulated = false`",
             );
         }
@@ -167,7 +167,7 @@ impl TcpWire {
             document.report(
                 &place.key("wire.port"),
                 "is 0 in a cell that is not simulated",
-                "it must be a whole number from 1 to 65535",
+                "the port must be a whole number from 1 to 65535",
                 "the usual port of Modbus TCP is 502",
             );
         }
@@ -182,8 +182,8 @@ impl TcpWire {
     /// Reports to the document if the CMM and the grinder have the same host, port and unit.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self == grinder && self.port != 0 {
-            let found = format!("is {}, the same as that of the CMM at the same host and port", grinder.unit);
-            let allowed = "two machines require two units or two ports";
+            let found = format!("is {}, but the CMM at the same host and port has this unit number too", grinder.unit);
+            let allowed = "each machine requires its own unit number or its own port";
             document.report("grinder.wire.unit", found, allowed, "correct one of them");
         }
     }
@@ -232,12 +232,12 @@ impl RtuWire {
             return;
         }
         if self.unit == grinder.unit {
-            let found = format!("is {}, the same as that of the CMM on the same line", grinder.unit);
-            let allowed = "two machines on one line require two units";
+            let found = format!("is {}, but the CMM on the same line has this unit number too", grinder.unit);
+            let allowed = "each machine on a line requires its own unit number";
             document.report("grinder.wire.unit", found, allowed, "correct one of them");
         }
         if self.line() != grinder.line() {
-            let found = "has another speed, parity or stop bits than the CMM on the same line";
+            let found = "differs from the CMM on the same line in speed, parity or stop bits";
             document.report("grinder.wire", found, "a line has only one setting", "make them the same");
         }
     }
@@ -340,7 +340,7 @@ impl RegisterMap {
             let end = u32::from(first) + u32::from(count);
             let key = place.key(&format!("registers.{name}"));
             if end > REGISTERS {
-                let found = format!("is {first}; the block has {count} registers and ends at {}", end - 1);
+                let found = format!("is {first}; the block has {count} registers and ends at register {}", end - 1);
                 document.report(&key, found, "the last register of a device is 65535", "lower it");
             }
             for &(other, start, length) in &blocks[..k] {
@@ -351,7 +351,7 @@ impl RegisterMap {
                         if moved { (key.clone(), other) } else { (place.key(&format!("registers.{other}")), name) };
                     let found = format!("overlaps the block `{of}`");
                     let allowed = format!(
-                        "`{other}` is {start} to {}, `{name}` is {first} to {}",
+                        "`{other}` has registers {start} to {}, `{name}` has registers {first} to {}",
                         u32::from(start) + u32::from(length) - 1,
                         end - 1
                     );
@@ -464,17 +464,22 @@ impl Signal {
                     &key("scale"),
                     "is 0",
                     "every value would be 0",
-                    "write 1 to keep the number unchanged",
+                    "write 1 to use the number in the register unchanged",
                 );
             }
             let Some(signal) = Self::from_table(table, word_order) else { continue };
             if signal.range[0] >= signal.range[1] {
                 let found = format!("is [{}, {}]", signal.range[0], signal.range[1]);
-                document.report(&key("range"), found, "the first must be less than the second", "swap them");
+                document.report(
+                    &key("range"),
+                    found,
+                    "the first limit must be less than the second limit",
+                    "swap them",
+                );
             }
             let last = u32::from(signal.address) + u32::from(signal.kind.registers()) - 1;
             if last >= REGISTERS {
-                let found = format!("is {}; the value ends at {last}", signal.address);
+                let found = format!("is {}; the value ends at register {last}", signal.address);
                 document.report(&key("address"), found, "the last register of a device is 65535", "lower it");
             }
             signals.push(signal);

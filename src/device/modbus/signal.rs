@@ -35,11 +35,11 @@ impl Signal {
             Some(self.value(words, other)).filter(|swapped| !is_good(&value) && words.len() > 1 && is_good(swapped));
         let hint = swapped.map(|swapped| {
             let unit = &self.unit;
-            format!("it would be {swapped} {unit} with its words in the other order, word_order = \"{name}\" in the cell file")
+            format!("the value would be {swapped} {unit} with the words in the other order: write word_order = \"{name}\" in the cell file")
         });
         let reads = || {
             format!(
-                "register {} reads as {value}: compare address, type, scale and word_order in the cell file with the machine's",
+                "register {} reads as {value}: compare address, type, scale and word_order in the cell file with the register list of the machine",
                 self.address
             )
         };
@@ -63,7 +63,10 @@ mod tests {
         let big = signal(SignalType::F32, WordOrder::Big);
         assert_eq!(big.cause(&[first, second]), None);
         let told = big.cause(&[second, first]).unwrap();
-        assert!(told.starts_with("it would be 20.25 C with") && told.contains("word_order = \"little\""), "{told}");
+        assert!(
+            told.starts_with("the value would be 20.25 C with") && told.contains("word_order = \"little\""),
+            "{told}"
+        );
         let little = signal(SignalType::F32, WordOrder::Little);
         assert!(little.cause(&[first, second]).unwrap().contains("word_order = \"big\""));
         // No number in either order: only the value that the register gives is known.

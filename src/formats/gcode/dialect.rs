@@ -395,7 +395,9 @@ pub enum DialectError {
          {limit_um} or less"
     )]
     ArcsWide { found_um: f64, limit_um: f64 },
-    #[error("grinder.program.arcs_within_um requires an upright wheel, and grinding.tilt tilts it; remove one of them")]
+    #[error(
+        "grinder.program.arcs_within_um requires an upright wheel, but grinding.tilt tilts the wheel; remove one of the two keys"
+    )]
     ArcsTilted,
     #[error(
         "the dialect `{dialect}` has no words for a control that keeps the wheel's centre while the head tilts; give \

@@ -14,7 +14,9 @@ use crate::FormatError;
 pub enum GcodeError {
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{axis} of move {number} is {value_mm} mm; do not use this path; report the fault with the input files")]
+    #[error(
+        "{axis} of move {number} is {value_mm} mm, which is not a finite number; do not use this path; report the fault with the input files"
+    )]
     NotFinite { axis: char, value_mm: f64, number: u64 },
     #[error(transparent)]
     Dialect(#[from] DialectError),

@@ -163,8 +163,8 @@ fn proof_text(proof: Option<&Proof>) -> Markup {
             Ok(found) => {
                 p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
                     @if found.signed == 0 { "; not signed" }
-                    @else if proof.keys == 0 { "; signed up to record " (found.signed) " by a key that the plant does not know" }
-                    @else { "; signed up to record " (found.signed) " by a key that the plant knows of the cell" }
+                    @else if proof.keys == 0 { "; signatures up to record " (found.signed) ", with a key that is not enrolled at the plant" }
+                    @else { "; signatures up to record " (found.signed) ", with a key that is enrolled for the cell" }
                     @if found.closed { "." } @else { ". The run has no recorded end: it is still active, or its record was cut before the end arrived." }
                 }
             }

@@ -186,7 +186,7 @@ async fn lower_machine_speed_is_reported() {
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
-    assert!(bench.cmm.notes().iter().any(|note| note.contains("Speed is 50")), "{:?}", bench.cmm.notes());
+    assert!(bench.cmm.notes().iter().any(|note| note.contains("Speed to 50")), "{:?}", bench.cmm.notes());
 }
 
 #[tokio::test]

@@ -287,7 +287,7 @@ fn broker_certificate_is_verified() {
     let readable = |mode| fs::set_permissions(home.path().join("password"), fs::Permissions::from_mode(mode)).unwrap();
 
     plant("broker = \"plant.example\"\n");
-    refused("plant.example is another computer, and no certificates to authenticate it are given");
+    refused("plant.example is another computer, but no certificates to authenticate the other computer are given");
     plant("broker = \"localhost\"\ncertificates = \"its.pem\"\n");
     readable(0o644);
     refused("other users of this computer can read the password");

@@ -14,7 +14,7 @@ fn unknown_database_layout_refused() {
     for arguments in [&init, &ship] {
         let (_, told) = plant.ends(arguments, 2);
         assert!(
-            told.contains("the database has layout 99")
+            told.contains("the tables of the database have layout 99")
                 && told.contains("use the version of Regrind that made this layout"),
             "{told}"
         );
@@ -49,7 +49,7 @@ fn connection_errors_name_remedy() {
     wrong(("user = ", "usher = "), 2, "usher");
     wrong(("[database]", "[database]\nname = \"other\""), 2, "check name, user and password");
     let socket = format!("host = \"{}\"", plant.postgres.socket().display());
-    wrong((&socket, "host = \"plant.example\""), 2, "no certificates to authenticate it are given");
+    wrong((&socket, "host = \"plant.example\""), 2, "no certificates to authenticate the other computer are given");
     wrong((&socket, "host = \"/nowhere\""), 3, "cannot be reached");
     std::fs::write(plant.path("cell-1.toml"), &file).unwrap();
     std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o644))
@@ -61,7 +61,7 @@ fn connection_errors_name_remedy() {
     plant.does(&ship);
     plant.postgres.kill();
     let (_, told) = plant.ends(&ship, 3);
-    assert!(told.contains("cannot be reached") && told.contains("check that it runs"), "{told}");
+    assert!(told.contains("cannot be reached") && told.contains("check that the database runs"), "{told}");
     plant.postgres.go_on();
     plant.does(&ship);
 }

@@ -420,7 +420,7 @@ fn unproven_run_gives_no_report() {
     let said = words(&until_proven(&shown, "/runs/1"));
     let records = plant.sql("SELECT count(*) FROM record");
     assert!(said.contains("Proven at") && said.contains(&format!("{records} records in an unbroken chain")), "{said}");
-    assert!(said.contains("by a key that the plant knows of the cell") && said.contains("SIMULATION"), "{said}");
+    assert!(said.contains("with a key that is enrolled for the cell") && said.contains("SIMULATION"), "{said}");
 
     // The report from the copy equals the report at the cell.
     let report = shown.visitor.get("/runs/1/report");

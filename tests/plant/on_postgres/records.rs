@@ -93,7 +93,7 @@ fn run_replicated_verified_and_fetched() {
     let alone = plant.does(&copy);
     assert!(
         alone.contains(&format!("{} records", before.len()))
-            && alone.contains("by a key that the plant knows of cell-1"),
+            && alone.contains("with a key that is enrolled for cell-1"),
         "{alone}"
     );
 

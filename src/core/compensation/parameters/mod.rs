@@ -222,16 +222,20 @@ pub enum ParameterError {
     #[error("{points} points are too few to separate parameters from form; measure at least {MIN_POINTS}")]
     TooFew { points: usize },
     #[error(
-        "point {} has a coordinate, normal or deviation that is not finite; do not use this measurement",
+        "point number {} has a coordinate, normal or deviation that is not a finite number; do not use this \
+         measurement",
         index + 1
     )]
     NotFinite { index: usize },
     #[error(
-        "the normal at point {} has nz = {nz:.4}; it must be at least {MIN_NZ}, because the wheel comes from above",
+        "the surface normal at point number {} has the z component {nz:.4}; this component must be at least {MIN_NZ}, \
+         because the wheel comes from above; check the orientation of the part",
         index + 1
     )]
     Normal { index: usize, nz: f64 },
-    #[error("{found} values of progress are given for {points} points; give one for each point")]
+    #[error(
+        "{found} values of the progress along the path are given for {points} points; give one value for each point"
+    )]
     Progress { found: usize, points: usize },
     #[error("the wheel radius is {radius_mm} mm; it must be above 0")]
     WheelRadius { radius_mm: f64 },

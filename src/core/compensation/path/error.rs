@@ -8,14 +8,17 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum PathError {
-    #[error("no track can be laid, because the nominal surface or its outline covers no area; check both")]
+    #[error(
+        "no tool path can be made, because the nominal surface or its outline covers no area; check the surface and \
+         the outline"
+    )]
     Empty,
     #[error(
         "the nominal surface is not a height over x and y at x {x_mm:.3}, y {y_mm:.3} mm: it is steeper than 84° or \
          faces away from +z; turn the model frame so that z points away from the part"
     )]
     NotAHeight { x_mm: f64, y_mm: f64 },
-    #[error("the correction is not a finite number at x {x_mm:.3}, y {y_mm:.3} mm; compute it again")]
+    #[error("the correction is not a finite number at x {x_mm:.3}, y {y_mm:.3} mm; compute the correction again")]
     Correction { x_mm: f64, y_mm: f64 },
     #[error("{key} is {found}; it must be {allowed}")]
     Option { key: &'static str, found: f64, allowed: &'static str },

@@ -24,11 +24,12 @@ pub enum DefinitionError {
     #[error("`{key}` is not a term of this formula; {expected}")]
     Term { key: String, expected: &'static str },
     /// Two coefficients are given for one term.
-    #[error("`{key}` is given twice; add the two coefficients, or remove one")]
+    #[error("`{key}` is given twice; write the sum of the two coefficients once, or remove one coefficient")]
     RepeatedTerm { key: String },
     /// A section is cut from another section.
     #[error(
-        "`{key}` is itself an off-axis section; give the whole surface as the parent, and one distance and azimuth"
+        "`{key}` is an off-axis section, but the parent of a section must be a whole surface; give the whole surface \
+         as the parent, with one distance and one azimuth"
     )]
     NestedSection { key: String },
     /// The formula is not defined, or infinitely steep, at the centre of an off-axis section, in the parent's frame.

@@ -28,7 +28,7 @@ impl LinuxcncGrinder {
             }
             _ if seen.interpreter != Interpreter::Idle => {
                 let program = seen.program.unwrap_or_default();
-                Some(Reconciled::Unknown { reason: format!("it runs another program now, {program}") })
+                Some(Reconciled::Unknown { reason: format!("the grinder now runs another program, {program}") })
             }
             _ => None,
         })
@@ -57,8 +57,8 @@ impl LinuxcncGrinder {
                 let (_, status) = self.read_status().await?;
                 Ok(Reconciled::NotStarted(status))
             }
-            Some(_) => Ok(unknown("the .log file of its program shows its begin, but not its end")),
-            None => Ok(unknown("the .log file of its program is no longer in the folder of programs")),
+            Some(_) => Ok(unknown("the .log file shows the begin of the program, but not the end")),
+            None => Ok(unknown("the .log file of the program is no longer in the folder of programs")),
         }
     }
 

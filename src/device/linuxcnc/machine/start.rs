@@ -62,11 +62,11 @@ impl LinuxcncGrinder {
                 let (state, fault) = (MachineState::Faulted, standing_fault(seen).unwrap_or(Fault::None));
                 Err(DeviceError::Faulted { machine: self.machine(), state, fault })
             }
-            () if seen.interpreter == Interpreter::Running => Err(self.unready("it runs a program")),
+            () if seen.interpreter == Interpreter::Running => Err(self.unready("the controller runs a program")),
             () if seen.interpreter == Interpreter::Paused => {
-                Err(self.unready("a program is paused: end it at the machine"))
+                Err(self.unready("a program is paused: end the program at the machine"))
             }
-            () if !seen.homed => Err(self.unready("it is not homed: home it at the machine")),
+            () if !seen.homed => Err(self.unready("the machine is not homed: home the machine at its own panel")),
             () => Ok(()),
         }
     }

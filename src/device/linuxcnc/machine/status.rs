@@ -48,7 +48,7 @@ impl LinuxcncGrinder {
         match &self.last_motion {
             Some((line, at, since)) if (*line, at) == (seen.line, &seen.position) => {
                 if seen.interpreter == Interpreter::Running && since.elapsed() > STANDSTILL_AFTER {
-                    self.note("it reports a running program, and has not moved for 5 s: check the machine".to_owned());
+                    self.note("a program runs, but the machine has not moved for 5 s: check the machine".to_owned());
                 }
             }
             _ => self.last_motion = Some((seen.line, seen.position.clone(), Instant::now())),
@@ -105,8 +105,8 @@ impl LinuxcncGrinder {
                 }
             }
             Verdict::Unresolved => self.note(
-                "it has stopped, and its program logged neither its begin nor its end: check the machine, then \
-                 regrind confirm done if the pass is complete, otherwise regrind confirm still"
+                "the grinder has stopped, but the program logged neither its begin nor its end: check the machine. \
+                 Then type regrind confirm done if the pass is complete, otherwise regrind confirm still"
                     .to_owned(),
             ),
             Verdict::InState(_) | Verdict::Foreign(_) => {}

@@ -35,7 +35,7 @@ pub(crate) fn missing(device: &str) -> Option<String> {
     }
     let names = names();
     let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-    Some(format!("{device} is not on this computer; the serial ports here: {there}"))
+    Some(format!("the serial port {device} does not exist on this computer; the serial ports here: {there}"))
 }
 
 /// Returns the names of the serial ports that the operating system knows.

@@ -354,8 +354,8 @@ fn ply_errors_name_their_line() {
         ("list uchar int vertex", "list uchar float vertex", "expected vertex indices of an integer type"),
         ("element camera 1\n", "", "line 4: expected an element before its properties"),
         ("comment by hand", "remark by hand", "line 3: expected comment, element, property or end_header"),
-        ("9 4 0 1 2 3", "9 4 0 1 2 4", "line 21: a face has the vertex 4, but there are 4 vertices"),
-        ("9 4 0 1 2 3", "9 4 0 1 2 -1", "line 21: a face has the vertex -1"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 4", "line 21: a face refers to vertex 4, but the mesh has 4 vertices"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 -1", "line 21: a face refers to vertex -1"),
         ("9 4 0 1 2 3", "9 2 0 1", "line 21: expected at least 3 corners of face 1, found `2`"),
         ("9 4 0 1 2 3", "9 4.5 0 1 2 3", "line 21: expected face 1 of 2, found `4.5`"),
         (
