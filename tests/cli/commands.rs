@@ -600,9 +600,7 @@ fn plan_reports_time_and_slow_pass() {
     bench.write("slow.toml", shipped.replace(feed, "feed_mm_min = 16.7"));
     let plan = |recipe: &str| text(&bench.run(&["plan", recipe]).stdout);
     let good = plan("good.toml");
-    for words in
-        ["time        at most 5 passes of ", " minutes and 5 measurements of at least 13.5 minutes", " h and more"]
-    {
+    for words in ["5 passes of ", "5 measurements of at least 13.5 minutes", " h or more"] {
         assert!(good.contains(words), "`{words}` is missing: {good}");
     }
     assert!(!good.contains("warning"), "{good}");

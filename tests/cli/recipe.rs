@@ -521,7 +521,7 @@ const BAD_CELLS: &[BadText] = &[
     (SIM, "simulated = true ", "simulated = false ", "cmm.wire.port", "0                    #", "1 to 65535"),
     (SIM, "name = \"simulated cell\"\n", "", "cell.name", "cell]", "add `name"),
     (TCP, "port = 15021", "prot = 15021\nport = 1", "cmm.wire.prot", "prot", "did you mean `port`"),
-    (TCP, "port = 15022\nunit = 2", "port = 15021\nunit = 1", "grinder.wire.unit", "1\n\n[grinder.limits", "two units"),
+    (TCP, "port = 15022\nunit = 2", "port = 15021\nunit = 1", "grinder.wire.unit", "1\n\n[grinder.limits", "own unit"),
     (
         TCP,
         "# expected_name",

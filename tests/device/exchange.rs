@@ -501,7 +501,7 @@ fn pass_confirmed_by_map_identity() {
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
     assert!(!look.start_confirmed);
-    assert_says(&look, &["confirms map `0123456789abcdef`, expected map"]);
+    assert_says(&look, &["map `0123456789abcdef`", "but map "]);
     fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
     let look = settled(&mut grinder);
     assert!(look.start_confirmed && look.answer.is_none());
