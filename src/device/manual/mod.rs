@@ -328,9 +328,13 @@ fn batch_suffix(job: Job) -> String {
 /// accepted it.
 fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let stem = |path: &Path, wanted: &str| path.file_stem().is_some_and(|stem| stem == wanted);
+    // The files of later batches have a suffix: see `batch_suffix`.
+    let is_result = |path: &Path| {
+        let stem = path.file_stem().and_then(|stem| stem.to_str()).and_then(|stem| stem.strip_prefix("result"));
+        stem.is_some_and(|suffix| suffix.is_empty() || suffix.starts_with('-'))
+    };
     let cycles = within(run).filter(|path| path.is_dir());
-    let mut results = cycles.flat_map(|cycle| within(&cycle).filter(|path| stem(path, "result")).collect::<Vec<_>>());
+    let mut results = cycles.flat_map(|cycle| within(&cycle).filter(|path| is_result(path)).collect::<Vec<_>>());
     results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
 }
 
@@ -582,8 +586,13 @@ mod tests {
         let run = tempfile::tempdir().unwrap();
         std::fs::create_dir(run.path().join("cycle-1")).unwrap();
         std::fs::write(run.path().join("cycle-1/result.csv"), "1,2,3").unwrap();
+        // A later batch of the same measurement, and a file that is not a result.
+        std::fs::write(run.path().join("cycle-1/result-2.csv"), "4,5,6").unwrap();
+        std::fs::write(run.path().join("cycle-1/results.csv"), "7,8,9").unwrap();
         let sha256 = |text: &str| -> [u8; 32] { Sha256::digest(text).into() };
         assert!(is_stored_result(run.path(), &sha256("1,2,3")));
+        assert!(is_stored_result(run.path(), &sha256("4,5,6")), "the second batch");
+        assert!(!is_stored_result(run.path(), &sha256("7,8,9")));
         assert!(!is_stored_result(run.path(), &sha256("1,2,4")));
     }
 
